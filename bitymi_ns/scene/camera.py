@@ -1,0 +1,51 @@
+"""A pinhole camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in OpenCV axes (x right, y down, z forward).
+
+    Attributes:
+        viewmat: [4, 4] float32, world to camera.
+        K: [3, 3] float32, intrinsics in pixels; pixel (i, j) is sampled at (i + 0.5, j + 0.5).
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
+            raise ValueError(
+                f"a camera needs viewmat [4, 4] and K [3, 3], not {tuple(self.viewmat.shape)} and {tuple(self.K.shape)}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"a camera needs a positive image size, not {self.width} x {self.height}")
+
+    @property
+    def center(self) -> Tensor:
+        """[3] camera centre in the world frame."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera on another device."""
+        return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the same view with its image resized by `factor` (size rounded to whole pixels)."""
+        width = max(1, round(self.width * factor))
+        height = max(1, round(self.height * factor))
+        K = self.K.clone()
+        K[0] *= width / self.width
+        K[1] *= height / self.height
+        return replace(self, K=K, width=width, height=height)

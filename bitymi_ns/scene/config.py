@@ -1,0 +1,35 @@
+"""What a scene is made of: the options that decide its parameters and how they are rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Optional
+
+
+@dataclass
+class SceneConfig:
+    """Representation of the scene: surfels, view colour and residual colour field."""
+
+    view_color: Literal["sv", "sh", "sb", "sg"] = "sv"
+    """View-dependent colour of a surfel: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta,
+    sg = spherical Gaussians."""
+    sv_sites: int = 7
+    """Number of Spherical Voronoi sites a surfel (the paper's K)."""
+    sh_degree: int = 3
+    """Degree of the spherical harmonics, 0 to 3."""
+    lobes: int = 2
+    """Number of lobes a surfel of the Spherical Beta and spherical Gaussian colours."""
+    texture: Literal["hash", "none"] = "hash"
+    """Residual colour field: hash = multiresolution hash grid and MLP, none = surfels alone."""
+    levels: int = 4
+    """Hash grid levels; the paper's 4, with resolutions min_resolution * 2^level."""
+    min_resolution: int = 256
+    """Resolution of the coarsest hash grid level."""
+    log2_table_size: Optional[int] = None
+    """Entries a hash level, as a power of two; not given: chosen so that the table fits the scene and the cache."""
+    contraction: Literal["auto", "on", "off"] = "auto"
+    """mip-NeRF 360 contraction of space outside the unit ball of the cameras; auto: off for scenes with alpha."""
+    near: float = 0.2
+    """Nearest depth that is drawn, in scene units (camera z)."""
+    weight_bound: float = 0.0
+    """Fragments whose blending weight is below this keep the surfel's colour without the residual field."""

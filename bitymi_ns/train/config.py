@@ -1,0 +1,118 @@
+"""Training options. Every step count is stated for a run of 30,000 steps and scales with the length of the run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+REFERENCE_STEPS = 30_000
+"""The run length for which every step count below is given."""
+
+
+@dataclass
+class LossConfig:
+    """The objective: photometric loss and falloff reduction."""
+
+    ssim_weight: float = 0.2
+    """Photometric loss = (1 - w) L1 + w (1 - SSIM)."""
+    falloff_weight: float = 0.005
+    """Weight lambda of the falloff loss; 0 turns it off (the paper's quality setting)."""
+    falloff_gamma: float = 25.0
+    """How sharply the falloff loss fades with the photometric error: omega = exp(-gamma e)."""
+    falloff_error: Literal["l1_sum", "mse"] = "l1_sum"
+    """e of the line above: L1 summed over rgb, or the mean squared error."""
+    falloff_gradient: Literal["full", "beta_only"] = "full"
+    """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
+
+
+@dataclass
+class DensifyConfig:
+    """FastGS multi-view densification and pruning."""
+
+    start: int = 500
+    """First step of densification (exclusive)."""
+    stop: int = 15_000
+    """Last step of densification (exclusive)."""
+    interval: int = 500
+    """Steps between densifications."""
+    views: int = 10
+    """Training views rendered for the multi-view score; with fewer training views, all of them."""
+    error_threshold: float = 0.1
+    """A pixel counts as bad when its min-max normalised error is above this."""
+    importance: int = 5
+    """Surfels are densified when their mean count of bad pixels a view is above this."""
+    grad_threshold: float = 2e-4
+    """Clone when the mean gradient of the projected centre (NDC) is at least this."""
+    abs_grad_threshold: float = 7e-4
+    """Split when the mean absolute gradient of the projected centre (NDC) is at least this."""
+    dense: float = 0.001
+    """Surfels larger than this share of the scene extent are split, smaller ones are cloned."""
+    prune_opacity: float = 0.005
+    """Surfels below this opacity are candidates for pruning."""
+    prune_world: float = 0.1
+    """Surfels larger than this share of the scene extent are candidates for pruning."""
+    prune_screen: float = 20.0
+    """Surfels with a larger radius on screen, in pixels, are candidates for pruning after the first opacity reset."""
+    prune_budget: float = 0.5
+    """Share of the candidates that is drawn for pruning at each densification."""
+    opacity_clamp: float = 0.8
+    """Opacities are clamped to this at each densification."""
+    reset_interval: int = 3000
+    """Steps between opacity resets (until `stop`)."""
+    reset_opacity: float = 0.01
+    """Opacity after a reset, at most."""
+    final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
+    """Steps of the final multi-view prunes."""
+    final_prune_opacity: float = 0.1
+    """Final prunes remove surfels below this opacity."""
+    final_prune_score: float = 0.9
+    """Final prunes remove surfels whose multi-view error score (0 to 1) is above this."""
+    max_surfels: int = 0
+    """Hard cap on the number of surfels; 0 = none."""
+    min_surfels: int = 100
+    """No prune leaves fewer surfels than this."""
+
+
+@dataclass
+class LearningRates:
+    """Learning rates; pairs decay log-linearly from the first to the second over the run."""
+
+    means: tuple[float, float] = (1.6e-4, 1.6e-6)
+    """Times the scene extent."""
+    quats: float = 1e-3
+    log_scales: float = 5e-3
+    opacity_logits: float = 0.025
+    beta_raw: float = 5e-3
+    view_color: tuple[float, float] = (2.5e-3, 5e-4)
+    """View-dependent colour: sv_rgb, sh_dc, sb_base and sg_base."""
+    view_shape: tuple[float, float] = (5e-3, 5e-4)
+    """View-dependent colour: Voronoi sites and temperatures, lobes; higher SH bands use a twentieth of view_color."""
+    field_table: tuple[float, float] = (1e-2, 1e-3)
+    field_mlp: tuple[float, float] = (1e-3, 1e-4)
+
+
+@dataclass
+class TrainConfig:
+    """How a scene is trained."""
+
+    loss: LossConfig = field(default_factory=LossConfig)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    lr: LearningRates = field(default_factory=LearningRates)
+    freeze_after: int = 5000
+    """From this step on the texture field learns on one step in `freeze_every` only."""
+    freeze_every: int = 10
+    """1 = no freezing."""
+    field_warmup: int = 500
+    """Steps over which the learning rate of the texture field rises to its full value."""
+    resolution_schedule: int = 3000
+    """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout."""
+    num_downscales: int = 2
+    """How many times the image size is halved at the start."""
+    init_opacity: float = 0.1
+    """Opacity of the first surfels."""
+    random_points: int = 20_000
+    """Surfels placed at random in the scene box when the capture has no sparse points."""
+    background: Literal["black", "white", "random"] = "black"
+    """Colour behind the scene while training; images with alpha are composed over it."""
+    seed: int = 0
+    """Seed of every random choice in training."""

@@ -1,0 +1,79 @@
+# make setup   virtual environment, pinned dependencies, compiled extension
+# make demo    train, bake and evaluate the sample scene (or DATA=folder) into demo/
+# make test    the test suite
+# make lint    ruff and clang-format
+# Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip --disable-pip-version-check
+DATA   ?=
+
+TORCH       := torch==2.13.0
+TORCHVISION := torchvision==0.28.0
+CPU_INDEX   := https://download.pytorch.org/whl/cpu
+CXX_FILES   := $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name '*.hpp')
+
+export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
+
+.PHONY: setup demo test lint format clean
+.DELETE_ON_ERROR:
+
+setup: $(VENV)/.stamp-build
+
+$(VENV)/.stamp-venv:
+	@command -v $(PYTHON) >/dev/null || { \
+	  echo "No '$(PYTHON)' found. Install Python 3.10, 3.11 or 3.12, or run: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' || { \
+	  echo "$$($(PYTHON) -V) is not supported: nerfstudio needs 3.10, 3.11 or 3.12. Run: make PYTHON=python3.11" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "This Python has no venv module (on Debian and Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	@command -v $${CXX:-c++} >/dev/null || { \
+	  echo "No C++ compiler found (on Debian and Ubuntu: apt install g++)" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@touch $@
+
+# torch first, so that nothing else chooses it. Without an NVIDIA GPU its CPU build is enough: a tenth of the size. It
+# comes from PyTorch's own index; where that cannot be reached, whatever the configured index has is taken.
+$(VENV)/.stamp-torch: $(VENV)/.stamp-venv
+	@if command -v nvidia-smi >/dev/null; then \
+	  $(PIP) install -q $(TORCH) $(TORCHVISION); \
+	else \
+	  $(PIP) install -q --retries 0 --timeout 5 --extra-index-url $(CPU_INDEX) $(TORCH)+cpu $(TORCHVISION)+cpu \
+	    2>/dev/null \
+	  || { echo "No CPU wheels of torch and torchvision from $(CPU_INDEX): taking the default ones"; \
+	       $(PIP) install -q $(TORCH) && $(PIP) install -q --no-deps $(TORCHVISION); }; \
+	fi
+	@touch $@
+
+$(VENV)/.stamp-deps: $(VENV)/.stamp-torch constraints.txt pyproject.toml scripts/torchvision_remedy.py
+	$(PIP) install -q -c constraints.txt nerfstudio==1.1.5 scikit-build-core nanobind cmake ninja \
+	  $$($(BIN)/python scripts/requirements.py)
+	$(BIN)/python scripts/torchvision_remedy.py
+	@touch $@
+
+# Editable: changes to Python are live, changes to C++ need another make (seconds: build/ is kept).
+$(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(CXX_FILES)
+	$(PIP) install -q --no-build-isolation --no-deps -e .
+	@touch $@
+
+demo: setup
+	PATH="$(CURDIR)/$(BIN):$$PATH" bash scripts/demo.sh $(DATA)
+
+test: setup
+	$(BIN)/python -m pytest -q
+
+lint: $(VENV)/.stamp-deps
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run -Werror $(CXX_FILES)
+
+format: $(VENV)/.stamp-deps
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(CXX_FILES)
+
+clean:
+	rm -rf build demo .pytest_cache .ruff_cache .hypothesis
+	rm -f $(VENV)/.stamp-build

@@ -1,0 +1,27 @@
+"""Where the preset files (method_configs/*.yaml) are, in a wheel and in a source checkout."""
+
+from pathlib import Path
+
+
+def preset_dir() -> Path:
+    """The folder of the presets: inside the installed package, or beside it in a source checkout."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "method_configs", package.parent / "method_configs"):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(
+        f"the presets (method_configs/*.yaml) are missing from {package} and {package.parent}; reinstall bitymi-ns"
+    )
+
+
+def preset_names() -> list[str]:
+    """Names of all presets, sorted."""
+    return sorted(path.stem for path in preset_dir().glob("*.yaml"))
+
+
+def preset_path(name: str) -> Path:
+    """The YAML file of the preset `name` (a method name such as "bitymi-quality")."""
+    path = preset_dir() / f"{name}.yaml"
+    if not path.is_file():
+        raise FileNotFoundError(f'no preset named "{name}"; there are: {", ".join(preset_names()) or "none"}')
+    return path

@@ -1,0 +1,22 @@
+#!/usr/bin/env python3
+"""Print the project's requirements with its dev extra, one a line without spaces, for the Makefile's pip call."""
+
+import re
+from pathlib import Path
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10: the one that comes inside pip
+    from pip._vendor import tomli as tomllib
+
+
+def main() -> None:
+    """Read pyproject.toml beside this folder and print."""
+    pyproject = Path(__file__).resolve().parent.parent / "pyproject.toml"
+    project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
+    for requirement in project["dependencies"] + project["optional-dependencies"]["dev"]:
+        print(re.sub(r"\s", "", requirement))
+
+
+if __name__ == "__main__":
+    main()

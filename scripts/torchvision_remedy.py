@@ -1,0 +1,113 @@
+#!/usr/bin/env python3
+"""Make a CUDA build of torchvision importable beside a CPU build of torch, in this virtual environment.
+
+`pip install torchvision` brings a build whose compiled operators need CUDA libraries. Beside a CPU torch they are left
+out without a word, and `import torchvision` then fails with "operator torchvision::nms does not exist", taking all of
+nerfstudio with it. The better cure is the matching CPU wheel from https://download.pytorch.org/whl/cpu; where it cannot
+be had, this script declares the two missing operators (declares only: calling them stays an error).
+
+It does nothing unless the import fails with just that message. Otherwise it writes a module and a .pth file into
+site-packages; the module acts only when torchvision is first imported, and only for this mismatch, so it is harmless
+after torch or torchvision are replaced. `--remove` deletes both files.
+"""
+
+import argparse
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+SHIM_NAME = "_torchvision_cpu_shim"
+SYMPTOM = "operator torchvision::nms does not exist"
+
+SHIM = '''"""Written by scripts/torchvision_remedy.py: lets a CUDA torchvision import beside a CPU torch."""
+
+import importlib.abc
+import importlib.machinery
+import sys
+
+
+def _mismatch(spec):
+    """Whether torchvision is a CUDA build and torch is not."""
+    import os
+
+    try:
+        with open(os.path.join(os.path.dirname(spec.origin), "version.py"), encoding="utf-8") as file:
+            if "+cu" not in file.read():
+                return False
+    except (OSError, TypeError):
+        return False
+    import torch
+
+    return torch.version.cuda is None
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Finds nothing; declares the missing operators when torchvision is first looked up."""
+
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname != "torchvision":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.machinery.PathFinder.find_spec(fullname, path, target)
+        if spec is not None and _mismatch(spec):
+            import torch
+
+            # FRAGMENT: may be declared beside another library of the same name. Kept alive as an attribute.
+            self.library = torch.library.Library("torchvision", "FRAGMENT")
+            self.library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+            self.library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+            sys.modules[__name__].library = self.library
+        return None
+
+
+sys.meta_path.insert(0, _Finder())
+'''
+
+
+def shim_files() -> tuple[Path, Path]:
+    """The shim module and the .pth file that loads it at start-up, in this environment's site-packages."""
+    site = Path(sysconfig.get_paths()["purelib"])
+    return site / f"{SHIM_NAME}.py", site / f"{SHIM_NAME}.pth"
+
+
+def import_error() -> str:
+    """What `import torchvision` prints to stderr when it fails in a fresh interpreter; empty when it works."""
+    result = subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, text=True, check=False)
+    return result.stderr if result.returncode else ""
+
+
+def main() -> int:
+    """Apply or remove the remedy; 0 when torchvision imports afterwards."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--remove", action="store_true", help="delete what an earlier run wrote")
+    args = parser.parse_args()
+    if sys.prefix == sys.base_prefix:
+        print("torchvision remedy: run this with the Python of a virtual environment", file=sys.stderr)
+        return 2
+    module, pth = shim_files()
+    if args.remove:
+        for path in (pth, module):
+            path.unlink(missing_ok=True)
+        return 0
+    error = import_error()
+    if not error:
+        print("torchvision imports: nothing to do")
+        return 0
+    if SYMPTOM not in error:
+        print(f"import torchvision fails for another reason, left alone:\n{error}", file=sys.stderr)
+        return 1
+    module.write_text(SHIM, encoding="utf-8")
+    pth.write_text(f"import {SHIM_NAME}\n", encoding="utf-8")
+    error = import_error()
+    if error:
+        for path in (pth, module):
+            path.unlink(missing_ok=True)
+        print(f"the remedy did not help and was taken back:\n{error}", file=sys.stderr)
+        return 1
+    print(f"torchvision is a CUDA build beside a CPU torch: missing operators are declared by {module}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""Where a bundle's config.yml finds its bundle.
+
+nerfstudio's tools read a config.yml and then look for a checkpoint at the place recorded in it. A bundle has none, and
+may have been moved since. The functions here find the bundle and give nerfstudio a stand-in for the checkpoint.
+"""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from nerfstudio.models.base_model import ModelConfig
+
+from bitymi_ns.host.errors import fail
+
+MANIFEST = "bundle.json"
+
+
+def _model_class() -> type:
+    from bitymi_ns.host.bundle_model import BakedModel
+
+    return BakedModel
+
+
+@dataclass
+class BakedModelConfig(ModelConfig):
+    """A scene baked into a bundle."""
+
+    _target: type = field(default_factory=_model_class)
+    enable_collider: bool = False
+    bundle: Path = Path()
+    """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour behind the scene."""
+
+
+def find_bundle(recorded: Path) -> Path:
+    """The folder of the bundle whose config.yml is being loaded."""
+    candidates = [*_loaded_from(), recorded]
+    for folder in candidates:
+        if (folder / MANIFEST).is_file():
+            return folder.absolute()
+    places = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
+    fail(f"no bundle found (looked for {MANIFEST} in {places}). Keep config.yml in the bundle's folder.")
+
+
+def _loaded_from() -> list[Path]:
+    """The folder of the config.yml that is being loaded, which nerfstudio does not pass on.
+
+    It is `config_path` in the frame of nerfstudio's eval_setup, from where this is called; or, should that change, the
+    argument of --load-config on the command line.
+    """
+    folders = []
+    frame = sys._getframe()
+    while frame is not None:
+        if frame.f_code.co_name == "eval_setup" and isinstance(frame.f_locals.get("config_path"), Path):
+            folders.append(frame.f_locals["config_path"].absolute().parent)
+        frame = frame.f_back
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config"):
+            value = value or (sys.argv[i + 1] if i + 1 < len(sys.argv) else "")
+            folders.append(Path(value).absolute().parent)
+    return folders
+
+
+def stub_checkpoint_dir(bundle: Path) -> Path:
+    """A temporary folder with an empty checkpoint, named after the bundle.
+
+    nerfstudio insists on a checkpoint file. It is not kept in the bundle, so that a bundle holds no pickled data.
+    """
+    scratch = Path(tempfile.mkdtemp(prefix="bitymi-"))
+    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
+    folder = scratch / bundle.name / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    torch.save(
+        {"step": 0, "pipeline": {}, "optimizers": {}, "schedulers": {}, "scalers": {}}, folder / "step-000000000.ckpt"
+    )
+    return folder

@@ -1,0 +1,159 @@
+"""nerfstudio configurations of the registered methods, made from the presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.optimizers import OptimizerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, stub_checkpoint_dir
+from bitymi_ns.host.datamanager import BitymiDataManagerConfig
+from bitymi_ns.host.device import default_device_type, has_cuda_kernels
+from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
+from bitymi_ns.host.pipeline import BitymiPipelineConfig
+from bitymi_ns.host.preset import OptimizerOptions, Preset, load_preset
+from bitymi_ns.host.trainer import BitymiTrainer
+
+
+@dataclass
+class BitymiTrainerConfig(TrainerConfig):
+    """Configuration of a training run."""
+
+    _target: type = field(default_factory=lambda: BitymiTrainer)
+    vis: Literal[
+        "none",
+        "viewer",
+        "wandb",
+        "tensorboard",
+        "comet",
+        "viewer+wandb",
+        "viewer+tensorboard",
+        "viewer+comet",
+        "viewer_legacy",
+    ] = "viewer"
+    """Which visualizer to use; none = no viewer and no log but the training curve."""
+    max_num_iterations: int | None = None
+    """Length of the run in steps; all schedules scale with it. Not given: `default_iterations`, or on a machine without
+    a supported GPU `default_iterations_cpu`. A resumed run ends at this step in total, by default where the interrupted
+    run would have ended."""
+    default_iterations: int = 30_000
+    """Steps of a run on a GPU when --max-num-iterations is not given."""
+    default_iterations_cpu: int = 3_000
+    """Steps of a run on a CPU when --max-num-iterations is not given."""
+    steps_per_save: int | None = None
+    """Number of steps between checkpoints; not given: `default_saves` over the run."""
+    default_saves: int = 5
+    """Checkpoints written over a run when --steps-per-save is not given."""
+
+    def set_timestamp(self) -> None:
+        """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
+        super().set_timestamp()
+        self._make_paths_absolute()
+        if self.load_dir is None and self.load_checkpoint is None:
+            self.resolve_length()  # a resumed run learns its length from the checkpoint
+
+    def resolve_length(self, trained_for: int | None = None) -> None:
+        """Fill in the length of the run where it was not given.
+
+        Args:
+            trained_for: the length of the run that is resumed.
+        """
+        on_cpu = self.machine.device_type == "cpu"
+        if self.max_num_iterations is None:
+            self.max_num_iterations = trained_for or (
+                self.default_iterations_cpu if on_cpu else self.default_iterations
+            )
+            if on_cpu and trained_for is None:
+                why = "no kernels for the GPU in this installation" if torch.cuda.is_available() else "no GPU"
+                CONSOLE.print(
+                    f"[bold yellow]Training on the CPU ({why}): a short schedule of {self.max_num_iterations:,} steps. "
+                    f"For the full one: --max-num-iterations {self.default_iterations}"
+                )
+        if self.max_num_iterations < 1:
+            raise SystemExit(f"bitymi: --max-num-iterations must be at least 1, not {self.max_num_iterations}")
+        if self.steps_per_save is None:
+            self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
+
+    def _make_paths_absolute(self) -> None:
+        """So that config.yml can be used from any folder."""
+        datamanager = self.pipeline.datamanager
+        for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
+            path = getattr(owner, "data", None)
+            if path is not None:
+                owner.data = Path(path).expanduser().absolute()
+
+    def is_viewer_enabled(self) -> bool:
+        return self.vis != "none" and super().is_viewer_enabled()
+
+    def get_checkpoint_dir(self) -> Path:
+        """The folder of the checkpoints; for the configuration in a bundle, a stand-in that satisfies nerfstudio.
+
+        nerfstudio's tools ask here before they build the model, so this is also where a bundle that was moved is found.
+        """
+        model = self.pipeline.model
+        if not isinstance(model, BakedModelConfig):
+            return super().get_checkpoint_dir()
+        model.bundle = find_bundle(model.bundle)
+        return stub_checkpoint_dir(model.bundle)
+
+
+@dataclass
+class BitymiAdamConfig(OptimizerConfig):
+    """Adam; the learning rate is set at every step from the preset's schedule."""
+
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay of the running averages."""
+    fused: bool = True
+    """Update all entries of a tensor in one pass."""
+
+
+def optimizers(options: OptimizerOptions) -> dict[str, Any]:
+    """nerfstudio's optimiser dictionary: one Adam a parameter group, no scheduler (the model sets the rates)."""
+    return {
+        group: {"optimizer": BitymiAdamConfig(lr=1e-3, eps=options.eps, betas=options.betas), "scheduler": None}
+        for group in PARAMETER_GROUPS
+    }
+
+
+def trainer_config(preset: Preset) -> BitymiTrainerConfig:
+    """The configuration of a training run by a preset."""
+    trainer, data = preset.trainer, preset.data
+    dataparser = NerfstudioDataParserConfig(
+        eval_mode=data.eval_mode, eval_interval=data.eval_interval, load_3D_points=data.load_3D_points
+    )
+    return BitymiTrainerConfig(
+        method_name=preset.name,
+        machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]
+        default_iterations=trainer.iterations,
+        default_iterations_cpu=trainer.iterations_cpu,
+        default_saves=trainer.saves,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
+        mixed_precision=False,
+        pipeline=BitymiPipelineConfig(
+            datamanager=BitymiDataManagerConfig(
+                dataparser=dataparser,
+                cache_images_type=data.cache_images_type,
+                cache_images="gpu" if has_cuda_kernels() else "cpu",
+            ),
+            model=BitymiModelConfig(scene=preset.scene, train=preset.train, curve_points=trainer.curve_points),
+        ),
+        optimizers=optimizers(preset.optimizer),
+        viewer=ViewerConfig(quit_on_train_completion=trainer.quit_on_train_completion),
+        vis=trainer.vis,  # type: ignore[arg-type]
+    )
+
+
+def method_config(name: str) -> MethodSpecification:
+    """The registry entry of the preset `name`."""
+    preset = load_preset(name)
+    return MethodSpecification(config=trainer_config(preset), description=preset.description)

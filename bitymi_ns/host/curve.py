@@ -1,0 +1,71 @@
+"""The training curve: quality against time, one JSON object a line, written while a run goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+FILE = "training_curve.jsonl"
+
+
+class Stopwatch:
+    """Wall-clock and CPU seconds of the training steps alone: evaluation, saving and loading are not counted."""
+
+    def __init__(self, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
+        self.seconds = seconds
+        self.cpu_seconds = cpu_seconds
+        self._started: tuple[float, float] | None = None
+
+    def start(self) -> None:
+        self._started = (time.perf_counter(), time.process_time())
+
+    def stop(self) -> None:
+        if self._started is not None:
+            self.seconds += time.perf_counter() - self._started[0]
+            self.cpu_seconds += time.process_time() - self._started[1]
+            self._started = None
+
+
+class TrainingCurve:
+    """Appends points to the file of a run."""
+
+    def __init__(self, path: Path, resumed_from: Path | None = None, last_step: int = -1) -> None:
+        """
+        Args:
+            path: the file; a new run starts it afresh.
+            resumed_from: curve of the run that is continued; its points up to `last_step` are taken over.
+            last_step: last step that the checkpoint contains.
+        """
+        self.path = path
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        source = resumed_from if resumed_from is not None else path if last_step >= 0 else None
+        kept = _points_until(source, last_step) if source is not None and source.is_file() else []
+        unfinished = path.with_name(path.name + ".new")
+        unfinished.write_text("".join(line + "\n" for line in kept), "utf8")
+        os.replace(unfinished, path)
+
+    def add(self, point: dict[str, Any]) -> None:
+        """Write one point, whole and at once."""
+        with open(self.path, "a", encoding="utf8") as file:
+            file.write(json.dumps(point) + "\n")
+
+
+def _points_until(path: Path, last_step: int) -> list[str]:
+    kept = []
+    for line in path.read_text("utf8").splitlines():
+        try:
+            if json.loads(line)["step"] <= last_step:
+                kept.append(line)
+        except (ValueError, KeyError, TypeError):
+            continue  # cut off when the run was killed
+    return kept
+
+
+def points(total: int, count: int) -> frozenset[int]:
+    """The steps after which the curve gets a point: `count` of them, evenly spaced, the last step included."""
+    if count <= 0:
+        return frozenset()
+    return frozenset(max(0, round(total * (i + 1) / count) - 1) for i in range(count))

@@ -1,0 +1,156 @@
+"""nerfstudio's full-image data manager with a resumable training order and views for multi-view scoring."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns.host.capture import check_capture, reporting_input_errors
+from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
+from bitymi_ns.host.errors import fail
+
+FEW_VIEWS = 10
+"""With fewer training views than this the multi-view scores rest on little."""
+
+
+@dataclass
+class BitymiDataManagerConfig(FullImageDatamanagerConfig):
+    """Configuration of the data manager."""
+
+    _target: type = field(default_factory=lambda: BitymiDataManager)
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """The image type that is kept in memory; uint8 takes a quarter of the space."""
+
+
+class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
+    """Full images and their cameras.
+
+    The view of a training step is a function of the seed and the step alone, so that a resumed run sees the views that
+    the uninterrupted one would have seen: each epoch of n steps is a permutation of the n views.
+    """
+
+    config: BitymiDataManagerConfig
+
+    def __init__(
+        self,
+        config: BitymiDataManagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        **kwargs: Any,
+    ) -> None:
+        check_capture(config)
+        with reporting_input_errors(config):
+            super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
+        self._epoch: tuple[int, list[int]] = (-1, [])
+        self._check_images(test_mode)
+        outputs = self.train_dataparser_outputs
+        color = outputs.alpha_color
+        self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
+        self.train_dataset.metadata["has_alpha"] = bool(outputs.image_filenames) and file_has_transparency(
+            outputs.image_filenames[0]
+        )
+        self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
+
+    @property
+    def dataset_type(self) -> type[BitymiDataset]:  # type: ignore[override]
+        return BitymiDataset
+
+    def sample_train_cameras(self) -> list[int]:
+        """The training views; their order comes from `train_index`. nerfstudio's base class asks for this."""
+        if len(self.train_dataset) == 0:
+            fail(
+                f"no image is left for training in {self.config.data}: all {len(self.eval_dataset)} are held out for "
+                "evaluation. Take more photographs, or train on all of them with `nerfstudio-data --eval-mode all`."
+            )
+        return list(range(len(self.train_dataset)))
+
+    def _check_images(self, test_mode: str) -> None:
+        """Stop, or warn, before any time is spent on a capture that cannot give a scene."""
+        count = len(self.train_dataset)
+        if test_mode == "inference":
+            return
+        names = [*self.train_dataset.image_filenames, *self.eval_dataset.image_filenames]
+        missing = [path for path in dict.fromkeys(names) if not Path(path).is_file()]
+        if missing:
+            some = "\n  ".join(str(path) for path in missing[:3])
+            fail(
+                f"{len(missing)} of {len(set(names))} images of the capture are missing:\n  {some}\n"
+                "Poses without images cannot be used: copy the images there or remove the frames."
+            )
+        if count == 1 and test_mode == "val":
+            fail(
+                f"only one training view in {self.config.data}. A scene cannot be learned from one image: take "
+                "photographs from more sides."
+            )
+        if count < FEW_VIEWS and test_mode == "val":
+            CONSOLE.print(
+                f"[bold yellow]Only {count} training views: all of them are used for multi-view scoring, and views "
+                "from elsewhere will look poor. Twenty or more photographs are advisable."
+            )
+
+    def _load_images(
+        self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
+    ) -> list[dict[str, torch.Tensor]]:
+        # "cpu" means pinned memory there, which needs CUDA; "gpu" means self.device, whatever it is
+        device = cache_images_device if torch.cuda.is_available() else "gpu"
+        with reporting_input_errors(self.config):
+            images = super()._load_images(split, device)  # type: ignore[arg-type]
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        # undistorted now, and their intrinsics changed with them
+        if dataset.cameras.distortion_params is not None:
+            dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
+        self.train_cameras = self.train_dataset.cameras.to(self.device)
+        return images
+
+    def train_index(self, step: int) -> int:
+        """The training view of a step."""
+        count = len(self.train_dataset)
+        epoch = step // count
+        if self._epoch[0] != epoch:
+            order = list(range(count))
+            random.Random(self.config.train_cameras_sampling_seed * 1_000_003 + epoch).shuffle(order)
+            self._epoch = (epoch, order)
+        return self._epoch[1][step % count]
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        return self.train_view(self.train_index(step))
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """The held-out views in turn, without drawing from a shared random generator."""
+        return self.eval_view(step % len(self.eval_dataset))
+
+    def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
+        """Camera and batch of a training view; the order of training is not touched."""
+        data = self._batch(self.cached_train[index])
+        camera = self.train_cameras[index : index + 1].to(self.device)
+        camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
+        return camera, data
+
+    def eval_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
+        """Camera and batch of a held-out view."""
+        data = self._batch(self.cached_eval[index])
+        return self.eval_dataset.cameras[index : index + 1].to(self.device), data
+
+    def _batch(self, cached: dict[str, Any]) -> dict[str, Any]:
+        data = dict(cached)
+        data["image"] = data["image"].to(self.device)
+        return data
+
+    def undistorted_train_cameras(self) -> Cameras:
+        """All training cameras, as they belong to the images in memory."""
+        distortion = self.train_dataset.cameras.distortion_params
+        if distortion is not None and bool((distortion != 0).any()):
+            _ = self.cached_train  # undistorts, which changes the intrinsics
+        return self.train_dataset.cameras

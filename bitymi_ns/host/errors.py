@@ -1,0 +1,24 @@
+"""How the nerfstudio commands report what a user can put right: one clear message, no traceback, exit status 1."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+
+class InputError(SystemExit):
+    """Something about the input is wrong. Python prints the message to stderr and exits with status 1.
+
+    A SystemExit rather than an Exception: nerfstudio's commands have no error handling of their own, and a traceback
+    through them hides what the user can do about it.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(f"bitymi: {message}")
+
+    def __str__(self) -> str:
+        return str(self.code)
+
+
+def fail(message: str, cause: BaseException | None = None) -> NoReturn:
+    """Raise InputError(message), remembering `cause` for debuggers."""
+    raise InputError(message) from cause

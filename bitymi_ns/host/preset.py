@@ -1,0 +1,164 @@
+"""Presets: the YAML files of method_configs/ as checked dataclasses."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Union
+
+import yaml
+
+from bitymi_ns.presets import preset_dir
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import TrainConfig
+
+
+class PresetError(ValueError):
+    """A preset file that cannot be used; the message names the file and the key."""
+
+
+@dataclass
+class TrainerOptions:
+    """How long a run is and what it leaves behind."""
+
+    iterations: int = 30_000
+    """Steps of a run when --max-num-iterations is not given."""
+    iterations_cpu: int = 3_000
+    """The same on a machine without a supported GPU."""
+    saves: int = 5
+    """Checkpoints written over a run."""
+    curve_points: int = 20
+    """Evaluations over a run, for the curve of quality against time; 0 = none."""
+    vis: str = "viewer"
+    """Default of --vis."""
+    quit_on_train_completion: bool = True
+    """End the process when training is done, also with the viewer."""
+
+
+@dataclass
+class DataOptions:
+    """How a capture is split and read."""
+
+    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
+    eval_interval: int = 8
+    load_3D_points: bool = True
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+
+
+@dataclass
+class OptimizerOptions:
+    """Adam's constants."""
+
+    eps: float = 1e-15
+    betas: tuple[float, float] = (0.9, 0.999)
+
+
+@dataclass
+class Preset:
+    """One method: everything its YAML file says."""
+
+    name: str
+    description: str = ""
+    trainer: TrainerOptions = field(default_factory=TrainerOptions)
+    data: DataOptions = field(default_factory=DataOptions)
+    optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    bake: dict[str, Any] = field(default_factory=dict)
+    """Defaults of `ns-export bitymi-atlas`, by option name."""
+
+
+def load_preset(name: str, folder: Path | None = None) -> Preset:
+    """Read the preset `name` from `folder` (default: the installed presets).
+
+    Raises:
+        PresetError: the file is missing or is not a valid preset.
+    """
+    folder = preset_dir() if folder is None else folder
+    path = folder / f"{name}.yaml"
+    values = _read_with_base(path, folder, ())
+    return _build(Preset, {**values, "name": name}, path.name, "")
+
+
+def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    """The mapping of a preset file, laid over that of its `base`."""
+    if path in above:
+        raise PresetError(f"{path.name}: base: presets refer to each other in a circle")
+    if not path.is_file():
+        where = f" (named as base of {above[-1].name})" if above else ""
+        raise PresetError(f"there is no preset file {path}{where}; reinstall bitymi-ns")
+    try:
+        values = yaml.safe_load(path.read_text("utf8"))
+    except yaml.YAMLError as error:
+        raise PresetError(f"{path.name}: not valid YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise PresetError(f"{path.name}: expected a mapping of options, found {type(values).__name__}")
+    base = values.pop("base", None)
+    if base is None:
+        return values
+    if not isinstance(base, str):
+        raise PresetError(f"{path.name}: base: expected the name of a preset, found {base!r}")
+    return _merged(_read_with_base(folder / f"{base}.yaml", folder, (*above, path)), values)
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    result = dict(below)
+    for key, value in above.items():
+        if isinstance(value, dict) and isinstance(result.get(key), dict):
+            value = _merged(result[key], value)
+        result[key] = value
+    return result
+
+
+def _build(cls: type, values: dict[str, Any], file: str, prefix: str) -> Any:
+    """An instance of the dataclass `cls` from a mapping; unknown keys and wrong types are errors."""
+    hints = typing.get_type_hints(cls)
+    known = [f.name for f in dataclasses.fields(cls)]
+    for key in values:
+        if key not in known:
+            raise PresetError(f"{file}: {prefix}{key}: unknown key; known here: {', '.join(known)}")
+    return cls(**{key: _converted(value, hints[key], file, prefix + key) for key, value in values.items()})
+
+
+def _converted(value: Any, hint: Any, file: str, key: str) -> Any:
+    """`value` as the type `hint` asks for."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        return _converted(value, next(a for a in args if a is not type(None)), file, key)
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise PresetError(f"{file}: {key}: expected a group of options, found {value!r}")
+        return _build(typing.cast(type, hint), value, file, key + ".")
+    if origin is Literal:
+        if value not in args:
+            raise PresetError(f"{file}: {key}: expected one of {', '.join(map(str, args))}, found {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list) or (args[-1] is not Ellipsis and len(value) != len(args)):
+            count = "" if args[-1] is Ellipsis else f" of {len(args)} values"
+            raise PresetError(f"{file}: {key}: expected a list{count}, found {value!r}")
+        items = [args[0]] * len(value) if args[-1] is Ellipsis else args
+        return tuple(_converted(v, a, file, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, items, strict=True)))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise PresetError(f"{file}: {key}: expected a group of options, found {value!r}")
+        return value
+    return _converted_plain(value, hint, file, key)
+
+
+def _converted_plain(value: Any, hint: Any, file: str, key: str) -> Any:
+    if hint is float and isinstance(value, (int, float, str)) and not isinstance(value, bool):
+        try:
+            return float(value)  # YAML 1.1 reads 1e-3, without a point, as text
+        except ValueError:
+            pass
+    elif hint is Path and isinstance(value, str):
+        return Path(value)
+    elif isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
+        return value
+    raise PresetError(f"{file}: {key}: expected {getattr(hint, '__name__', hint)}, found {value!r}")

@@ -1,0 +1,123 @@
+"""nerfstudio's trainer with exact resumption, crash-safe checkpoints and an orderly end on Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns.host import checkpoints
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, by the convention of shells."""
+
+
+class _StopAfterStep(Exception):
+    """Raised at the end of a training step after which the run is to stop."""
+
+
+class BitymiTrainer(Trainer):
+    """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one."""
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        super().setup(test_mode)
+        self._stop_requested = False
+        # after all other callbacks of a step: the state is then complete and can be saved
+        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._stop_if_asked))
+
+    def _stop_if_asked(self, step: int) -> None:
+        if self._stop_requested:
+            raise _StopAfterStep
+
+    def _load_checkpoint(self) -> None:
+        config = self.config
+        if config.load_dir is not None or config.load_checkpoint is not None:
+            if config.load_dir is not None:
+                step = config.load_step if config.load_step is not None else checkpoints.newest_step(config.load_dir)
+                path = Path(config.load_dir) / f"step-{step:09d}.ckpt"
+            else:
+                path = Path(config.load_checkpoint)
+            self._restore(checkpoints.load(path))
+            CONSOLE.print(f"Resuming after step {self._start_step - 1} from {path}")
+        config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self._start_step = state["step"] + 1
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        self.optimizers.load_optimizers(state["optimizers"])
+        if "schedulers" in state and self.config.load_scheduler:
+            self.optimizers.load_schedulers(state["schedulers"])
+        self.grad_scaler.load_state_dict(state["scalers"])
+
+    def train(self) -> None:
+        """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
+        total = self.config.max_num_iterations
+        if self._start_step >= total:
+            CONSOLE.print(
+                f"[bold yellow]Nothing to do: the checkpoint has {self._start_step:,} of {total:,} steps. "
+                "For a longer run give a larger --max-num-iterations."
+            )
+            return
+        self._stop_requested = False
+        restore_handler = self._catch_interrupt()
+        self.config.max_num_iterations = total - self._start_step
+        try:
+            super().train()
+        except _StopAfterStep:
+            self.save_checkpoint(self.step)
+            self._report_interruption()
+        except KeyboardInterrupt:
+            if self.training_state != "completed":  # else only the viewer was left to quit
+                self._report_interruption()
+        finally:
+            self.config.max_num_iterations = total
+            restore_handler()
+
+    def _catch_interrupt(self) -> Callable[[], None]:
+        """Let the first Ctrl-C end the run after the current step; returns what undoes that."""
+        if threading.current_thread() is not threading.main_thread():
+            return lambda: None
+        previous = signal.getsignal(signal.SIGINT)
+
+        def on_interrupt(number: int, frame: Any) -> None:
+            if self._stop_requested or self.training_state == "completed":
+                raise KeyboardInterrupt
+            self._stop_requested = True
+            CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
+
+        signal.signal(signal.SIGINT, on_interrupt)
+        return lambda: signal.signal(signal.SIGINT, previous)
+
+    def _report_interruption(self) -> None:
+        saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
+        if saved:
+            hint = f"The newest checkpoint is {saved[-1]}; resume with\n  --load-dir {self.checkpoint_dir}"
+        else:
+            hint = "No checkpoint had been written yet."
+        CONSOLE.print(f"[bold yellow]Training was interrupted.[/bold yellow] {hint}", soft_wrap=True)
+        raise SystemExit(INTERRUPTED)
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Write the checkpoint of a finished step; older ones are removed only after that."""
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        pipeline = getattr(self.pipeline, "module", self.pipeline)
+        state = {
+            "step": step,
+            "pipeline": pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        checkpoints.save(state, path, scratch=self.base_dir)
+        if self.config.save_only_latest_checkpoint:
+            for other in self.checkpoint_dir.glob("*.ckpt"):
+                if other != path:
+                    other.unlink(missing_ok=True)

@@ -1,0 +1,89 @@
+"""Presets state every option once, and errors name the file and the key."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bitymi_ns.host.preset import PresetError, load_preset
+from bitymi_ns.presets import preset_names, preset_path
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import TrainConfig
+
+METHODS = ["bitymi", "bitymi-quality", "bitymi-sb", "bitymi-sg", "bitymi-sh", "bitymi-notexture"]
+
+
+def missing_keys(cls: type, values: dict, prefix: str = "") -> list[str]:
+    missing = []
+    for field in dataclasses.fields(cls):
+        if field.name not in values:
+            missing.append(prefix + field.name)
+        elif isinstance(values[field.name], dict):
+            missing += missing_keys(type(field.default_factory()), values[field.name], f"{prefix}{field.name}.")
+    return missing
+
+
+def test_the_presets_are_those_that_are_registered() -> None:
+    assert sorted(METHODS) == preset_names()
+
+
+def test_the_default_preset_states_every_option() -> None:
+    values = yaml.safe_load(preset_path("bitymi").read_text("utf8"))
+    assert missing_keys(SceneConfig, values["scene"]) == []
+    assert missing_keys(TrainConfig, values["train"]) == []
+
+
+def test_the_default_preset_agrees_with_the_declared_defaults() -> None:
+    preset = load_preset("bitymi")
+    assert preset.scene == SceneConfig()
+    assert preset.train == TrainConfig()
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_preset_loads_and_describes_itself(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.name == name
+    assert len(preset.description) > 20
+
+
+def test_the_variants_differ_where_they_should() -> None:
+    base = load_preset("bitymi")
+    quality = load_preset("bitymi-quality")
+    assert quality.train.loss.falloff_weight == 0.0 and base.train.loss.falloff_weight == 0.005
+    assert quality.scene == base.scene
+    assert [load_preset(f"bitymi-{c}").scene.view_color for c in ("sh", "sb", "sg")] == ["sh", "sb", "sg"]
+    assert load_preset("bitymi-notexture").scene.texture == "none"
+
+
+def write(folder: Path, text: str, name: str = "mine") -> Path:
+    (folder / f"{name}.yaml").write_text(text, "utf8")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("train:\n  loss:\n    falloff_wieght: 1.0", r"mine\.yaml: train\.loss\.falloff_wieght: unknown key"),
+        ("scene:\n  levels: four", r"mine\.yaml: scene\.levels: expected int, found 'four'"),
+        ("scene:\n  levels: true", r"scene\.levels: expected int"),
+        ("scene:\n  view_color: xy", r"scene\.view_color: expected one of sv, sh, sb, sg"),
+        ("scene: 3", r"mine\.yaml: scene: expected a group of options"),
+        ("train:\n  lr:\n    means: [1.0]", r"train\.lr\.means: expected a list of 2 values"),
+        ("train:\n  densify:\n    final_prune_steps: [1, x]", r"final_prune_steps\[1\]: expected int"),
+        ("- a\n- b", r"mine\.yaml: expected a mapping"),
+        ("a: [", r"mine\.yaml: not valid YAML"),
+        ("base: nowhere", r"no preset file .*nowhere\.yaml .*named as base of mine\.yaml"),
+        ("base: mine", r"mine\.yaml: base: presets refer to each other in a circle"),
+        ("base: 3", r"mine\.yaml: base: expected the name of a preset"),
+    ],
+)
+def test_errors_name_file_and_key(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(PresetError, match=message):
+        load_preset("mine", write(tmp_path, text))
+
+
+def test_a_variant_overrides_single_keys_of_its_base(tmp_path: Path) -> None:
+    write(tmp_path, "description: d\nscene:\n  levels: 3\n  near: 1e-1", "below")
+    preset = load_preset("mine", write(tmp_path, "base: below\nscene:\n  levels: 2"))
+    assert (preset.scene.levels, preset.scene.near, preset.description) == (2, 0.1, "d")

@@ -38,24 +38,25 @@ $(VENV)/.stamp-venv:
 # comes from PyTorch's own index; where that cannot be reached, whatever the configured index has is taken.
 $(VENV)/.stamp-torch: $(VENV)/.stamp-venv
 	@if command -v nvidia-smi >/dev/null; then \
-	  $(PIP) install -q $(TORCH) $(TORCHVISION); \
+	  $(PIP) install -qq $(TORCH) $(TORCHVISION); \
 	else \
-	  $(PIP) install -q --retries 0 --timeout 5 --extra-index-url $(CPU_INDEX) $(TORCH)+cpu $(TORCHVISION)+cpu \
+	  $(PIP) install -qq --retries 0 --timeout 5 --extra-index-url $(CPU_INDEX) $(TORCH)+cpu $(TORCHVISION)+cpu \
 	    2>/dev/null \
 	  || { echo "No CPU wheels of torch and torchvision from $(CPU_INDEX): taking the default ones"; \
-	       $(PIP) install -q $(TORCH) && $(PIP) install -q --no-deps $(TORCHVISION); }; \
+	       $(PIP) install -qq $(TORCH) && $(PIP) install -qq --no-deps $(TORCHVISION); }; \
 	fi
 	@touch $@
 
 $(VENV)/.stamp-deps: $(VENV)/.stamp-torch constraints.txt pyproject.toml scripts/torchvision_remedy.py
-	$(PIP) install -q -c constraints.txt nerfstudio==1.1.5 scikit-build-core nanobind cmake ninja \
+	@echo "Installing nerfstudio and what it needs (a few minutes the first time)"
+	@$(PIP) install -qq -c constraints.txt nerfstudio==1.1.5 scikit-build-core nanobind cmake ninja \
 	  $$($(BIN)/python scripts/requirements.py)
 	$(BIN)/python scripts/torchvision_remedy.py
 	@touch $@
 
 # Editable: changes to Python are live, changes to C++ need another make (seconds: build/ is kept).
 $(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(CXX_FILES)
-	$(PIP) install -q --no-build-isolation --no-deps -e .
+	$(PIP) install -qq --no-build-isolation --no-deps -e .
 	@touch $@
 
 demo: setup

@@ -1,0 +1,211 @@
+"""Render the sample room along a camera path and write it as a nerfstudio capture."""
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PILImage
+
+from bitymi_ns.sample.room import Hits, Room
+
+FOCAL = 0.80  # focal length in image widths
+TARGET = np.array([0.0, 0.0, 0.72])
+BAND = 1 << 16  # rays traced at a time
+
+
+@dataclass(frozen=True)
+class View:
+    """One pinhole camera: camera-to-world [4, 4] with OpenGL axes (x right, y up, z backward), pixel intrinsics."""
+
+    camera_to_world: NDArray[np.float64]
+    focal: float
+    width: int
+    height: int
+
+    def rays(self, supersample: int = 1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Origin [3] and unit directions [H s, W s, 3] through the centres of s by s parts of each pixel."""
+        h, w = self.height * supersample, self.width * supersample
+        x = ((np.arange(w) + 0.5) / supersample - self.width / 2) / self.focal
+        y = (self.height / 2 - (np.arange(h) + 0.5) / supersample) / self.focal
+        d = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1)
+        d = d @ self.camera_to_world[:3, :3].T
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        return self.camera_to_world[:3, 3].astype(np.float32), d.astype(np.float32)
+
+
+def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Camera-to-world [4, 4], OpenGL axes, of a camera at `eye` that looks at `target` with z up."""
+    back = eye - target
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    return matrix
+
+
+def camera_path(views: int, width: int, height: int, seed: int) -> list[View]:
+    """Two turns around the objects, rising and falling, each camera looking in, a little off the middle."""
+    rng = np.random.default_rng([seed, 1])
+    path = []
+    for k in range(views):
+        s = (k + 0.5) / views
+        angle = 4 * np.pi * s
+        reach = 1 + 0.10 * np.sin(7 * 2 * np.pi * s)
+        eye = np.array([2.25 * reach * np.cos(angle), 1.75 * reach * np.sin(angle), 0.0])
+        eye[2] = (0.75 if s < 0.5 else 1.55) + 0.30 * np.sin(5 * 2 * np.pi * s)
+        target = TARGET + rng.uniform(-0.25, 0.25, 3)
+        path.append(View(look_at(eye, target), FOCAL * width, width, height))
+    return path
+
+
+def render(room: Room, view: View, supersample: int = 3) -> NDArray[np.uint8]:
+    """The antialiased picture [H, W, 3] of one view."""
+    origin, directions = view.rays(supersample)
+    o = tuple(np.float32(a) for a in origin)
+    flat = directions.reshape(-1, 3)
+    colour = np.empty_like(flat)
+    for start in range(0, len(flat), BAND):
+        d = tuple(np.ascontiguousarray(flat[start : start + BAND, a]) for a in range(3))
+        colour[start : start + BAND] = room.colour(o, d, room.hit(o, d))
+    colour = colour.reshape(view.height, supersample, view.width, supersample, 3).mean(axis=(1, 3))
+    return (colour * 255 + 0.5).astype(np.uint8)
+
+
+def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], Hits]:
+    """World points [n, 3] seen through the centres of flat pixel indices [n], and the hits."""
+    origin, directions = view.rays()
+    flat = directions.reshape(-1, 3)[pixels]
+    o = tuple(np.float32(a) for a in origin)
+    hits = room.hit(o, tuple(np.ascontiguousarray(flat[:, a]) for a in range(3)))
+    return origin + hits.t[:, None] * flat, hits
+
+
+def sparse_points(
+    room: Room, views: list[View], images: list[NDArray[np.uint8]], count: int, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """`count` exact surface points [count, 3] with their pixels' colours [count, 3], spread over all views."""
+    rng = np.random.default_rng([seed, 2])
+    points, colours = [], []
+    shares = np.diff(np.linspace(0, count, len(views) + 1).astype(int))
+    for view, image, share in zip(views, images, shares, strict=True):
+        pixels = rng.choice(view.width * view.height, size=share, replace=share > view.width * view.height)
+        points.append(first_hits(room, view, pixels)[0])
+        colours.append(image.reshape(-1, 3)[pixels])
+    return np.concatenate(points), np.concatenate(colours)
+
+
+def write_ply(path: Path, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+    """Binary little-endian PLY of points [n, 3] with colours [n, 3]."""
+    record = np.dtype([(n, "<f4") for n in ("x", "y", "z")] + [(n, "u1") for n in ("red", "green", "blue")])
+    rows = np.empty(len(points), record)
+    for k, name in enumerate(("x", "y", "z")):
+        rows[name] = points[:, k]
+    for k, name in enumerate(("red", "green", "blue")):
+        rows[name] = colours[:, k]
+    kinds = {"x": "float", "y": "float", "z": "float"}
+    properties = "".join(f"property {kinds.get(n, 'uchar')} {n}\n" for n in record.names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    path.write_bytes(header.encode("ascii") + rows.tobytes())
+
+
+def generate(
+    output_dir: Path,
+    views: int = 60,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    points: int = 8000,
+    overwrite: bool = False,
+    progress: bool = False,
+) -> Path:
+    """Write the sample capture to `output_dir` and return that folder.
+
+    Holds transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png and on, and sparse_pc.ply.
+    Equal arguments give equal pictures. The folder is written aside and renamed, so it is there whole or not at all.
+
+    Raises ValueError for sizes that make no picture, FileExistsError for a folder that already holds something.
+    """
+    for name, value, least in (("views", views, 1), ("width", width, 8), ("height", height, 8), ("points", points, 0)):
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}")
+    output_dir = Path(output_dir).absolute()
+    if output_dir.exists() and not output_dir.is_dir():
+        raise FileExistsError(f"{output_dir} is a file; choose another output folder")
+    if output_dir.exists() and any(output_dir.iterdir()) and not overwrite:
+        raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
+    output_dir.parent.mkdir(parents=True, exist_ok=True)
+    aside = output_dir.parent / f".{output_dir.name}-{os.getpid()}"
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir()
+    try:
+        _write(aside, views, width, height, seed, points, progress)
+        if output_dir.exists():
+            shutil.rmtree(output_dir)
+        aside.rename(output_dir)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+    return output_dir
+
+
+def _write(folder: Path, views: int, width: int, height: int, seed: int, points: int, progress: bool) -> None:
+    """Render and write everything into an empty folder."""
+    (folder / "images").mkdir()
+    path = camera_path(views, width, height, seed)
+    names = [f"images/frame_{k + 1:05d}.png" for k in range(views)]
+
+    with _progress(progress, views) as advance:
+        room = Room(seed)
+
+        def frame(k: int) -> NDArray[np.uint8]:
+            image = render(room, path[k])
+            PILImage.fromarray(image).save(folder / names[k])
+            advance()
+            return image
+
+        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # numpy works outside the interpreter lock
+            try:
+                images = list(pool.map(frame, range(views)))
+            except BaseException:  # Ctrl-C too: do not wait for what has not begun
+                pool.shutdown(cancel_futures=True)
+                raise
+    write_ply(folder / "sparse_pc.ply", *sparse_points(room, path, images, points, seed))
+    meta = {
+        "camera_model": "OPENCV",
+        "w": width,
+        "h": height,
+        "fl_x": FOCAL * width,
+        "fl_y": FOCAL * width,
+        "cx": width / 2,
+        "cy": height / 2,
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "ply_file_path": "sparse_pc.ply",
+        "frames": [
+            {"file_path": name, "transform_matrix": view.camera_to_world.tolist()}
+            for name, view in zip(names, path, strict=True)
+        ],
+    }
+    (folder / "transforms.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _progress(show: bool, total: int) -> Iterator:
+    """A function to call once per finished frame; draws a bar when `show`."""
+    if not show:
+        yield lambda: None
+        return
+    from rich.progress import Progress
+
+    with Progress() as bar:
+        task = bar.add_task("Rendering the sample room", total=total)
+        yield lambda: bar.advance(task)

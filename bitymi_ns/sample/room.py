@@ -1,0 +1,364 @@
+"""The sample room and its ray tracer, in numpy.
+
+World frame: metres, x and y along the floor, z up. Rays are structures of arrays: an origin and a direction as three
+float32 arrays [n] (or scalars for a shared origin); a ray's length parameter t counts in direction lengths.
+Colours are display values in [0, 1]; the light on walls and floor is worked out once, with soft shadows, and multiplied
+into their textures, so that those surfaces look the same from everywhere. The sphere and the box are glossy: what they
+mirror moves with the eye.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bitymi_ns.sample import textures
+from bitymi_ns.sample.textures import Image
+
+Vec = tuple[Image, Image, Image]
+
+LOW = np.float32([-3.0, -2.5, 0.0])
+HIGH = np.float32([3.0, 2.5, 2.6])
+WINDOW = (-1.3, 1.1, 0.75, 2.15)  # x0, x1, z0, z1 of the opening in the wall y = HIGH[1]
+OUTSIDE = (-40.0, 40.0, -5.0, 15.0)  # x0, x1, z0, z1 of the landscape picture
+OUTSIDE_Y = 30.0
+LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
+
+SPHERE_CENTRE, SPHERE_RADIUS = np.float32([-0.55, 0.10, 0.80]), np.float32(0.36)
+KNOB_CENTRE, KNOB_RADIUS = np.float32([1.25, -0.95, 1.37]), np.float32(0.07)
+BOX_CENTRE, BOX_HALF, BOX_YAW = np.float32([0.65, -0.05, 0.38]), np.float32([0.32, 0.26, 0.38]), np.float32(0.5)
+PLINTH = (np.float32([-0.85, -0.20, 0.0]), np.float32([-0.25, 0.40, 0.44]))
+POLES = [(1.55, 0.95, 0.022, 2.6), (1.25, -0.95, 0.012, 1.35), (-1.45, -0.85, 0.016, 1.7)]  # x, y, radius, height
+
+UPRIGHTS, RUNGS = 8, 7  # thin bars of the lattice behind the sphere
+
+# Surfaces. 0 to 5 are the room's sides: x low, x high, y low, y high, floor, ceiling.
+LANDSCAPE, SPHERE, BOX, PLINTH_ID, BARS, POLE, KNOB = range(6, 13)
+DISTANT = np.float32(1e9)
+NEAR = np.float32(1e-4)
+
+
+def _bars() -> tuple[np.ndarray, np.ndarray]:
+    """Corners (low, high), each [m, 3], of the thin bars: a free-standing lattice and the window's cross."""
+    low, high = [], []
+
+    def add(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> None:
+        low.append((x0, y0, z0))
+        high.append((x1, y1, z1))
+
+    for k in range(UPRIGHTS):
+        x = -1.75 + 0.17 * k
+        add(x, x + 0.014, 1.000, 1.014, 0.0, 1.35)
+    for k in range(RUNGS):
+        z = 0.12 + 0.19 * k
+        add(-1.80, -0.50, 1.014, 1.026, z, z + 0.012)
+    x0, x1, z0, z1 = WINDOW
+    y = float(HIGH[1])
+    add((x0 + x1) / 2 - 0.02, (x0 + x1) / 2 + 0.02, y - 0.03, y, z0, z1)
+    add(x0, x1, y - 0.03, y, (z0 + z1) / 2 - 0.015, (z0 + z1) / 2 + 0.015)
+    return np.float32(low), np.float32(high)
+
+
+@dataclass
+class Hits:
+    """First hits of n rays."""
+
+    t: Image
+    """[n] distance in direction lengths"""
+    surface: np.ndarray
+    """[n] int8, which surface"""
+    part: np.ndarray
+    """[n] int8, which bar or pole"""
+
+
+def _dot(a: Vec, b: Vec) -> Image:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _slab(o: Vec, inverse: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Image, Image]:
+    """Entry and exit t of rays through an axis-aligned box."""
+    near, far = None, None
+    for a in range(3):
+        t0, t1 = (low[a] - o[a]) * inverse[a], (high[a] - o[a]) * inverse[a]
+        small, large = np.minimum(t0, t1), np.maximum(t0, t1)
+        near = small if near is None else np.maximum(near, small)
+        far = large if far is None else np.minimum(far, large)
+    return near, far
+
+
+def _take(v: Vec, index: np.ndarray) -> Vec:
+    return tuple(a[index] if np.ndim(a) else a for a in v)
+
+
+class Room:
+    """The scene: textures painted and lit from a seed, and functions that trace and colour rays."""
+
+    def __init__(self, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.bars_low, self.bars_high = _bars()
+        self.landscape = textures.landscape(rng)
+        size = HIGH - LOW
+        left = textures.bricks(rng, size[1], size[2])
+        textures.hang(left, textures.poster(rng, 1.1, 0.8, "noise"), 2.9, 1.1)
+        textures.hang(left, textures.poster(rng, 0.9, 1.2, "text"), 0.8, 0.8)
+        right = textures.wallpaper(rng, size[1], size[2])
+        textures.hang(right, textures.poster(rng, 1.2, 1.2, "rings"), 0.7, 0.8)
+        textures.hang(right, textures.poster(rng, 1.3, 0.9, "text"), 2.9, 1.0)
+        front = textures.plaster(rng, size[0], size[2], (0.80, 0.66, 0.45))
+        textures.hang(front, textures.poster(rng, 1.5, 1.0, "bars"), 0.7, 1.0)
+        textures.hang(front, textures.poster(rng, 1.0, 1.4, "text"), 2.7, 0.7)
+        textures.hang(front, textures.poster(rng, 1.2, 0.9, "noise"), 4.2, 1.0)
+        back = textures.plaster(rng, size[0], size[2], (0.62, 0.70, 0.78))
+        textures.hang(back, textures.poster(rng, 0.9, 1.1, "rings"), 0.4, 0.9)
+        textures.hang(back, textures.poster(rng, 1.0, 1.3, "bars"), 4.6, 0.8)
+        floor = textures.wood_tiles(rng, size[0], size[1])
+        ceiling = textures.plaster(rng, size[0], size[1], (0.92, 0.92, 0.90))
+        self.sides = [left, right, front, back, floor, ceiling]
+        for side, texture in enumerate(self.sides):
+            texture *= textures.resize(self._light_map(side, rng), *texture.shape[:2])
+            np.clip(texture, 0, 1, out=texture)
+        x, y = textures.grid(size[0], size[1])
+        lamp = (x + LOW[0] > LAMP[0]) & (x + LOW[0] < LAMP[1]) & (y + LOW[1] > LAMP[2]) & (y + LOW[1] < LAMP[3])
+        ceiling[lamp] = 1.0
+        self.box_texture = textures.poster(rng, 1.0, 1.0, "noise") * 0.8
+        textures.print_text(rng, self.box_texture, 0.12, 0.12)
+        self.plinth_texture = textures.poster(rng, 0.6, 0.44, "bars")
+
+    def _light_map(self, side: int, rng: np.random.Generator, n: int = 96, samples: int = 48) -> Image:
+        """Light [n, n, 3] on one side of the room: an ambient part and the lamp with soft shadows."""
+        v, u = np.meshgrid(*[(np.arange(n, dtype=np.float32) + 0.5) / n] * 2, indexing="ij")
+        p, normal = _side_points(side, u.ravel(), v.ravel())
+        ambient = np.ones(n * n, np.float32)
+        for a in range(3):  # darker towards the room's edges
+            if normal[a] == 0:
+                for edge in (LOW[a], HIGH[a]):
+                    ambient *= 1 - 0.3 * np.exp(-np.abs(p[a] - edge) / 0.25)
+        light = np.zeros(n * n, np.float32)
+        for k in range(samples):
+            lx = LAMP[0] + (LAMP[1] - LAMP[0]) * ((k % 8) + rng.random(dtype=np.float32)) / 8
+            ly = LAMP[2] + (LAMP[3] - LAMP[2]) * ((k // 8) + rng.random(dtype=np.float32)) / (samples // 8)
+            d = (np.float32(lx) - p[0], np.float32(ly) - p[1], HIGH[2] - np.float32(0.01) - p[2])
+            r2 = _dot(d, d) + np.float32(1e-4)
+            cosine = np.maximum(sum(d[a] * normal[a] for a in range(3)), 0) / np.sqrt(r2)
+            lamp_cosine = np.maximum(d[2], 0) / np.sqrt(r2)
+            seen = ~self._blocked(p, d)
+            light += cosine * (0.35 + 0.65 * lamp_cosine) / (1 + 0.12 * r2) * seen
+        total = 0.42 * ambient + 1.05 * light / samples
+        warm = np.float32([1.03, 1.0, 0.95])
+        return (total[:, None] * warm).reshape(n, n, 3).astype(np.float32)
+
+    def _blocked(self, o: Vec, d: Vec) -> np.ndarray:
+        """Whether something big or a pole stands between o and o + d; [n] bool."""
+        t = np.full(d[0].shape, 1.0, np.float32)
+        hits = Hits(t, np.zeros(t.shape, np.int8), np.zeros(t.shape, np.int8))
+        self._objects(o, d, hits, with_bars=True)
+        return hits.t < np.float32(0.999)
+
+    def _objects(self, o: Vec, d: Vec, hits: Hits, with_bars: bool = True) -> None:
+        """Shorten `hits` to what stands in the room."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            inverse = tuple(np.float32(1) / a for a in d)
+            self._hit_sphere(o, d, inverse, hits, SPHERE_CENTRE, SPHERE_RADIUS, SPHERE)
+            self._hit_sphere(o, d, inverse, hits, KNOB_CENTRE, KNOB_RADIUS, KNOB)
+            self._hit_box(o, d, inverse, hits)
+            near, far = _slab(o, inverse, *PLINTH)
+            closer = (near < far) & (near > NEAR) & (near < hits.t)
+            hits.t[closer], hits.surface[closer] = near[closer], PLINTH_ID
+            for part, pole in enumerate(POLES):
+                self._hit_pole(o, d, inverse, hits, part, *pole)
+            if with_bars:
+                for group in (slice(0, UPRIGHTS + RUNGS), slice(UPRIGHTS + RUNGS, None)):
+                    self._hit_bars(o, inverse, hits, group)
+
+    def _hit_sphere(
+        self, o: Vec, d: Vec, inverse: Vec, hits: Hits, centre: np.ndarray, radius: np.float32, surface: int
+    ) -> None:
+        near, far = _slab(o, inverse, centre - radius, centre + radius)
+        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        o, d = _take(o, index), _take(d, index)
+        oc = tuple(o[a] - centre[a] for a in range(3))
+        a, b, c = _dot(d, d), _dot(oc, d), _dot(oc, oc) - radius * radius
+        root = b * b - a * c
+        t = (-b - np.sqrt(np.maximum(root, 0))) / a
+        closer = (root > 0) & (t > NEAR) & (t < hits.t[index])
+        hits.t[index[closer]], hits.surface[index[closer]] = t[closer], surface
+
+    def _hit_box(self, o: Vec, d: Vec, inverse: Vec, hits: Hits) -> None:
+        reach = np.float32([np.hypot(BOX_HALF[0], BOX_HALF[1])] * 2 + [BOX_HALF[2]])
+        near, far = _slab(o, inverse, BOX_CENTRE - reach, BOX_CENTRE + reach)
+        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        o, d = _to_box(_take(o, index), True), _to_box(_take(d, index), False)
+        near, far = _slab(o, tuple(np.float32(1) / a for a in d), -BOX_HALF, BOX_HALF)
+        closer = (near < far) & (near > NEAR) & (near < hits.t[index])
+        hits.t[index[closer]], hits.surface[index[closer]] = near[closer], BOX
+
+    def _hit_pole(
+        self, o: Vec, d: Vec, inverse: Vec, hits: Hits, part: int, x: float, y: float, radius: float, height: float
+    ) -> None:
+        low, high = np.float32([x - radius, y - radius, 0]), np.float32([x + radius, y + radius, height])
+        near, far = _slab(o, inverse, low, high)
+        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        o, d = _take(o, index), _take(d, index)
+        ox, oy = o[0] - np.float32(x), o[1] - np.float32(y)
+        a = d[0] * d[0] + d[1] * d[1]
+        b = ox * d[0] + oy * d[1]
+        root = b * b - a * (ox * ox + oy * oy - np.float32(radius * radius))
+        t = (-b - np.sqrt(np.maximum(root, 0))) / a
+        z = o[2] + t * d[2]
+        closer = (root > 0) & (t > NEAR) & (t < hits.t[index]) & (z > 0) & (z < height)
+        chosen = index[closer]
+        hits.t[chosen], hits.surface[chosen], hits.part[chosen] = t[closer], POLE, part
+
+    def _hit_bars(self, o: Vec, inverse: Vec, hits: Hits, group: slice) -> None:
+        lows, highs = self.bars_low[group], self.bars_high[group]
+        near, far = _slab(o, inverse, lows.min(axis=0), highs.max(axis=0))
+        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        o, inverse = _take(o, index), _take(inverse, index)
+        best, part = hits.t[index], np.full(index.shape, -1, np.int8)
+        for k in range(len(lows)):
+            near, far = _slab(o, inverse, lows[k], highs[k])
+            closer = (near < far) & (near > NEAR) & (near < best)
+            best[closer], part[closer] = near[closer], k + (group.start or 0)
+        closer = part >= 0
+        chosen = index[closer]
+        hits.t[chosen], hits.surface[chosen], hits.part[chosen] = best[closer], BARS, part[closer]
+
+    def hit(self, o: Vec, d: Vec) -> Hits:
+        """First hits of rays that start inside the room."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            exits = []
+            for a in range(3):
+                t = (np.where(d[a] > 0, HIGH[a], LOW[a]) - o[a]) / d[a]
+                exits.append(np.where(d[a] == 0, DISTANT, t).astype(np.float32))
+        t = np.minimum(np.minimum(exits[0], exits[1]), exits[2])
+        surface = np.where(
+            t == exits[0],
+            np.where(d[0] > 0, 1, 0),
+            np.where(t == exits[1], np.where(d[1] > 0, 3, 2), np.where(d[2] > 0, 5, 4)),
+        ).astype(np.int8)
+        hits = Hits(t, surface, np.zeros(t.shape, np.int8))
+        index = np.flatnonzero(surface == 3)
+        if len(index):
+            oo, dd = _take(o, index), _take(d, index)
+            x, z = oo[0] + t[index] * dd[0], oo[2] + t[index] * dd[2]
+            through = (x > WINDOW[0]) & (x < WINDOW[1]) & (z > WINDOW[2]) & (z < WINDOW[3])
+            outside = index[through]
+            t[outside] = ((np.float32(OUTSIDE_Y) - oo[1]) / dd[1])[through]
+            surface[outside] = LANDSCAPE
+        self._objects(o, d, hits)
+        return hits
+
+    def colour(self, o: Vec, d: Vec, hits: Hits, mirrors: bool = True) -> Image:
+        """Colours [n, 3] of rays with unit directions; `mirrors`: follow one reflection on glossy surfaces."""
+        result = np.zeros((hits.t.shape[0], 3), np.float32)
+        for surface in np.unique(hits.surface):
+            index = np.flatnonzero(hits.surface == surface)
+            oo, dd, t = _take(o, index), _take(d, index), hits.t[index]
+            p = tuple(oo[a] + t * dd[a] for a in range(3))
+            if surface < 6:
+                u, v = _side_uv(int(surface), p)
+                result[index] = textures.lookup(self.sides[surface], u, v)
+            elif surface == LANDSCAPE:
+                u = (p[0] - np.float32(OUTSIDE[0])) / np.float32(OUTSIDE[1] - OUTSIDE[0])
+                v = (p[2] - np.float32(OUTSIDE[2])) / np.float32(OUTSIDE[3] - OUTSIDE[2])
+                result[index] = textures.lookup(self.landscape, u, v)
+            else:
+                result[index] = self._object_colour(int(surface), hits.part[index], p, dd, mirrors)
+        return result
+
+    def _object_colour(self, surface: int, part: np.ndarray, p: Vec, d: Vec, mirrors: bool) -> Image:
+        """Colours [n, 3] of points p [n] on one object, seen along d [n]."""
+        n = p[0].shape[0]
+        gloss = 0.0
+        if surface in (SPHERE, KNOB):
+            centre, radius = (SPHERE_CENTRE, SPHERE_RADIUS) if surface == SPHERE else (KNOB_CENTRE, KNOB_RADIUS)
+            normal = tuple((p[a] - centre[a]) / radius for a in range(3))
+            rgb = (0.16, 0.20, 0.30) if surface == SPHERE else (0.85, 0.15, 0.10)
+            base = np.broadcast_to(np.float32(rgb), (n, 3))
+            gloss = 0.55 if surface == SPHERE else 0.0
+        elif surface == BOX:
+            normal, u, v = _box_face(p)
+            base, gloss = textures.lookup(self.box_texture, u, v), 0.10
+        elif surface == PLINTH_ID:
+            normal, u, v = _aabb_face(p, PLINTH[0], PLINTH[1])
+            base = textures.lookup(self.plinth_texture, u, v)
+        elif surface == BARS:
+            normal, _, _ = _aabb_face(p, self.bars_low[part].T, self.bars_high[part].T)
+            brass, black, white = np.float32([0.75, 0.60, 0.20]), np.float32([0.12] * 3), np.float32([0.92, 0.92, 0.90])
+            base = np.where((part < UPRIGHTS)[:, None], brass, black)
+            base = np.where((part >= UPRIGHTS + RUNGS)[:, None], white, base)
+        else:
+            x, y, radius, _ = (np.float32(column)[part] for column in zip(*POLES, strict=True))
+            normal = ((p[0] - x) / radius, (p[1] - y) / radius, np.zeros(n, np.float32))
+            stripe = ((p[2] * np.float32(8)).astype(np.int32) % 2 == 0) & (part == 0)
+            base = np.where(stripe[:, None], np.float32([0.85, 0.20, 0.15]), np.float32([0.85, 0.85, 0.82]))
+        lamp = (np.float32((LAMP[0] + LAMP[1]) / 2), np.float32((LAMP[2] + LAMP[3]) / 2), HIGH[2])
+        light = tuple(lamp[a] - p[a] for a in range(3))
+        distance = np.sqrt(_dot(light, light))
+        lit = np.maximum(_dot(light, normal) / distance, 0) / (1 + 0.12 * distance * distance)
+        low = 1 - 0.35 * np.exp(-p[2] / np.float32(0.15))  # the floor's shade
+        result = base * ((0.42 + 0.10 * normal[2]) * low + 0.95 * lit)[:, None]
+        if gloss:
+            facing = -_dot(d, normal)
+            fresnel = gloss + (1 - gloss) * np.clip(1 - facing, 0, 1) ** 5
+            r = tuple(d[a] + 2 * facing * normal[a] for a in range(3))
+            if mirrors:
+                start = tuple(p[a] + np.float32(1e-3) * normal[a] for a in range(3))
+                seen = self.colour(start, r, self.hit(start, r), mirrors=False)
+            else:
+                seen = np.full((n, 3), 0.4, np.float32)
+            highlight = np.maximum(_dot(r, light) / distance, 0) ** 90
+            result = result * (1 - fresnel)[:, None] + seen * fresnel[:, None] + 0.5 * highlight[:, None]
+        return np.clip(result, 0, 1).astype(np.float32)
+
+
+def _to_box(v: Vec, point: bool) -> Vec:
+    """World to the yawed box's own axes."""
+    c, s = np.cos(BOX_YAW), np.sin(BOX_YAW)
+    x, y, z = (v[a] - BOX_CENTRE[a] for a in range(3)) if point else v
+    return c * x + s * y, c * y - s * x, z
+
+
+def _aabb_face(p: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Vec, Image, Image]:
+    """Outward normals and face coordinates u, v in [0, 1] of points on a box (corners [3] or [3, n])."""
+    ratio = [(p[a] - (low[a] + high[a]) / 2) / ((high[a] - low[a]) / 2) for a in range(3)]
+    axis = np.argmax(np.abs(np.stack(ratio)), axis=0)
+    normal = tuple(np.where(axis == a, np.sign(ratio[a]), 0).astype(np.float32) for a in range(3))
+    u = np.where(axis == 0, ratio[1], ratio[0]) * np.float32(0.5) + np.float32(0.5)
+    v = np.where(axis == 2, ratio[1], ratio[2]) * np.float32(0.5) + np.float32(0.5)
+    return normal, u, v
+
+
+def _box_face(p: Vec) -> tuple[Vec, Image, Image]:
+    """As `_aabb_face` for the yawed box; normals in world axes."""
+    (nx, ny, nz), u, v = _aabb_face(_to_box(p, True), -BOX_HALF, BOX_HALF)
+    c, s = np.cos(BOX_YAW), np.sin(BOX_YAW)
+    return (c * nx - s * ny, s * nx + c * ny, nz), u, v
+
+
+def _side_axes(side: int) -> tuple[int, int, int]:
+    """Which world axis is the side's normal, its texture's u and its v."""
+    return ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))[side]
+
+
+def _side_uv(side: int, p: Vec) -> tuple[Image, Image]:
+    """Texture coordinates in [0, 1]; u runs to the right for who stands in the room facing a wall."""
+    _, ua, va = _side_axes(side)
+    u = (p[ua] - LOW[ua]) / (HIGH[ua] - LOW[ua])
+    if side in (1, 2):
+        u = 1 - u
+    return u, (p[va] - LOW[va]) / (HIGH[va] - LOW[va])
+
+
+def _side_points(side: int, u: Image, v: Image) -> tuple[Vec, np.ndarray]:
+    """World points [n] of texture coordinates and the side's inward normal [3]."""
+    na, ua, va = _side_axes(side)
+    if side in (1, 2):
+        u = 1 - u
+    p: list[Image] = [u, u, u]
+    p[ua] = LOW[ua] + u * (HIGH[ua] - LOW[ua])
+    p[va] = LOW[va] + v * (HIGH[va] - LOW[va])
+    inward = 1.0 if side % 2 == 0 else -1.0
+    p[na] = np.full_like(u, (LOW if side % 2 == 0 else HIGH)[na] + np.float32(1e-3 * inward))
+    normal = np.zeros(3, np.float32)
+    normal[na] = inward
+    return (p[0], p[1], p[2]), normal

@@ -1,0 +1,198 @@
+"""Procedural textures of the sample room: painted once as images, looked up bilinearly.
+
+A texture is float32 [h, w, 3] in [0, 1]. Row 0 is v = 0 and column 0 is u = 0, both at the texel's centre.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+TEXELS_PER_METRE = 160.0
+
+
+def lookup(texture: Image, u: Image, v: Image) -> Image:
+    """Bilinear colour [n, 3] at u, v [n] in [0, 1] (clamped), u along the columns."""
+    h, w = texture.shape[:2]
+    x = np.clip(u * np.float32(w) - np.float32(0.5), 0, w - 1)
+    y = np.clip(v * np.float32(h) - np.float32(0.5), 0, h - 1)
+    x0 = np.minimum(x.astype(np.int32), w - 2)
+    y0 = np.minimum(y.astype(np.int32), h - 2)
+    fx = (x - x0)[:, None].astype(np.float32)
+    fy = (y - y0)[:, None].astype(np.float32)
+    flat = texture.reshape(-1, 3)
+    i = y0 * w + x0
+    top = flat[i] * (1 - fx) + flat[i + 1] * fx
+    bottom = flat[i + w] * (1 - fx) + flat[i + w + 1] * fx
+    return top * (1 - fy) + bottom * fy
+
+
+def resize(image: Image, height: int, width: int) -> Image:
+    """Bilinear resampling of image [h, w] or [h, w, c] to [height, width] or [height, width, c], edges clamped."""
+    for axis, size in ((0, height), (1, width)):
+        n = image.shape[axis]
+        x = np.clip((np.arange(size, dtype=np.float32) + 0.5) * np.float32(n / size) - np.float32(0.5), 0, n - 1)
+        low = np.minimum(x.astype(np.int32), max(n - 2, 0))
+        f = (x - low).reshape((-1,) + (1,) * (image.ndim - 1 - axis)).astype(np.float32)
+        image = np.take(image, low, axis) * (1 - f) + np.take(image, np.minimum(low + 1, n - 1), axis) * f
+    return image
+
+
+def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
+    """Metric coordinates (x, y), each [h, w], of the texel centres of a surface of the given size."""
+    w = max(2, round(width_m * TEXELS_PER_METRE))
+    h = max(2, round(height_m * TEXELS_PER_METRE))
+    y, x = np.meshgrid(
+        (np.arange(h, dtype=np.float32) + 0.5) * np.float32(height_m / h),
+        (np.arange(w, dtype=np.float32) + 0.5) * np.float32(width_m / w),
+        indexing="ij",
+    )
+    return x, y
+
+
+def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 4) -> Image:
+    """Fractal value noise [h, w] with values about [0, 1]; `cells` (rows, columns) of its coarsest octave."""
+    total = np.zeros(shape, np.float32)
+    weight = 0.0
+    for octave in range(octaves):
+        rows, columns = cells[0] * 2**octave + 1, cells[1] * 2**octave + 1
+        total += 0.5**octave * resize(rng.random((rows, columns), dtype=np.float32), *shape)
+        weight += 0.5**octave
+    return total / np.float32(weight)
+
+
+def mix(a: Image | tuple[float, ...], b: Image | tuple[float, ...], t: Image) -> Image:
+    """a (1 - t) + b t for colours [3] or [h, w, 3] and t [h, w]."""
+    a, b = np.asarray(a, np.float32), np.asarray(b, np.float32)
+    return a + (b - a) * t[..., None]
+
+
+def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: float = 0.5) -> Image:
+    """Square tiles of wood, light and dark like a chessboard, the grain turning from tile to tile."""
+    x, y = grid(width_m, height_m)
+    i, j = (x / tile).astype(int), (y / tile).astype(int)
+    odd = (i + j) % 2 == 1
+    along, across = np.where(odd, y, x), np.where(odd, x, y)
+    wobble = noise(rng, x.shape, (12, 12))
+    shift = rng.random((int(i.max()) + 1, int(j.max()) + 1), dtype=np.float32)[i, j]
+    rings = 0.5 + 0.5 * np.sin(2 * np.pi * (across / 0.045 + 3 * wobble + 0.4 * np.sin(2 * along) + 7 * shift))
+    fine = noise(rng, x.shape, (100, 100), 2)
+    dark = mix((0.33, 0.19, 0.10), (0.50, 0.31, 0.17), rings)
+    light = mix((0.66, 0.48, 0.29), (0.85, 0.69, 0.46), rings)
+    colour = np.where(odd[..., None], dark, light) * (0.82 + 0.18 * shift + 0.2 * (fine - 0.5))[..., None]
+    gap = np.minimum(np.minimum(x % tile, tile - x % tile), np.minimum(y % tile, tile - y % tile)) < 0.008
+    return np.where(gap[..., None], np.float32(0.12), colour).astype(np.float32)
+
+
+def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
+    """Bricks of 25 by 9 cm in light mortar."""
+    x, y = grid(width_m, height_m)
+    row = (y / 0.09).astype(int)
+    shifted = x + 0.125 * (row % 2)
+    column = (shifted / 0.25).astype(int)
+    tone = rng.random((int(row.max()) + 1, int(column.max()) + 1), dtype=np.float32)[row, column]
+    speckle = noise(rng, x.shape, (60, 120), 3)
+    colour = mix((0.47, 0.20, 0.15), (0.76, 0.42, 0.30), np.clip(0.7 * tone + 0.6 * (speckle - 0.3), 0, 1))
+    mortar = (y % 0.09 < 0.012) | (shifted % 0.25 < 0.012)
+    return np.where(mortar[..., None], (0.70 + 0.2 * speckle)[..., None], colour).astype(np.float32)
+
+
+def plaster(rng: np.random.Generator, width_m: float, height_m: float, colour: tuple[float, float, float]) -> Image:
+    """Rough paint of one colour."""
+    x, _ = grid(width_m, height_m)
+    coarse, fine = noise(rng, x.shape, (6, 8)), noise(rng, x.shape, (80, 100), 3)
+    return (np.asarray(colour, np.float32) * (0.78 + 0.18 * coarse + 0.3 * (fine - 0.35))[..., None]).clip(0, 1)
+
+
+def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
+    """Stripes with a small diamond pattern on every other one."""
+    x, y = grid(width_m, height_m)
+    stripe = (x / 0.16).astype(int) % 2 == 0
+    diamond = np.abs((x % 0.16) - 0.08) + np.abs((y % 0.12) - 0.06) < 0.035
+    colour = np.where(stripe[..., None], np.float32([0.30, 0.48, 0.50]), np.float32([0.78, 0.76, 0.64]))
+    colour = np.where((diamond & stripe)[..., None], np.float32([0.92, 0.80, 0.42]), colour)
+    colour = np.where((diamond & ~stripe)[..., None], np.float32([0.55, 0.25, 0.28]), colour)
+    return (colour * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1).astype(np.float32)
+
+
+def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, margin: float = 0.05) -> None:
+    """Print lines of made-up 5 by 7 letters, `glyph` metres high, on `image` in place."""
+    texel = max(1, round(glyph * TEXELS_PER_METRE / 7))
+    letters = rng.random((26, 7, 3)) < 0.55
+    letters = np.concatenate([letters, letters[:, :, 1::-1]], axis=2)  # mirrored: they look drawn, not random
+    letters[:, :, 0] |= rng.random((26, 1)) < 0.5
+    h, w = image.shape[:2]
+    edge = round(margin * TEXELS_PER_METRE)
+    for top in range(edge, h - edge - 7 * texel, 10 * texel):
+        end = w - edge - 5 * texel
+        if rng.random() < 0.25:
+            end = round(end * rng.uniform(0.4, 0.9))
+        for left in range(edge, end, 6 * texel):
+            letter = rng.integers(0, 32)
+            if letter >= 26:
+                continue  # a space between words
+            # v points up on walls, so a letter's first row comes last
+            mask = np.kron(letters[letter][::-1], np.ones((texel, texel), bool))
+            image[top : top + mask.shape[0], left : left + mask.shape[1]][mask] = (0.08, 0.07, 0.10)
+
+
+def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str) -> Image:
+    """A framed poster: `text`, `rings` (a zone-plate-like test pattern), `noise` (marble) or `bars` (colour bars)."""
+    x, y = grid(width_m, height_m)
+    if kind == "text":
+        image = np.broadcast_to(np.float32([0.93, 0.91, 0.84]), (*x.shape, 3)).copy()
+        print_text(rng, image)
+    elif kind == "rings":
+        r2 = (x - width_m / 2) ** 2 + (y - height_m / 2) ** 2
+        wave = 0.5 + 0.5 * np.cos(2 * np.pi * r2 / 0.012 / max(width_m, height_m))
+        image = mix((0.12, 0.16, 0.42), (0.97, 0.86, 0.55), wave)
+    elif kind == "noise":
+        n = noise(rng, x.shape, (4, 5), 6)
+        vein = np.abs(np.sin(18 * n + 3 * x))
+        image = mix(mix((0.05, 0.30, 0.28), (0.85, 0.30, 0.20), n), (0.98, 0.93, 0.80), vein**6)
+    elif kind == "bars":
+        colours = rng.random((24, 3), dtype=np.float32)
+        image = colours[(x / width_m * 24).astype(int).clip(0, 23)]
+        image = np.where(((y / height_m * 10).astype(int) % 2 == 0)[..., None], image, 1 - image)
+    else:
+        raise ValueError(f"unknown poster {kind!r}")
+    frame = np.minimum(np.minimum(x, width_m - x), np.minimum(y, height_m - y)) < 0.025
+    return np.where(frame[..., None], np.float32([0.10, 0.08, 0.07]), image).astype(np.float32)
+
+
+def hang(wall: Image, picture: Image, left_m: float, bottom_m: float) -> None:
+    """Put `picture` on `wall` in place, its lower left corner at the given metres from the wall's."""
+    top, left = round(bottom_m * TEXELS_PER_METRE), round(left_m * TEXELS_PER_METRE)
+    wall[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+
+
+def landscape(rng: np.random.Generator) -> Image:
+    """What is outside the window, [512, 2048, 3] over 80 by 20 metres: sky, clouds, hills, trees and houses."""
+    h, w = 512, 2048
+    v, u = np.meshgrid(np.linspace(0, 1, h, dtype=np.float32), np.linspace(0, 1, w, dtype=np.float32), indexing="ij")
+    cloud = noise(rng, (h, w), (5, 14), 5)
+    image = mix((0.80, 0.88, 0.95), (0.30, 0.52, 0.86), np.clip((v - 0.35) * 1.6, 0, 1))
+    image = mix(image, (0.98, 0.98, 0.98), np.clip((cloud - 0.5) * 4, 0, 1))
+    ridges = [(0.52, (0.42, 0.52, 0.62)), (0.42, (0.30, 0.48, 0.34)), (0.30, (0.40, 0.56, 0.22))]
+    for k, (level, colour) in enumerate(ridges):
+        ridge = level + 0.12 * (noise(rng, (2, w), (1, 6 + 5 * k), 4)[:1] - 0.5)
+        shade = 0.7 + 0.6 * noise(rng, (h, w), (20, 60), 3)
+        image = np.where((v < ridge)[..., None], np.asarray(colour, np.float32) * shade[..., None], image)
+    for _ in range(60):
+        x, y, r = rng.uniform(0, w), rng.uniform(60, 150), rng.uniform(8, 20)
+        rows, columns = slice(int(y - r), int(y + r)), slice(max(0, int(x - r)), int(x + r))
+        yy, xx = np.mgrid[rows, columns]
+        crown = (xx - x) ** 2 + (yy - y) ** 2 < (r * rng.uniform(0.7, 1.0)) ** 2
+        part = image[rows, columns]
+        crown = crown[: part.shape[0], : part.shape[1]]
+        part[crown] = np.float32([0.10, 0.28, 0.10]) * rng.uniform(0.7, 1.5)
+    for _ in range(14):
+        x, y, s = int(rng.uniform(0, w - 80)), int(rng.uniform(60, 120)), int(rng.uniform(24, 44))
+        image[y : y + s, x : x + int(1.4 * s)] = rng.uniform(0.6, 0.95, 3)
+        image[y + s : y + s + s // 3, x - 3 : x + int(1.4 * s) + 3] = (0.55, 0.18, 0.12)
+        for k in range(3):
+            image[y + s // 3 : y + 2 * s // 3, x + 4 + k * (s // 2) : x + 4 + k * (s // 2) + s // 5] = (
+                0.12,
+                0.14,
+                0.20,
+            )
+    return image.clip(0, 1).astype(np.float32)

@@ -1,0 +1,203 @@
+"""The sample capture: its geometry is exact, its pictures are right, and nerfstudio reads it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bitymi_ns.sample import generate
+from bitymi_ns.sample.capture import camera_path, first_hits, look_at
+from bitymi_ns.sample.room import HIGH, LANDSCAPE, LOW, SPHERE, SPHERE_CENTRE, SPHERE_RADIUS, Room
+
+VIEWS, WIDTH, HEIGHT = 12, 160, 120
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return generate(tmp_path_factory.mktemp("sample") / "room", views=VIEWS, width=WIDTH, height=HEIGHT, points=3000)
+
+
+@pytest.fixture(scope="module")
+def meta(capture: Path) -> dict:
+    return json.loads((capture / "transforms.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def images(capture: Path, meta: dict) -> np.ndarray:
+    return np.stack([np.asarray(Image.open(capture / frame["file_path"])) for frame in meta["frames"]])
+
+
+@pytest.fixture(scope="module")
+def cloud(capture: Path) -> tuple[np.ndarray, np.ndarray]:
+    import open3d
+
+    ply = open3d.io.read_point_cloud(str(capture / "sparse_pc.ply"))
+    return np.asarray(ply.points), np.asarray(ply.colors)
+
+
+def test_files(capture: Path, meta: dict, images: np.ndarray, cloud: tuple[np.ndarray, np.ndarray]) -> None:
+    assert [frame["file_path"] for frame in meta["frames"]][::11] == [
+        "images/frame_00001.png",
+        "images/frame_00012.png",
+    ]
+    assert images.shape == (VIEWS, HEIGHT, WIDTH, 3)
+    assert (meta["w"], meta["h"]) == (WIDTH, HEIGHT)
+    assert cloud[0].shape == (3000, 3)
+    assert sorted(path.name for path in capture.parent.iterdir()) == ["room"], "nothing is left beside it"
+
+
+def project(meta: dict, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel x and y and depth, each [n], by the textbook formulas from the file alone."""
+    world_to_camera = np.linalg.inv(np.array(meta["frames"][frame]["transform_matrix"]))
+    p = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    depth = -p[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return meta["cx"] + meta["fl_x"] * p[:, 0] / depth, meta["cy"] - meta["fl_y"] * p[:, 1] / depth, depth
+
+
+def test_points_have_the_colour_of_the_pixels_they_fall_on(
+    meta: dict, images: np.ndarray, cloud: tuple[np.ndarray, np.ndarray]
+) -> None:
+    points, colours = cloud
+    room, path = Room(0), camera_path(VIEWS, WIDTH, HEIGHT, 0)
+    agree, total = 0, 0
+    for k in range(VIEWS):
+        x, y, depth = project(meta, k, points)
+        index = np.flatnonzero((depth > 0) & (x >= 1) & (x < WIDTH - 1) & (y >= 1) & (y < HEIGHT - 1))
+        x, y = x[index], y[index]
+        flat = y.astype(int) * WIDTH + x.astype(int)
+        seen, hits = first_hits(room, path[k], flat)
+        near = np.linalg.norm(seen - points[index], axis=1) < 0.03 * depth[index]
+        plain = near & (hits.surface != SPHERE)
+        # the 3 x 3 pixels around, since a point may fall on the edge of a pattern
+        best = np.full(len(index), np.inf)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                pixel = images[k][y.astype(int) + dy, x.astype(int) + dx] / 255.0
+                best = np.minimum(best, np.abs(pixel - colours[index]).max(axis=1))
+        agree += int((best[plain] < 0.1).sum())
+        total += int(plain.sum())
+    assert total > 3000, "points are seen by several views"
+    assert agree >= 0.9 * total, f"{agree} of {total}"
+
+
+def test_own_view_reproduces_the_points_exactly(meta: dict, cloud: tuple[np.ndarray, np.ndarray]) -> None:
+    """Points were drawn view by view: the first ones lie on pixel centres of the first view."""
+    x, y, _ = project(meta, 0, cloud[0][: 3000 // VIEWS])
+    assert np.abs(x - np.floor(x) - 0.5).max() < 2e-3
+    assert np.abs(y - np.floor(y) - 0.5).max() < 2e-3
+
+
+def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
+    for frame in meta["frames"]:
+        matrix = np.array(frame["transform_matrix"])
+        assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(matrix[:3, :3]) > 0
+        assert (matrix[:3, 3] > LOW + 0.1).all() and (matrix[:3, 3] < HIGH - 0.1).all()
+        assert matrix[2, 1] > 0.5, "up in the picture is up in the room"
+    room = Room(0)
+    for view in camera_path(60, 64, 48, 0):
+        _, hits = first_hits(room, view, np.arange(64 * 48))
+        assert hits.t.min() > 0.1
+    assert {LANDSCAPE, SPHERE} <= set(np.concatenate([first_hits(room, v, np.arange(3072))[1].surface for v in [view]]))
+
+
+def test_pictures_have_detail_and_range(images: np.ndarray) -> None:
+    grey = images.astype(np.float32).mean(axis=3)
+    assert (grey.std(axis=(1, 2)) > 25).all()
+    assert np.abs(np.diff(grey, axis=2)).mean() > 5, "high-frequency texture"
+    assert 60 < grey.mean() < 160
+    assert (images == 255).all(axis=3).mean() < 0.05, "little is burnt out"
+
+
+def test_sphere_mirrors() -> None:
+    """A point of the sphere, seen from two sides, has two colours; a point of the floor has one."""
+    room = Room(0)
+
+    def seen(eye: list[float], point: np.ndarray) -> np.ndarray:
+        d = point - np.array(eye)
+        d = np.float32(d / np.linalg.norm(d))
+        o = tuple(np.float32(a) for a in eye)
+        rays = tuple(np.array([a], np.float32) for a in d)
+        return room.colour(o, rays, room.hit(o, rays))[0]
+
+    a, b = [-1.5, -1.8, 1.2], [0.6, -1.9, 0.9]
+    angles = np.linspace(-0.5, 1.3, 12)
+    on_sphere = SPHERE_CENTRE + SPHERE_RADIUS * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
+    assert np.mean([np.abs(seen(a, p) - seen(b, p)).max() for p in on_sphere]) > 0.08
+    on_floor = np.array([0.3, -1.5, 0.0])
+    assert np.abs(seen(a, on_floor) - seen(b, on_floor)).max() < 0.01
+
+
+def test_same_seed_same_capture(tmp_path: Path) -> None:
+    args = {"views": 3, "width": 64, "height": 48, "points": 50}
+    folders = [generate(tmp_path / name, seed=seed, **args) for name, seed in (("a", 4), ("b", 4), ("c", 5))]
+    files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*") if p.is_file()} for f in folders]
+    assert len(files[0]) == 5
+    assert files[0] == files[1]
+    assert files[0] != files[2]
+
+
+def test_nerfstudio_reads_it(capture: Path, cloud: tuple[np.ndarray, np.ndarray]) -> None:
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    config = NerfstudioDataParserConfig(data=capture, eval_mode="interval", eval_interval=8, load_3D_points=True)
+    parser = config.setup()
+    train, test = parser.get_dataparser_outputs("train"), parser.get_dataparser_outputs("test")
+    assert (len(train.image_filenames), len(test.image_filenames)) == (10, 2)
+    assert all(name.exists() for name in train.image_filenames)
+    assert float(train.cameras.fx[0]) == pytest.approx(0.8 * WIDTH)
+    assert train.metadata["points3D_xyz"].shape == (3000, 3)
+    # nerfstudio's world is a rotated, moved and scaled one; the parser says how
+    moved = cloud[0] @ train.dataparser_transform[:3, :3].numpy().T + train.dataparser_transform[:3, 3].numpy()
+    assert np.allclose(moved * train.dataparser_scale, train.metadata["points3D_xyz"], atol=1e-4)
+
+
+def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        generate(tmp_path, views=1)
+    with pytest.raises(FileExistsError, match="is a file"):
+        generate(tmp_path / "mine.txt", views=1)
+    assert (tmp_path / "mine.txt").read_text() == "precious"
+    folder = generate(tmp_path / "room", views=1, width=16, height=12, points=0)
+    generate(folder, views=2, width=16, height=12, points=5, overwrite=True)
+    assert len(list((folder / "images").iterdir())) == 2
+
+
+@pytest.mark.parametrize("bad", [{"views": 0}, {"width": 0}, {"height": -5}, {"points": -1}])
+def test_bad_sizes(tmp_path: Path, bad: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(bad))} must be at least"):
+        generate(tmp_path / "room", **bad)
+    assert not list(tmp_path.iterdir())
+
+
+def test_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("bitymi_ns.sample.capture.write_ply", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        generate(tmp_path / "room", views=1, width=16, height=12)
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def interrupted(*args: object) -> None:
+        calls.append(1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bitymi_ns.sample.capture.render", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        generate(tmp_path / "room", views=1000, width=16, height=12)
+    assert len(calls) < 1000
+    assert not list(tmp_path.iterdir())
+
+
+def test_look_at() -> None:
+    matrix = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
+    assert np.allclose(matrix[:3, :3], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])

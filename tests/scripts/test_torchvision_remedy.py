@@ -1,0 +1,120 @@
+"""The torchvision remedy: what it writes, and that nerfstudio's parts of torchvision import with it."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "torchvision_remedy.py"
+
+
+@pytest.fixture
+def remedy() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("torchvision_remedy", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:
+    """Run code in a fresh interpreter without site's .pth files' effect on `path`, which comes first."""
+    setup = f"import sys; sys.path[:0] = {[str(p) for p in path]!r}\n"
+    return subprocess.run([sys.executable, "-c", setup + code], capture_output=True, text=True, check=False)
+
+
+def test_torchvision_imports_here() -> None:
+    result = python(
+        "import torchvision, torchvision.models, torchvision.transforms, torchvision.utils, torch\n"
+        "torchvision.models.alexnet(weights=None)\n"
+        "assert torchvision.transforms.functional.resize(torch.zeros(3, 8, 8), [4, 4]).shape == (3, 4, 4)\n"
+        "assert torchvision.utils.make_grid(torch.zeros(2, 3, 4, 4)).shape[0] == 3\n"
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def fake(folder: Path, version: str, cuda: str | None) -> None:
+    """A torchvision that fails as the real one does when nms is missing, and a torch that records declarations."""
+    (folder / "torchvision").mkdir(parents=True)
+    (folder / "torchvision" / "version.py").write_text(f"__version__ = '{version}'\n")
+    (folder / "torchvision" / "__init__.py").write_text(
+        "import torch\n"
+        "for name in ('nms', 'qnms'):\n"
+        "    if name not in torch.declared:\n"
+        "        raise RuntimeError(f'operator torchvision::{name} does not exist')\n"
+    )
+    (folder / "torch.py").write_text(
+        "declared = []\n"
+        f"class version: cuda = {cuda!r}\n"
+        "class library:\n"
+        "    class Library:\n"
+        "        def __init__(self, name, kind): assert (name, kind) == ('torchvision', 'FRAGMENT')\n"
+        "        def define(self, schema): declared.append(schema.split('(')[0])\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("version", "cuda", "works"),
+    [("0.28.0+cu130", None, True), ("0.28.0+cpu", None, False), ("0.28.0+cu130", "13.0", False)],
+)
+def test_acts_only_on_the_mismatch(
+    tmp_path: Path, remedy: ModuleType, version: str, cuda: str | None, works: bool
+) -> None:
+    fake(tmp_path, version, cuda)
+    (tmp_path / "shim_under_test.py").write_text(remedy.SHIM)
+    code = "import sys\nsys.meta_path = [f for f in sys.meta_path if type(f).__name__ != '_Finder']\n"
+    result = python(code + "import shim_under_test\nassert 'torch' not in sys.modules\nimport torchvision", tmp_path)
+    assert (result.returncode == 0) is works, result.stderr
+    if not works:
+        assert remedy.SYMPTOM in result.stderr
+
+
+def test_writes_nothing_when_all_is_well(
+    tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(remedy, "shim_files", lambda: (tmp_path / "shim.py", tmp_path / "shim.pth"))
+    monkeypatch.setattr(remedy, "import_error", lambda: "")
+    monkeypatch.setattr(sys, "argv", ["remedy"])
+    monkeypatch.setattr(sys, "base_prefix", "elsewhere")
+    assert remedy.main() == 0
+    assert "nothing to do" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("errors", "status", "left"),
+    [
+        (["RuntimeError: operator torchvision::nms does not exist", ""], 0, 2),
+        (["RuntimeError: operator torchvision::nms does not exist", "still broken"], 1, 0),
+        (["ImportError: something else"], 1, 0),
+    ],
+)
+def test_writes_when_needed_and_takes_back_when_useless(
+    tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch, errors: list[str], status: int, left: int
+) -> None:
+    answers = iter(errors)
+    monkeypatch.setattr(remedy, "shim_files", lambda: (tmp_path / "shim.py", tmp_path / "shim.pth"))
+    monkeypatch.setattr(remedy, "import_error", lambda: next(answers))
+    monkeypatch.setattr(sys, "argv", ["remedy"])
+    monkeypatch.setattr(sys, "base_prefix", "elsewhere")
+    assert remedy.main() == status
+    assert len(list(tmp_path.iterdir())) == left
+
+
+def test_remove(tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = (tmp_path / "shim.py", tmp_path / "shim.pth")
+    for path in files:
+        path.write_text("")
+    monkeypatch.setattr(remedy, "shim_files", lambda: files)
+    monkeypatch.setattr(sys, "argv", ["remedy", "--remove"])
+    monkeypatch.setattr(sys, "base_prefix", "elsewhere")
+    assert remedy.main() == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_refuses_outside_a_virtual_environment(remedy: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["remedy"])
+    monkeypatch.setattr(sys, "base_prefix", sys.prefix)
+    assert remedy.main() == 2

@@ -1,0 +1,72 @@
+"""The `bitymi` console script: thin calls, and mistakes answered in one line."""
+
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns import cli
+
+
+def test_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["sample", "--output-dir", str(tmp_path / "room"), "--views", "1", "--width", "16", "--height", "12"]
+    assert cli.main(args) == 0
+    assert (tmp_path / "room" / "transforms.json").is_file()
+    assert "Wrote 1 images" in capsys.readouterr().out
+    assert cli.main(args) == 1
+    error = capsys.readouterr().err
+    assert "--overwrite" in error and error.count("\n") == 1
+    assert cli.main([*args, "--overwrite"]) == 0
+
+
+def test_bad_value_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["sample", "--output-dir", str(tmp_path / "room"), "--views", "0"]) == 1
+    assert capsys.readouterr().err == "bitymi: views must be at least 1, got 0\n"
+
+
+def test_unwritable_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert cli.main(["sample", "--output-dir", str(tmp_path / "file" / "room")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("bitymi: ") and error.count("\n") == 1
+
+
+def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import bitymi_ns.report
+
+    seen = {}
+
+    def build(inputs: list[Path], output_dir: Path, title: str = "") -> Path:
+        seen.update(inputs=inputs, output_dir=output_dir, title=title)
+        return output_dir / "index.html"
+
+    monkeypatch.setattr(bitymi_ns.report, "build", build, raising=False)
+    assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
+    assert seen == {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two"}
+
+
+def test_broken_report_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["report", str(tmp_path / "missing.json"), "--output-dir", str(tmp_path / "report")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("bitymi: ") and "missing.json" in error and error.count("\n") == 1
+
+
+def test_report_without_inputs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["report"]) == 1
+    assert "nothing to report" in capsys.readouterr().err
+
+
+def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bitymi_ns.sample.generate", interrupted)
+    assert cli.main(["sample", "--output-dir", str(tmp_path / "room")]) == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_help_lists_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--help"])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert "sample" in out and "report" in out

@@ -1,0 +1,19 @@
+"""Trained field to texture atlas: resolution, packing, evaluation, quantisation and the files of a bundle."""
+
+from bitymi_ns.bake.bundle import Bundle, BundleError, read_bundle, verify_bundle, write_bundle
+from bitymi_ns.bake.pipeline import Baked, BakeOptions, bake, export
+from bitymi_ns.bake.progress import Progress, rich_progress
+
+__all__ = [
+    "BakeOptions",
+    "Baked",
+    "Bundle",
+    "BundleError",
+    "Progress",
+    "bake",
+    "export",
+    "read_bundle",
+    "rich_progress",
+    "verify_bundle",
+    "write_bundle",
+]

@@ -1,0 +1,190 @@
+"""KTX2 files: 2D array textures of one level, in the three texel formats of an atlas.
+
+Written from the Khronos KTX File Format Specification 2.0 and the Khronos Data Format Specification 1.3.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
+
+Format = Literal["bc7", "uint8", "fp16"]
+
+_HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, and the one level
+_KEY_LIMIT = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the format of the texels decides in the file."""
+
+    vk_format: int
+    type_size: int  # bytes of one component, 1 for compressed formats
+    block: int  # texels a block along x and y
+    block_bytes: int
+    color_model: int
+    samples: tuple[tuple[int, int, int, int, int], ...]  # bit offset, bit length, channel type, lower, upper
+
+
+_RGBA = (0, 1, 2, 15)  # channel numbers of the colour model RGBSDA
+_FLOAT_SIGNED = 0xC0
+_LAYOUTS: dict[str, _Layout] = {
+    "bc7": _Layout(145, 1, 4, 16, 134, ((0, 128, 0, 0, 0xFFFFFFFF),)),
+    "uint8": _Layout(37, 1, 1, 4, 1, tuple((8 * i, 8, c, 0, 255) for i, c in enumerate(_RGBA))),
+    "fp16": _Layout(
+        97, 2, 1, 8, 1, tuple((16 * i, 16, c | _FLOAT_SIGNED, 0xBF800000, 0x3F800000) for i, c in enumerate(_RGBA))
+    ),
+}
+
+
+class Ktx2Error(ValueError):
+    """The bytes are not a KTX2 file of the kind this module writes; the message says what is wrong."""
+
+
+@dataclass(frozen=True)
+class Ktx2Image:
+    """A 2D array texture.
+
+    Attributes:
+        payload: one bytes-like object a layer.
+        format: one of bc7, uint8, fp16.
+        width, height: size in texels.
+        metadata: the key/value pairs, values as text (values that are not text are left out).
+    """
+
+    payload: list[memoryview]
+    format: Format
+    width: int
+    height: int
+    metadata: dict[str, str]
+
+
+def layer_bytes(format: Format, width: int, height: int) -> int:
+    """Bytes of one layer of `width` x `height` texels."""
+    layout = _LAYOUTS[format]
+    return -(-width // layout.block) * -(-height // layout.block) * layout.block_bytes
+
+
+def descriptor(format: Format) -> bytes:
+    """The Data Format Descriptor: a basic descriptor block with linear transfer and BT.709 primaries."""
+    layout = _LAYOUTS[format]
+    size = 24 + 16 * len(layout.samples)
+    block = struct.pack("<IHH", 0, 2, size)  # Khronos, basic format, version 1.3
+    block += struct.pack("<4B", layout.color_model, 1, 1, 0)  # BT.709, linear, straight alpha
+    block += struct.pack("<4B", layout.block - 1, layout.block - 1, 0, 0)
+    block += struct.pack("<8B", layout.block_bytes, 0, 0, 0, 0, 0, 0, 0)
+    for bit_offset, bit_length, channel, lower, upper in layout.samples:
+        block += struct.pack("<HBB4xII", bit_offset, bit_length - 1, channel, lower, upper)
+    return struct.pack("<I", 4 + size) + block
+
+
+def write_ktx2(
+    path: str | Path,
+    payload: Sequence[bytes],
+    format: Format,
+    width: int,
+    height: int,
+    writer: str,
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Writes a 2D array texture with one level, not supercompressed.
+
+    Args:
+        path: file to write.
+        payload: one bytes object a layer, rows from the top.
+        format: bc7, uint8 (RGBA) or fp16 (RGBA).
+        width, height: size in texels; multiples of 4 for bc7.
+        writer: name and version of the program (KTXwriter).
+        metadata: further key/value pairs.
+    """
+    layout = _LAYOUTS[format]
+    expected = layer_bytes(format, width, height)
+    if not payload or any(len(layer) != expected for layer in payload):
+        sizes = sorted({len(layer) for layer in payload})
+        raise Ktx2Error(f"{format} layers of {width} x {height} texels have {expected} bytes each, not {sizes}")
+    dfd = descriptor(format)
+    kvd = _pack_metadata({**(metadata or {}), "KTXorientation": "rd", "KTXwriter": writer})
+    start = _HEADER.size + len(dfd) + len(kvd)
+    alignment = max(layout.block_bytes, 4)
+    padding = -start % alignment
+    total = expected * len(payload)
+    header = _HEADER.pack(
+        IDENTIFIER,
+        *(layout.vk_format, layout.type_size, width, height, 0, len(payload), 1, 1, 0),
+        *(_HEADER.size, len(dfd), _HEADER.size + len(dfd), len(kvd), 0, 0),
+        *(start + padding, total, total),
+    )
+    with open(path, "wb") as file:
+        file.write(header + dfd + kvd + bytes(padding))
+        for layer in payload:
+            file.write(layer)
+
+
+def parse_ktx2(data: bytes | memoryview) -> Ktx2Image:
+    """Reads and checks a file written by `write_ktx2`, without copying the texels.
+
+    Raises:
+        Ktx2Error: the file is something else, is truncated, or contradicts itself.
+    """
+    view = memoryview(data)
+    if len(view) < _HEADER.size or bytes(view[:12]) != IDENTIFIER:
+        raise Ktx2Error("not a KTX2 file")
+    fields = _HEADER.unpack(view[: _HEADER.size])[1:]
+    vk_format, type_size, width, height, depth, layers, faces, levels, scheme = fields[:9]
+    dfd_at, dfd_size, kvd_at, kvd_size, sgd_at, sgd_size = fields[9:15]
+    data_at, data_size, raw_size = fields[15:]
+    format = next((name for name, layout in _LAYOUTS.items() if layout.vk_format == vk_format), None)
+    if format is None:
+        raise Ktx2Error(f"the texel format {vk_format} is none of {[each.vk_format for each in _LAYOUTS.values()]}")
+    layout = _LAYOUTS[format]
+    if scheme != 0 or sgd_at or sgd_size:
+        raise Ktx2Error("the file is supercompressed; write it again without supercompression")
+    if (type_size, depth, faces, levels) != (layout.type_size, 0, 1, 1) or not (width and height and layers):
+        raise Ktx2Error("not a 2D array texture of one level")
+    if width % layout.block or height % layout.block:
+        raise Ktx2Error(f"the size {width} x {height} is not made of whole {layout.block} x {layout.block} blocks")
+    expected_dfd = descriptor(format)
+    if dfd_at != _HEADER.size or bytes(view[dfd_at : dfd_at + dfd_size]) != expected_dfd:
+        raise Ktx2Error("the data format descriptor does not match the texel format")
+    if kvd_size > _KEY_LIMIT or (kvd_size and kvd_at != dfd_at + dfd_size) or kvd_at + kvd_size > len(view):
+        raise Ktx2Error("the key/value data lies outside the file")
+    size = layer_bytes(format, width, height)
+    if data_size != size * layers or raw_size != data_size or data_at % max(layout.block_bytes, 4):
+        raise Ktx2Error(f"the level index does not match {layers} layers of {width} x {height} texels")
+    if data_at < kvd_at + kvd_size or data_at < dfd_at + dfd_size or data_at + data_size != len(view):
+        raise Ktx2Error(f"truncated: {len(view)} bytes, {data_at + data_size} expected")
+    metadata = _unpack_metadata(bytes(view[kvd_at : kvd_at + kvd_size]))
+    payload = [view[data_at + i * size : data_at + (i + 1) * size] for i in range(layers)]
+    return Ktx2Image(payload, format, width, height, metadata)
+
+
+def _pack_metadata(metadata: Mapping[str, str]) -> bytes:
+    packed = b""
+    for key in sorted(metadata):
+        entry = key.encode() + b"\0" + metadata[key].encode() + b"\0"
+        packed += struct.pack("<I", len(entry)) + entry + bytes(-len(entry) % 4)
+    return packed
+
+
+def _unpack_metadata(data: bytes) -> dict[str, str]:
+    metadata: dict[str, str] = {}
+    at = 0
+    while at < len(data):
+        if at + 4 > len(data):
+            raise Ktx2Error("the key/value data ends within an entry")
+        (length,) = struct.unpack_from("<I", data, at)
+        entry = data[at + 4 : at + 4 + length]
+        if length < 2 or len(entry) != length or b"\0" not in entry:
+            raise Ktx2Error("the key/value data ends within an entry")
+        key, value = entry.split(b"\0", 1)
+        try:
+            metadata[key.decode()] = value.rstrip(b"\0").decode()
+        except UnicodeDecodeError:
+            pass  # the specification allows binary values
+        at += 4 + length + -length % 4
+    return metadata

@@ -1,0 +1,130 @@
+"""Shelf-First-Fit-Decreasing packing of texture tiles into pages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+GRID = 4  # tiles sit on the grid of BC7 blocks, so that no block belongs to two surfels
+ROWS = 64  # page heights are multiples of this, once an atlas has so many rows
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Where every tile lies.
+
+    Attributes:
+        tiles: [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x. A surfel without a
+            tile has a row of zeros.
+        width, height: size of every page in texels.
+        layers: number of pages.
+        occupancy: share of the pages' texels that belong to a tile.
+    """
+
+    tiles: npt.NDArray[np.int32]
+    width: int
+    height: int
+    layers: int
+    occupancy: float
+
+
+@dataclass
+class _Shelf:
+    y: int
+    used: int  # texels of its width that are taken
+
+
+def page_width_for(texels: int, widest: int, page_width: int) -> int:
+    """The page width: `page_width`, or a smaller power of two when a square of that side holds everything."""
+    width = max(GRID, widest)
+    while width < page_width and width * width < texels:
+        width *= 2
+    return width
+
+
+def _round_up(value: int, step: int) -> int:
+    return -(-value // step) * step
+
+
+def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192, max_layers: int = 2048) -> Packing:
+    """Packs tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
+
+    Tiles are taken by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
+    opens a new shelf of its own height. Sides are powers of two, so all tiles of one size are placed by arithmetic,
+    shelf starts are multiples of their height, and cutting the column of shelves into pages of equal height never
+    cuts a shelf. The result depends on the input alone.
+
+    Args:
+        resolution: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) for a surfel without a tile.
+        page_width: largest page width in texels, a power of two (smaller atlases get a narrower page).
+        max_rows: largest page height; 8192 is the limit of WebGPU and phones.
+        max_layers: largest number of pages.
+
+    Raises:
+        ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages would be needed.
+    """
+    sizes = np.asarray(resolution, dtype=np.int64).reshape(-1, 2)
+    _check_sizes(sizes, page_width, max_rows)
+    tiles = np.zeros((len(sizes), 5), dtype=np.int32)
+    area = int(sizes.prod(axis=1).sum())
+    if area == 0:
+        return Packing(tiles, GRID, GRID, 1, 0.0)
+    tallest = int(sizes[:, 1].max())
+    width = page_width_for(area, int(sizes[:, 0].max()), page_width)
+
+    placed = np.flatnonzero(sizes[:, 0])
+    order = placed[np.lexsort((placed, -sizes[placed, 0], -sizes[placed, 1]))]
+    ordered = sizes[order]
+    starts = np.flatnonzero(np.r_[True, np.any(ordered[1:] != ordered[:-1], axis=1)])
+    origins = np.zeros((len(order), 2), dtype=np.int64)
+    shelves: list[_Shelf] = []  # the shelves with room left, first opened first
+    rows = 0
+    for start, stop in zip(starts, np.r_[starts[1:], len(order)], strict=True):
+        r_u, r_v = (int(r) for r in ordered[start])
+        for shelf in shelves:
+            count = min(stop - start, (width - shelf.used) // r_u)
+            origins[start : start + count, 0] = shelf.used + r_u * np.arange(count)
+            origins[start : start + count, 1] = shelf.y
+            shelf.used += count * r_u
+            start += count
+        if start < stop:
+            index = np.arange(stop - start)
+            per_shelf = width // r_u
+            origins[start:stop, 0] = index % per_shelf * r_u
+            origins[start:stop, 1] = rows + index // per_shelf * r_v
+            opened = -(-len(index) // per_shelf)
+            rows += opened * r_v
+            shelves.append(_Shelf(rows - r_v, (len(index) - (opened - 1) * per_shelf) * r_u))
+        shelves = [shelf for shelf in shelves if shelf.used < width]
+
+    layers = -(-rows // max_rows)
+    if layers > max_layers:
+        raise ValueError(
+            f"the atlas needs {layers} pages of {width} x {max_rows} texels, more than {max_layers}: "
+            "lower r_max, cap tiles by the training views, or widen the pages"
+        )
+    step = max(ROWS, tallest) if rows >= ROWS else GRID
+    height = _round_up(-(-rows // layers), step)
+    tiles[order, 0] = origins[:, 0]
+    tiles[order, 1] = origins[:, 1] % height
+    tiles[order, 2] = origins[:, 1] // height
+    tiles[:, 3:] = sizes
+    return Packing(tiles, width, height, -(-rows // height), area / (width * height * -(-rows // height)))
+
+
+def _check_sizes(sizes: npt.NDArray[np.int64], page_width: int, max_rows: int) -> None:
+    if page_width < GRID or page_width & (page_width - 1):
+        raise ValueError(f"the page width must be a power of two of at least {GRID}, not {page_width}")
+    if max_rows < ROWS or max_rows % ROWS:
+        raise ValueError(f"the page height must be a multiple of {ROWS}, not {max_rows}")
+    tiled = sizes.any(axis=1)
+    bad = tiled & ((sizes < GRID) | (sizes & (sizes - 1) != 0)).any(axis=1)
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise ValueError(f"tile {row} is {sizes[row].tolist()} texels; sides must be powers of two of at least {GRID}")
+    if tiled.any() and int(sizes[:, 0].max()) > page_width:
+        raise ValueError(f"a tile is {int(sizes[:, 0].max())} texels wide, more than the page width {page_width}")
+    if tiled.any() and max_rows % int(sizes[:, 1].max()):
+        raise ValueError(f"tiles of {int(sizes[:, 1].max())} rows do not divide pages of {max_rows} rows")

@@ -1,0 +1,33 @@
+"""Progress of the slow steps, as a callback that anything can implement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Called after every chunk of work with the step's name and how much of it is done."""
+
+    def __call__(self, step: str, done: int, total: int) -> None: ...
+
+
+def no_progress(step: str, done: int, total: int) -> None:
+    """Shows nothing."""
+
+
+@contextmanager
+def rich_progress() -> Iterator[Progress]:
+    """A callback that draws one bar a step on the terminal; `with rich_progress() as progress: bake(..., progress)`."""
+    from rich.progress import Progress as Bars  # kept out of the import of the package: only the terminal needs it
+
+    with Bars() as bars:
+        tasks: dict[str, int] = {}
+
+        def update(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(step, total=total)
+            bars.update(tasks[step], completed=done, total=total)
+
+        yield update

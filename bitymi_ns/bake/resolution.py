@@ -1,0 +1,124 @@
+"""How many texels a surfel's tile gets along each tangent axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.scene.camera import Camera
+
+# Forgives the rounding of a ratio that is meant to be a power of two, so that it does not double the tile.
+_ROUNDING = 1e-6
+
+
+def next_power_of_two(x: Tensor) -> Tensor:
+    """The smallest power of two >= x, up to a relative rounding of 1e-6; float64, 0 where x <= 0."""
+    x = x.double().clamp(min=0.0, max=2.0**62) * (1.0 - _ROUNDING)
+    mantissa, exponent = torch.frexp(x)  # x = mantissa 2^exponent, mantissa in [0.5, 1)
+    exponent = exponent - (mantissa == 0.5).to(exponent.dtype)
+    return torch.where(x > 0, torch.ldexp(torch.ones_like(x), exponent), torch.zeros_like(x))
+
+
+def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor | None = None) -> Tensor:
+    """Edge of the finest voxel along each tangent axis of a surfel: the local delta of the Nyquist rule.
+
+    Outside the unit ball of a contracted scene a voxel is longer along the ray from the centre than across it.
+    A step of length 1 along the axis t crosses cos / radial voxels one way and sin / tangential the other, cos being
+    the component of t along that ray; the edge along t is the reciprocal of the two together (an ellipse).
+    Without a centre the smaller of the two edges holds for both axes, which never samples too coarsely.
+
+    Args:
+        voxel: [N, 2] (radial, tangential) voxel edges at the surfels' centres, world units.
+        axes: [N, 3, 2] unit tangent directions, world frame.
+        means: [N, 3] surfel centres, world frame.
+        center: [3] centre of the contraction, world frame.
+
+    Returns:
+        [N, 2] voxel edges along u and v, world units.
+    """
+    if center is None:
+        return voxel.amin(dim=1, keepdim=True).expand(-1, 2)
+    ray = torch.nn.functional.normalize(means - center.to(means), dim=-1)  # [N, 3], zero at the centre
+    cos2 = torch.einsum("nk,nka->na", ray, axes).square().clamp(max=1.0)  # [N, 2]
+    radial, tangential = voxel[:, :1], voxel[:, 1:]
+    return (cos2 / radial.square() + (1 - cos2) / tangential.square()).rsqrt()
+
+
+def nyquist_resolution(
+    scales: Tensor,
+    delta: Tensor,
+    extent: float = 3.0,
+    r_min: int = 4,
+    r_max: int = 64,
+    max_pixels: Tensor | None = None,
+) -> Tensor:
+    """Tile resolutions at the Nyquist rate of the finest hash level, capped by what the training views resolve.
+
+    Paper, eq. (nyquist): r_a = clamp(2^ceil(log2(4 e s_a / delta)), r_min, r_max); then r_a is at most the next power
+    of two of the largest projected extent in pixels.
+
+    Args:
+        scales: [N, 2] tangent scales s, world units.
+        delta: [N, 2] (or [N, 1]) finest voxel edge at the surfel along each axis, world units.
+        extent: e, half side of the tile in scale units. 3 covers the support exactly; the paper's 4 more than that.
+        r_min, r_max: smallest and largest resolution, powers of two >= 4.
+        max_pixels: [N, 2] or [N] largest projected extent of the tile over the training views, pixels.
+
+    Returns:
+        [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
+    """
+    for name, value in (("r_min", r_min), ("r_max", r_max)):
+        if value < 4 or value & (value - 1):
+            raise ValueError(f"{name} must be a power of two of at least 4 (a BC7 block is 4 x 4 texels), not {value}")
+    if r_min > r_max:
+        raise ValueError(f"r_min {r_min} is larger than r_max {r_max}")
+    resolution = next_power_of_two(4.0 * extent * scales / delta)  # [N, 2]
+    if max_pixels is not None:
+        if max_pixels.dim() == 1:
+            max_pixels = max_pixels[:, None]
+        resolution = torch.minimum(resolution, next_power_of_two(max_pixels))
+    return resolution.clamp(r_min, r_max).to(torch.int32)
+
+
+def max_projected_extent(
+    means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = 3.0, near: float = 0.2
+) -> tuple[Tensor, Tensor]:
+    """Largest projected size in pixels of every surfel's tile, per tangent axis, over the training views.
+
+    The segment from -e s_a to +e s_a along axis a is projected with the Jacobian of the pinhole at the surfel's
+    centre. A view counts when the centre lies in front of the near plane and within the image enlarged by the
+    projected half extents.
+
+    Args:
+        means: [N, 3] world positions.
+        axes: [N, 3, 2] unit tangent directions, world frame.
+        scales: [N, 2] tangent scales, world units.
+        cameras: training views; with none, nothing is seen.
+        extent: half side of the tile in scale units.
+        near: nearest drawn depth, camera z.
+
+    Returns:
+        (max_pixels [N, 2] float32, 0 where unseen; views [N] int32, the number of views that see the surfel).
+    """
+    max_pixels = torch.zeros_like(scales)  # [N, 2]
+    views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
+    steps = axes * (2.0 * extent * scales)[:, None, :]  # [N, 3, 2] whole side of the tile
+    for camera in cameras:
+        viewmat, K = camera.viewmat.to(means), camera.K.to(means)
+        p = means @ viewmat[:3, :3].T + viewmat[:3, 3]  # [N, 3] camera frame
+        t = torch.einsum("ck,nka->nca", viewmat[:3, :3], steps)  # [N, 3, 2] camera frame
+        front = p[:, 2] > near
+        z = torch.where(front, p[:, 2], torch.ones_like(p[:, 2]))[:, None]  # [N, 1]
+        x, y = p[:, 0:1] / z, p[:, 1:2] / z
+        du = K[0, 0] * (t[:, 0] - x * t[:, 2]) / z  # [N, 2] pixels across, per axis
+        dv = K[1, 1] * (t[:, 1] - y * t[:, 2]) / z  # [N, 2] pixels down
+        reach_x, reach_y = du.abs().sum(1) / 2, dv.abs().sum(1) / 2  # [N] half extents
+        px, py = (K[0, 0] * x + K[0, 2])[:, 0], (K[1, 1] * y + K[1, 2])[:, 0]
+        seen = front & (px > -reach_x) & (px < camera.width + reach_x)
+        seen &= (py > -reach_y) & (py < camera.height + reach_y)
+        pixels = torch.where(seen[:, None], torch.hypot(du, dv), torch.zeros_like(du))
+        max_pixels = torch.maximum(max_pixels, pixels)
+        views += seen.to(torch.int32)
+    return max_pixels, views

@@ -1,0 +1,157 @@
+"""Surfels as the columns of a PLY file, and back.
+
+The names of 3D Gaussian splatting come first, so that its viewers show a sensible colour: x y z, f_dc_0..2, opacity
+(logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour by
+name, `<parameter>_<i>` in C order, and the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.ply import PlyError
+
+SH_C0 = 0.28209479177387814
+FLAT_LOG_SCALE = -31.0
+TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
+
+# Trailing shape of every view-colour parameter; -1 is read from the number of columns.
+VIEW_COLORS: dict[str, dict[str, tuple[int, ...]]] = {
+    "sv": {"sv_sites": (-1, 3), "sv_log_tau": (-1,), "sv_rgb": (-1, 3)},
+    "sh": {"sh_dc": (3,), "sh_rest": (-1, 3)},
+    "sb": {"sb_base": (3,), "sb_lobes": (-1, 6)},
+    "sg": {"sg_base": (3,), "sg_lobes": (-1, 7)},
+}
+
+
+def view_color_kind(surfels: Mapping[str, Tensor]) -> str:
+    """Which view colour the parameters belong to: sv, sh, sb or sg."""
+    for kind, shapes in VIEW_COLORS.items():
+        if all(name in surfels for name in shapes):
+            return kind
+    raise ValueError(f"no view colour among the surfels' parameters {sorted(surfels)}")
+
+
+def mean_view_color(surfels: Mapping[str, Tensor]) -> Tensor:
+    """Mean of f_view over all directions, without the bias 0.5: [N, 3].
+
+    Exact for sh, sb and sg; a mean over 32 directions for sv. For display only.
+    """
+    kind = view_color_kind(surfels)
+    if kind == "sh":
+        return surfels["sh_dc"] * SH_C0
+    if kind == "sb":  # mean over the sphere of max(0, d.mu)^p is 1 / (2 (p + 1))
+        lobes = surfels["sb_lobes"]  # [N, L, 6]
+        power = 4.0 * lobes[..., 5].exp()
+        rgb = torch.nn.functional.softplus(lobes[..., :3], beta=10.0 * float(np.log(2.0)))
+        return surfels["sb_base"] + (rgb / (2.0 * (power + 1.0))[..., None]).sum(1)
+    if kind == "sg":  # mean over the sphere of exp(l (d.mu - 1)) is (1 - exp(-2l)) / 2l
+        lobes = surfels["sg_lobes"]  # [N, L, 7]
+        sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
+        share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
+        return surfels["sg_base"] + (lobes[..., 4:] * share[..., None]).sum(1)
+    sites = torch.nn.functional.normalize(surfels["sv_sites"], dim=-1)  # [N, K, 3]
+    sites = sites * surfels["sv_log_tau"].exp()[..., None]
+    total = torch.zeros_like(surfels["sv_rgb"][:, 0])
+    directions = _sphere(32).to(sites)
+    for direction in directions:
+        weight = torch.softmax(sites @ direction, dim=1)  # [N, K]
+        total += torch.einsum("nk,nkc->nc", weight, surfels["sv_rgb"])
+    return total / len(directions)
+
+
+def to_columns(
+    surfels: Mapping[str, Tensor], tiles: npt.NDArray[np.int32], mean_residual: Tensor | None = None
+) -> dict[str, npt.NDArray]:
+    """The columns of surfels.ply.
+
+    Args:
+        surfels: the per-surfel parameters of docs/architecture.md, N rows each.
+        tiles: [N, 5] int32.
+        mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers.
+    """
+    kind = view_color_kind(surfels)
+    surfels = {name: value.detach().float().cpu() for name, value in surfels.items()}
+    color = mean_view_color(surfels)
+    if mean_residual is not None:
+        color = color + mean_residual
+    color = color.nan_to_num(0.0).clamp(-0.5, 0.5) / SH_C0  # (mean colour - 0.5) / SH_C0
+    quats = torch.nn.functional.normalize(surfels["quats"], dim=1)
+    flat = torch.full((len(quats), 1), FLAT_LOG_SCALE)
+    groups: dict[tuple[str, ...], Tensor] = {
+        ("x", "y", "z"): surfels["means"],
+        _numbered("f_dc", 3): color,
+        ("opacity",): surfels["opacity_logits"][:, None],
+        _numbered("scale", 3): torch.cat([surfels["log_scales"], flat], dim=1),
+        _numbered("rot", 4): quats,
+        ("beta",): surfels["beta_raw"][:, None],
+    }
+    for name in VIEW_COLORS[kind]:
+        values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
+        groups[_numbered(name, values.shape[1])] = values
+    columns = {name: values[:, i].numpy() for names, values in groups.items() for i, name in enumerate(names)}
+    return columns | {name: tiles[:, i] for i, name in enumerate(TILE_COLUMNS)}
+
+
+def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[str, Tensor], Tensor]:
+    """Surfels and tiles from the columns of surfels.ply.
+
+    Returns:
+        surfels: the per-surfel parameters, float32 (quaternions have length 1).
+        tiles: [N, 5] int32.
+
+    Raises:
+        PlyError: a column is missing or has the wrong type, or the view colour has the wrong number of columns.
+    """
+    if kind not in VIEW_COLORS:
+        raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
+
+    def stack(names: tuple[str, ...], dtype: type = np.float32) -> Tensor:
+        for name in names:
+            if name not in columns:
+                raise PlyError(f"the column {name} is missing")
+            if columns[name].dtype != dtype:
+                raise PlyError(f"the column {name} holds {columns[name].dtype}, not {np.dtype(dtype)}")
+        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(dtype, copy=False))
+
+    surfels = {
+        "means": stack(("x", "y", "z")),
+        "quats": stack(_numbered("rot", 4)),
+        "log_scales": stack(_numbered("scale", 3))[:, :2].contiguous(),
+        "opacity_logits": stack(("opacity",))[:, 0].contiguous(),
+        "beta_raw": stack(("beta",))[:, 0].contiguous(),
+    }
+    count = len(surfels["means"])
+    for name, shape in VIEW_COLORS[kind].items():
+        found = [int(column[len(name) + 1 :]) for column in columns if _is_number_of(column, name)]
+        width = int(np.prod([size for size in shape if size > 0]))
+        if sorted(found) != list(range(len(found))) or len(found) % width or (-1 not in shape and len(found) != width):
+            raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {len(found)} columns")
+        values = stack(_numbered(name, len(found))) if found else torch.zeros(count, 0)
+        surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
+    if kind == "sv" and len({surfels[name].shape[1] for name in VIEW_COLORS["sv"]}) != 1:
+        raise PlyError("the Spherical Voronoi parameters disagree about the number of sites")
+    return surfels, stack(TILE_COLUMNS, np.int32)
+
+
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}_{i}" for i in range(count))
+
+
+def _is_number_of(column: str, name: str) -> bool:
+    rest = column[len(name) + 1 :]
+    return column.startswith(f"{name}_") and rest.isascii() and rest.isdecimal() and len(rest) < 6
+
+
+def _sphere(count: int) -> Tensor:
+    """Directions spread evenly over the sphere along a Fibonacci spiral: [count, 3]."""
+    i = torch.arange(count, dtype=torch.float64)
+    z = 1.0 - (2.0 * i + 1.0) / count
+    angle = i * torch.pi * (3.0 - 5.0**0.5)
+    radius = (1.0 - z * z).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1).float()

@@ -1,0 +1,108 @@
+"""The training objective: photometric loss and falloff reduction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import RenderOutput
+
+SSIM_WINDOW = 11
+"""Side of the SSIM window in pixels; images narrower than this have no valid window."""
+
+
+def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None = None) -> Tensor:
+    """(1 - w) L1 + w (1 - SSIM).
+
+    Args:
+        rgb: [H, W, 3] rendered image.
+        target: [H, W, 3] photograph in [0, 1].
+        ssim_weight: w. An image that holds no 11 x 11 window is judged by L1 alone.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts. Other pixels are left out of L1 and made equal in
+            both images for SSIM, so that no gradient comes from them.
+
+    Returns:
+        Scalar; 0 when no pixel counts.
+    """
+    if mask is not None:
+        mask = mask.reshape(*rgb.shape[:2], 1)
+        # where() also keeps a NaN in an excluded pixel of the photograph out of the gradient
+        target = torch.where(mask, target, 0.0)
+        rgb = torch.where(mask, rgb, target)
+        l1 = (rgb - target).abs().sum() / (3 * mask.sum()).clamp(min=1)
+    else:
+        l1 = (rgb - target).abs().mean()
+    if ssim_weight == 0.0 or min(rgb.shape[:2]) < SSIM_WINDOW:
+        return l1
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ops.ssim(rgb, target))
+
+
+def error_weight(rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_sum", "mse"] = "l1_sum") -> Tensor:
+    """omega = exp(-gamma e) of the falloff loss: 1 where the picture is right already, near 0 where it is wrong.
+
+    Without gradient: else the loss could be lowered by making the error larger.
+
+    Args:
+        rgb, target: [H, W, 3].
+        gamma: how fast omega fades with the error.
+        error: e = L1 summed over rgb (the formula of the paper), or the mean squared error over rgb.
+
+    Returns:
+        [H, W, 1].
+    """
+    difference = rgb.detach() - target.detach()
+    if error == "l1_sum":
+        e = difference.abs().sum(-1, keepdim=True)
+    elif error == "mse":
+        e = difference.square().mean(-1, keepdim=True)
+    else:
+        raise ValueError(f"falloff_error must be l1_sum or mse, not {error!r}")
+    return torch.exp(-gamma * e)
+
+
+def falloff(
+    rgb: Tensor,
+    target: Tensor,
+    beta_map: Tensor,
+    gamma: float,
+    error: Literal["l1_sum", "mse"] = "l1_sum",
+    mask: Tensor | None = None,
+) -> Tensor:
+    """L_beta = mean over the pixels of omega * beta_map, with omega from `error_weight`.
+
+    Args:
+        rgb, target: [H, W, 3]; only their difference counts and it gets no gradient.
+        beta_map: [H, W, 1] alpha-blended beta, sum_i w_i beta_i. `RenderOutput.beta` carries gradient to the blending
+            weights and to beta (the literal formula); for gradient to beta alone pass `beta_only_map(...)`.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
+
+    Returns:
+        Scalar.
+    """
+    if mask is None:
+        return (error_weight(rgb, target, gamma, error) * beta_map).mean()
+    mask = mask.reshape(*rgb.shape[:2], 1)
+    omega = error_weight(rgb, torch.where(mask, target, rgb), gamma, error)
+    return (omega * beta_map * mask).sum() / mask.sum().clamp(min=1)
+
+
+def beta_only_map(output: RenderOutput, beta_raw: Tensor) -> Tensor:
+    """The blended beta map with the blending weights held fixed, so that the falloff loss moves beta alone.
+
+    Args:
+        output: what `Scene.render` returned.
+        beta_raw: [N] the surfels' parameter; beta = 4 sigmoid(beta_raw).
+
+    Returns:
+        [H, W, 1], equal in value to `output.beta`.
+    """
+    fragments = replace(output.fragments, weight=output.fragments.weight.detach())
+    beta = 4.0 * torch.sigmoid(beta_raw)
+    values = beta[output.fragments.surfel.long()].unsqueeze(-1)  # [F, 1]
+    return ops.composite(fragments, values).reshape(output.beta.shape)

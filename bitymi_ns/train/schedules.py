@@ -1,0 +1,128 @@
+"""Everything that changes in the course of a run, in one place."""
+
+from __future__ import annotations
+
+import math
+
+from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
+
+VIEW_COLOR = ("sv_rgb", "sh_dc", "sb_base", "sg_base")
+VIEW_SHAPE = ("sv_sites", "sv_log_tau", "sb_lobes", "sg_lobes")
+FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
+SH_REST_SHARE = 1.0 / 20.0
+"""The higher SH bands learn at this share of the rate of the constant one."""
+
+
+class Schedule:
+    """Events and rates of a run of `max_steps` steps.
+
+    The options give every step count for a run of 30,000 steps. A run of another length keeps the proportions: an
+    event that fires n times in 30,000 steps fires n times in any run with room for it, at the same share of the run.
+    (A run too short for that, fewer than 60 steps with the default options, fires at every step it can.)
+
+    `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
+    """
+
+    def __init__(self, config: TrainConfig, max_steps: int, extent: float = 1.0) -> None:
+        """
+        Args:
+            config: training options.
+            max_steps: length of the run in steps.
+            extent: scene extent in world units; the learning rate of the means is in multiples of it.
+        """
+        if max_steps < 1:
+            raise ValueError(f"a run needs at least one step, not {max_steps}")
+        if not (math.isfinite(extent) and extent > 0.0):
+            raise ValueError(f"the scene extent must be positive and finite, not {extent}")
+        self.config = config
+        self.max_steps = max_steps
+        self.extent = float(extent)
+        densify = config.densify
+        if densify.interval < 1 or densify.reset_interval < 1 or config.freeze_every < 1:
+            raise ValueError("densify.interval, densify.reset_interval and freeze_every must be at least 1")
+        self.densify_steps = self._events(_multiples(densify.interval, densify.start, densify.stop))
+        self.reset_steps = self._events(_multiples(densify.reset_interval, 0, densify.stop))
+        self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
+
+    def scaled(self, step_at_30k: float) -> int:
+        """The step count of this run that corresponds to one given for 30,000 steps: 0 stays 0, all else at least 1."""
+        if step_at_30k <= 0:
+            return 0
+        return max(1, math.floor(step_at_30k * self.max_steps / REFERENCE_STEPS + 0.5))
+
+    def _events(self, steps_at_30k: list[int]) -> frozenset[int]:
+        return frozenset(min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
+
+    def is_densify_step(self, step: int) -> bool:
+        """Whether surfels are cloned, split and pruned after this step."""
+        return step in self.densify_steps
+
+    def is_reset_step(self, step: int) -> bool:
+        """Whether opacities are reset after this step (after a densification of the same step)."""
+        return step in self.reset_steps
+
+    def is_final_prune_step(self, step: int) -> bool:
+        """Whether the multi-view prune of the finished geometry takes place after this step."""
+        return step in self.final_prune_steps
+
+    def after_first_reset(self, step: int) -> bool:
+        """Whether the first opacity reset is over: from then on size on screen counts for pruning."""
+        return step > self.scaled(self.config.densify.reset_interval)
+
+    def densification_over(self, step: int) -> bool:
+        """Whether no densification can follow this step, so that its statistics are needed no more."""
+        return not self.densify_steps or step > max(self.densify_steps)
+
+    def field_trains(self, step: int) -> bool:
+        """Whether the texture field learns in this step; on the other steps it is evaluated without gradient.
+
+        From `freeze_after` on it learns in one step in `freeze_every` (section Training Time of the paper).
+        """
+        return step < self.scaled(self.config.freeze_after) or step % self.config.freeze_every == 0
+
+    def field_warmup(self, step: int) -> float:
+        """Factor of the field's learning rate: rises linearly to 1 over the first `field_warmup` steps."""
+        return min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
+
+    def resolution_factor(self, step: int) -> float:
+        """Factor of the image size, 2^-k; 1 from `num_downscales` times `resolution_schedule` steps on."""
+        if self.config.resolution_schedule <= 0:
+            return 1.0
+        doublings = [self.scaled(self.config.resolution_schedule * (i + 1)) for i in range(self.config.num_downscales)]
+        return 2.0 ** -sum(step < at for at in doublings)
+
+    def lr(self, name: str, step: int) -> float:
+        """Learning rate of a parameter in this step.
+
+        Args:
+            name: a surfel parameter, or field_table, field_w1 to field_w3 (or field_mlp for the three together).
+        """
+        rates = self.config.lr
+        if name == "means":
+            return self.extent * self._decay(rates.means, step)
+        if name in ("quats", "log_scales", "opacity_logits", "beta_raw"):
+            return float(getattr(rates, name))
+        if name in VIEW_COLOR:
+            return self._decay(rates.view_color, step)
+        if name == "sh_rest":
+            return SH_REST_SHARE * self._decay(rates.view_color, step)
+        if name in VIEW_SHAPE:
+            return self._decay(rates.view_shape, step)
+        if name == "field_table":
+            return self.field_warmup(step) * self._decay(rates.field_table, step)
+        if name in FIELD_MLP:
+            return self.field_warmup(step) * self._decay(rates.field_mlp, step)
+        raise KeyError(f"no learning rate is known for a parameter named {name!r}")
+
+    def _decay(self, ends: tuple[float, float], step: int) -> float:
+        """Log-linear from the first value (step 0) to the second (last step)."""
+        first, last = float(ends[0]), float(ends[1])
+        if first <= 0.0 or last <= 0.0:
+            raise ValueError(f"learning rates that decay must be positive, not {first} and {last}")
+        t = min(max(step / max(1, self.max_steps - 1), 0.0), 1.0)
+        return math.exp((1.0 - t) * math.log(first) + t * math.log(last))
+
+
+def _multiples(interval: int, start: int, stop: int) -> list[int]:
+    """Multiples of `interval` strictly between `start` and `stop`."""
+    return [s for s in range(interval, stop, interval) if s > start]

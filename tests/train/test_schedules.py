@@ -1,0 +1,90 @@
+"""Short runs are proper runs: the same events, as often, at the same share of the run."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.schedules import Schedule
+
+
+def fired(schedule: Schedule, name: str) -> list[int]:
+    return [s for s in range(schedule.max_steps) if getattr(schedule, name)(s)]
+
+
+def test_reference_run_has_the_published_events():
+    schedule = Schedule(TrainConfig(), 30_000)
+    assert fired(schedule, "is_densify_step") == list(range(1000, 15_000, 500))
+    assert fired(schedule, "is_reset_step") == [3000, 6000, 9000, 12_000]
+    assert fired(schedule, "is_final_prune_step") == [18_000, 21_000, 24_000, 27_000]
+
+
+@pytest.mark.parametrize("max_steps", [60, 97, 300, 1000, 1999, 2000, 2500, 3000, 7000, 29_999, 35_000])
+@pytest.mark.parametrize("event", ["is_densify_step", "is_reset_step", "is_final_prune_step"])
+def test_every_event_fires_as_often_as_in_the_reference_run(max_steps, event):
+    reference = fired(Schedule(TrainConfig(), 30_000), event)
+    steps = fired(Schedule(TrainConfig(), max_steps), event)
+    assert len(steps) == len(reference)
+    for step, at_30k in zip(steps, reference, strict=True):
+        assert abs(step - at_30k * max_steps / 30_000) <= 0.5
+
+
+def test_resets_coincide_with_densification_in_short_runs():
+    for max_steps in (300, 2000, 2500, 3001):
+        schedule = Schedule(TrainConfig(), max_steps)
+        assert schedule.reset_steps <= schedule.densify_steps
+
+
+@pytest.mark.parametrize("max_steps", [1, 2, 3, 10, 59])
+def test_tiny_runs_stay_inside_the_run(max_steps):
+    schedule = Schedule(TrainConfig(), max_steps)
+    for steps in (schedule.densify_steps, schedule.reset_steps, schedule.final_prune_steps):
+        assert all(0 <= s < max_steps for s in steps)
+
+
+def test_scaled():
+    schedule = Schedule(TrainConfig(), 3000)
+    assert schedule.scaled(500) == 50
+    assert schedule.scaled(0) == 0
+    assert schedule.scaled(1) == 1
+    assert Schedule(TrainConfig(), 30_000).scaled(12_345) == 12_345
+
+
+@pytest.mark.parametrize("max_steps", [3000, 30_000])
+def test_field_learns_on_one_step_in_ten_after_freezing(max_steps):
+    schedule = Schedule(TrainConfig(), max_steps)
+    freeze = max_steps // 6
+    learning = [schedule.field_trains(s) for s in range(max_steps)]
+    assert all(learning[:freeze])
+    assert sum(learning[freeze:]) == math.ceil((max_steps - freeze) / 10)
+    assert all(Schedule(TrainConfig(freeze_every=1), 100).field_trains(s) for s in range(100))
+
+
+def test_resolution_doubles_up_to_full_size():
+    schedule = Schedule(TrainConfig(), 3000)
+    assert [schedule.resolution_factor(s) for s in (0, 299, 300, 599, 600, 2999)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
+    assert Schedule(TrainConfig(resolution_schedule=0), 3000).resolution_factor(0) == 1.0
+    assert Schedule(TrainConfig(num_downscales=0), 3000).resolution_factor(0) == 1.0
+
+
+def test_learning_rates():
+    schedule = Schedule(TrainConfig(), 3000, extent=4.0)
+    assert schedule.lr("means", 0) == pytest.approx(4 * 1.6e-4)
+    assert schedule.lr("means", 2999) == pytest.approx(4 * 1.6e-6)
+    assert schedule.lr("sh_rest", 0) == pytest.approx(schedule.lr("sh_dc", 0) / 20)
+    assert schedule.lr("field_table", 0) == pytest.approx(1e-2 / 50)
+    assert schedule.lr("field_w2", 2999) == pytest.approx(1e-4)
+    names = "means quats log_scales opacity_logits beta_raw sv_sites sv_log_tau sv_rgb sh_dc sh_rest sb_base sb_lobes"
+    for name in (names + " sg_base sg_lobes field_table field_w1 field_w2 field_w3 field_mlp").split():
+        assert type(schedule.lr(name, 1234)) is float  # checkpoints must hold no numpy scalars
+        assert schedule.lr(name, 1234) > 0
+    with pytest.raises(KeyError, match="colour"):
+        schedule.lr("colour", 0)
+
+
+@pytest.mark.parametrize("extent", [0.0, -1.0, float("nan"), float("inf")])
+def test_unusable_extent_is_refused(extent):
+    with pytest.raises(ValueError, match="extent"):
+        Schedule(TrainConfig(), 100, extent)

@@ -1,0 +1,8 @@
+"""What is learned: surfels, their view colour, and the residual colour field."""
+
+from .camera import Camera
+from .config import SceneConfig
+from .field import HashField
+from .scene import RenderOutput, Scene
+
+__all__ = ["Camera", "HashField", "RenderOutput", "Scene", "SceneConfig"]

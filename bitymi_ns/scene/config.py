@@ -33,3 +33,7 @@ class SceneConfig:
     """Nearest depth that is drawn, in scene units (camera z)."""
     weight_bound: float = 0.0
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field."""
+    texture_moves_surfels: bool = False
+    """The gradient of the residual field with respect to position reaches the surfels."""
+    rim: float = 1e-3
+    """Lower bound of 1 - x in the derivative of the Beta kernel; the derivative itself diverges at the rim for beta < 1."""

@@ -1,0 +1,54 @@
+"""Compositing: weighted sums of the fragments a pixel."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+from .project import Projection
+from .trace import Fragments
+
+
+class _CompositeImage(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, weight, depth, geom, colors, fragments, maps):
+        arrays = fragments.arrays
+        g, c = dense(geom, geom), dense(colors, geom)
+        image = geom.new_empty(fragments.width * fragments.height, 9 if maps else 5)
+        kernel("composite_forward", geom)(maps, g, fragments.tile_start, *arrays, c, image)
+        ctx.save_for_backward(g, fragments.tile_start, c, *arrays)
+        ctx.maps = maps
+        return image
+
+    @staticmethod
+    def backward(ctx, dimage):
+        geom, tile_start, colors, *arrays = ctx.saved_tensors
+        dweight, dcolors, dgeom = torch.empty_like(arrays[2]), torch.empty_like(colors), torch.empty_like(geom)
+        ddepth = torch.empty_like(arrays[4]) if ctx.maps else None
+        kernel("composite_backward", geom)(
+            ctx.maps, geom, tile_start, *arrays, colors, dense(dimage, geom), dweight, dcolors, ddepth, dgeom
+        )
+        return dweight, ddepth, dgeom, dcolors, None, None
+
+
+def composite_image(fragments: Fragments, projection: Projection, colors: Tensor, maps: bool = False) -> Tensor:
+    """Sums of w times colour, 1 and beta, and with maps also depth and normal, a pixel.
+
+    Args:
+        fragments: F fragments of an H x W view.
+        projection: the view's.
+        colors: [F, 3].
+        maps: add depth and normal.
+
+    Returns:
+        [H * W, 5] rgb, alpha, sum w beta; with maps [H * W, 9]: also sum w z (camera z) and sum w n (unit normals in the
+        camera frame, OpenCV axes, facing the camera). Nothing is divided by alpha; the background is not included.
+    """
+    return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)
+
+
+def composite(fragments: Fragments, values: Tensor) -> Tensor:
+    """Sums of w times any values [F, C] a pixel: [H * W, C]."""
+    out = values.new_zeros(fragments.width * fragments.height, values.shape[1])
+    return out.index_add(0, fragments.pixel, fragments.weight[:, None] * values)

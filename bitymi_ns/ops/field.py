@@ -1,0 +1,87 @@
+"""The residual colour field rho(x) = f_phi(E_theta(x)): contraction, hash grid, MLP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+
+FEATURES = 4
+"""Features a level."""
+WIDTH = 16
+"""Width of both hidden layers."""
+
+
+@dataclass(frozen=True)
+class FieldGeometry:
+    """Where the hash grid lies in the world.
+
+    Attributes:
+        min_resolution: cells along an edge of the coarsest level; each level doubles it.
+        contract: mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps
+            into the shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped.
+        mid: centre, world units.
+        half: radius or half edge, world units.
+    """
+
+    min_resolution: int
+    contract: bool
+    mid: tuple[float, float, float]
+    half: float
+
+
+def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor):
+    """The kernels' view of the field's parameters.
+
+    Raises:
+        ValueError: shapes do not agree.
+    """
+    levels, size, features = table.shape
+    log2_size = size.bit_length() - 1
+    if features != FEATURES or size != 1 << log2_size:
+        raise ValueError(f"field_table must be [levels, power of two, {FEATURES}], not {list(table.shape)}")
+    expected = [(levels * FEATURES, WIDTH), (WIDTH, WIDTH), (WIDTH, 3)]
+    for name, weight, shape in zip(("field_w1", "field_w2", "field_w3"), (w1, w2, w3), expected):
+        if tuple(weight.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(weight.shape)}")
+    weights = [dense(t, table) for t in (table, w1, w2, w3)]
+    g = geometry
+    return kernel("Field", table)(*weights, levels, log2_size, g.min_resolution, g.contract, tuple(g.mid), g.half)
+
+
+class _Field(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, geometry, *params):
+        points = dense(x, params[0])
+        rho = torch.empty_like(points)
+        kernel("field_forward", points)(kernel_field(geometry, *params), points, rho)
+        ctx.save_for_backward(points, *params)
+        ctx.geometry = geometry
+        return rho
+
+    @staticmethod
+    def backward(ctx, drho):
+        points, *params = ctx.saved_tensors
+        grads = [torch.empty_like(p) for p in params]
+        dx = torch.empty_like(points) if ctx.needs_input_grad[0] else None
+        kernel("field_backward", points)(kernel_field(ctx.geometry, *params), points, dense(drho, points), *grads, dx)
+        return dx, None, *grads
+
+
+def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
+    """Residual colour at world positions, eq. (color): four levels are interpolated trilinearly, concatenated and decoded by
+    an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
+
+    Args:
+        x: [M, 3] world positions.
+        geometry: where the grid lies.
+        table: [levels, T, 4] features, T a power of two; cells are hashed by XOR of coordinate times prime.
+        w1, w2, w3: [4 levels, 16], [16, 16], [16, 3] weights, input-major.
+
+    Returns:
+        [M, 3] residual, unbounded.
+    """
+    return _Field.apply(x, geometry, table, w1, w2, w3)

@@ -1,0 +1,108 @@
+"""Projection: what a camera sees of every surfel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.scene.camera import Camera
+
+from .backend import dense, kernel
+
+GEOM = 16
+"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), unused."""
+FRAME = 9
+
+
+@dataclass
+class Projection:
+    """Surfels as a camera sees them. Rows of surfels that it cannot see are zero.
+
+    With (dx, dy) the offset in pixels from the projected centre (cx, cy), a pixel's ray meets the surfel at
+    u = (u1 dx + u2 dy) / W, v = (v1 dx + v2 dy) / W, W = w0 + w1 dx + w2 dy, at depth z w0 / W (csrc/core/surfel.h).
+
+    Attributes:
+        geom: [N, 16], differentiable.
+        frames: [N, 9] mean, s_u t_u, s_v t_v in the world frame, differentiable.
+        radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0 = not visible.
+        camera: the camera.
+        near: nearest depth that is drawn, camera z.
+        not_finite: how many surfels were left out because a parameter is NaN or infinite.
+        mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
+        mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken a fragment before the sum.
+    """
+
+    geom: Tensor
+    frames: Tensor
+    radii: Tensor
+    camera: Camera
+    near: float
+    not_finite: int
+    mean2d_grad: Tensor | None = None
+    mean2d_absgrad: Tensor | None = None
+
+    @property
+    def visible(self) -> Tensor:
+        """[N] bool: the surfel can reach some pixel."""
+        return self.radii[:, 0] > 0
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, width, height, near):
+        n = means.shape[0]
+        inputs = [dense(t, means) for t in (means, quats, log_scales, opacity_logits, beta_raw, viewmat, K)]
+        geom, frames, radii = (means.new_empty(n, k) for k in (GEOM, FRAME, 2))
+        broken = kernel("project_forward", means)(*inputs, width, height, near, geom, frames, radii)
+        ctx.save_for_backward(*inputs, geom)
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        return geom, frames, radii, broken
+
+    @staticmethod
+    def backward(ctx, dgeom, dframes, _radii, _broken):
+        *inputs, geom = ctx.saved_tensors
+        dgeom = torch.zeros_like(geom) if dgeom is None else dense(dgeom, geom)
+        dframes = None if dframes is None else dense(dframes, geom)
+        out = [torch.empty_like(t) for t in inputs[:5]]
+        kernel("project_backward", geom)(*inputs, geom, dgeom, dframes, *out)
+        return *out, None, None, None, None, None
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    beta_raw: Tensor,
+    camera: Camera,
+    near: float = 0.2,
+) -> Projection:
+    """Projects surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
+
+    Args:
+        means: [N, 3] world positions.
+        quats: [N, 4] wxyz of any length.
+        log_scales: [N, 2] natural logarithm of the tangent scales, world units.
+        opacity_logits: [N], opacity = sigmoid.
+        beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
+        camera: OpenCV axes.
+        near: surfels with a centre nearer than this (camera z) are not seen.
+
+    Raises:
+        ValueError: shapes do not agree, or the camera has skew.
+    """
+    n = means.shape[0]
+    shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
+    shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    if float(camera.K[0, 1]) != 0.0:
+        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    geom, frames, radii, broken = _Project.apply(
+        means, quats, log_scales, opacity_logits, beta_raw, camera.viewmat, camera.K, camera.width, camera.height, near
+    )
+    return Projection(geom, frames, radii, camera, near, broken)

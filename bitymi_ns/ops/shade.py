@@ -1,0 +1,78 @@
+"""Shading: the colour of every fragment, eq. (color)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+from .field import FieldGeometry, kernel_field
+from .trace import Fragments
+
+
+class _Shade(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, base, frames, uv, fragments, geometry, bound, move, *params):
+        inputs = [dense(base, base), dense(frames, base)]
+        arrays = fragments.arrays
+        colors = base.new_empty(len(fragments), 3)
+        handle = kernel_field(geometry, *params) if params else None
+        kernel("shade_forward", base)(*arrays, bound, *inputs, handle, colors)
+        ctx.save_for_backward(*inputs, fragments.tile_start, colors, *arrays, *params)
+        ctx.geometry, ctx.bound, ctx.move = geometry, bound, move
+        return colors
+
+    @staticmethod
+    def backward(ctx, dcolors):
+        base, frames, tile_start, colors, *rest = ctx.saved_tensors
+        arrays, params = rest[:6], rest[6:]
+        learn = bool(params) and any(ctx.needs_input_grad[7:])
+        dbase = torch.empty_like(base)
+        grads = [torch.empty_like(p) for p in params] if learn else [None] * 4
+        duv = dframes = None
+        if learn and ctx.move:
+            duv, dframes = torch.empty_like(arrays[3]), torch.empty_like(frames)
+        handle = kernel_field(ctx.geometry, *params) if learn else None
+        kernel("shade_backward", base)(
+            tile_start,
+            *arrays,
+            ctx.bound,
+            base,
+            frames,
+            handle,
+            colors,
+            dense(dcolors, base),
+            dbase,
+            *grads,
+            duv,
+            dframes,
+        )
+        return dbase, dframes, duv, None, None, None, None, *(grads if params else ())
+
+
+def shade(
+    fragments: Fragments,
+    base: Tensor,
+    frames: Tensor,
+    geometry: FieldGeometry | None = None,
+    params: tuple[Tensor, ...] = (),
+    bound: float = 0.0,
+    move_surfels: bool = False,
+) -> Tensor:
+    """colour = ReLU(ReLU(f_view(d) + 0.5) + rho(x)), x = mean + u s_u t_u + v s_v t_v.
+
+    Args:
+        fragments: F fragments.
+        base: [N, 3] f_view of every surfel.
+        frames: [N, 9] of the projection.
+        geometry, params: the residual field (table, w1, w2, w3); none = no residual. Parameters that do not require a
+            gradient get none, and the field is then not evaluated in the backward pass.
+        bound: fragments of weight below this keep ReLU(f_view + 0.5).
+        move_surfels: the gradient of rho with respect to x reaches uv and frames.
+
+    Returns:
+        [F, 3].
+    """
+    if base.shape[0] != frames.shape[0]:
+        raise ValueError(f"base has {base.shape[0]} rows and frames {frames.shape[0]}")
+    return _Shade.apply(base, frames, fragments.uv, fragments, geometry, bound, move_surfels, *params)

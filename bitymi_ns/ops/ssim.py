@@ -1,0 +1,39 @@
+"""Structural similarity."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+
+
+class _Ssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, a, b):
+        height, width, channels = a.shape
+        x, y = dense(a, a), dense(b, a)
+        grad = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        value = kernel("ssim", x)(x, y, height, width, channels, grad)
+        ctx.grad = grad
+        return x.new_tensor(value)
+
+    @staticmethod
+    def backward(ctx, dvalue):
+        return dvalue * ctx.grad, None
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean SSIM over the valid 11 x 11 Gaussian windows (sigma 1.5), K1 = 0.01, K2 = 0.03, data range 1.
+
+    Differentiable in a. Images smaller than a window have nothing to compare: 1.
+
+    Args:
+        a, b: [H, W, C] in [0, 1].
+
+    Returns:
+        Scalar tensor.
+    """
+    if a.shape != b.shape or a.dim() != 3:
+        raise ValueError(f"ssim compares two [H, W, C] images of one size, not {list(a.shape)} and {list(b.shape)}")
+    return _Ssim.apply(a, b)

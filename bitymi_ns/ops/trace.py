@@ -1,0 +1,148 @@
+"""Visibility: the fragments of a view with their blending weights."""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel, module
+from .project import GEOM, Projection
+
+
+@dataclass
+class Fragments:
+    """The blended (pixel, surfel) pairs of a view: by tile of 16 x 16 pixels, in a tile front to back.
+
+    Attributes:
+        weight: [F] blending weight w = sigma T, differentiable.
+        uv: [2, F] surfel coordinates in scale units, |u|, |v| <= 3, differentiable.
+        depth: [F] camera z of the hit (of the centre in the low-pass branch), differentiable.
+        surfel: [F] int32 row of the surfel.
+        pixel: [F] int32, y * width + x.
+        sigma: [F] effective opacity, negative in the low-pass branch.
+        tile_start: [tiles + 1] int64, where each tile's fragments begin.
+        width, height: of the image, pixels.
+    """
+
+    weight: Tensor
+    uv: Tensor
+    depth: Tensor
+    surfel: Tensor
+    pixel: Tensor
+    sigma: Tensor
+    tile_start: Tensor
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return self.weight.shape[0]
+
+    @property
+    def arrays(self) -> tuple[Tensor, ...]:
+        """What the kernels take: surfel, pixel, weight, uv, depth, sigma, without their graph."""
+        return self.surfel, self.pixel, self.weight.detach(), self.uv.detach(), self.depth.detach(), self.sigma
+
+    def overdraw(self) -> Tensor:
+        """[H, W, 1] int32: blended surfels a pixel."""
+        count = torch.bincount(self.pixel, minlength=self.width * self.height)
+        return count.to(torch.int32).view(self.height, self.width, 1)
+
+
+class _Tracers:
+    """Tracers keep their memory from view to view; one is used by one thread at a time."""
+
+    def __init__(self) -> None:
+        self._idle: dict[object, list] = defaultdict(list)
+        self._lock = threading.Lock()
+
+    def take(self, like: Tensor):
+        make = kernel("Trace", like)
+        with self._lock:
+            return self._idle[make].pop() if self._idle[make] else make()
+
+    def give(self, tracer) -> None:
+        with self._lock:
+            self._idle[type(tracer)].append(tracer)
+
+
+tracers = _Tracers()
+
+
+class _Trace(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, geom, projection, rim):
+        camera, near = projection.camera, projection.near
+        tracer = tracers.take(geom)
+        n = tracer.run(geom.detach(), projection.radii, camera.width, camera.height, near)
+        ints = dict(dtype=torch.int32, device=geom.device)
+        surfel, pixel = torch.empty(n, **ints), torch.empty(n, **ints)
+        weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
+        uv = geom.new_empty(2, n)
+        tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64, device=geom.device)
+        tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
+        tracers.give(tracer)
+        ctx.save_for_backward(geom, tile_start, surfel, pixel, weight, uv, depth, sigma)
+        ctx.projection, ctx.rim = projection, rim
+        ctx.mark_non_differentiable(surfel, pixel, sigma, tile_start)
+        ctx.set_materialize_grads(False)
+        return weight, uv, depth, surfel, pixel, sigma, tile_start
+
+    @staticmethod
+    def backward(ctx, dweight, duv, ddepth, *_):
+        geom, tile_start, *arrays = ctx.saved_tensors
+        projection = ctx.projection
+        grads = [None if g is None else dense(g, geom) for g in (dweight, duv, ddepth)]
+        dgeom, absgrad = torch.empty_like(geom), geom.new_empty(geom.shape[0], 2)
+        kernel("trace_backward", geom)(
+            geom.detach(),
+            projection.near,
+            ctx.rim,
+            projection.camera.width,
+            tile_start,
+            *arrays,
+            *grads,
+            dgeom,
+            absgrad,
+        )
+        projection.mean2d_grad, projection.mean2d_absgrad = dgeom[:, :2], absgrad
+        return dgeom, None, None
+
+
+def trace(projection: Projection, rim: float = 1e-3) -> Fragments:
+    """Finds the fragments of a view: for each pixel, front to back by centre depth, the surfels with
+    sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255, until the transmittance would fall below 1e-4.
+
+    The backward pass fills `projection.mean2d_grad` and `projection.mean2d_absgrad`.
+
+    Args:
+        projection: of `project`; geom [N, 16].
+        rim: lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1.
+    """
+    if projection.geom.shape[1] != GEOM:
+        raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
+    weight, uv, depth, surfel, pixel, sigma, tile_start = _Trace.apply(projection.geom, projection, rim)
+    camera = projection.camera
+    return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height)
+
+
+def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
+    """How many blended fragments of each surfel lie on masked pixels (FastGS's per-view importance).
+
+    Args:
+        fragments: of a view of H x W pixels.
+        mask: [H * W] bool.
+        n: number of surfels.
+
+    Returns:
+        [n] int32.
+    """
+    if mask.numel() != fragments.width * fragments.height:
+        raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
+    counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)
+    flat = mask.reshape(-1).to(torch.uint8).contiguous()
+    module(counts.device).masked_counts(fragments.surfel, fragments.pixel, flat, counts)
+    return counts

@@ -1,0 +1,81 @@
+"""View-dependent surfel colour f_view(d): sv, sh, sb, sg."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+
+VIEW_COLORS: dict[str, tuple[str, ...]] = {
+    "sv": ("sv_sites", "sv_log_tau", "sv_rgb"),
+    "sh": ("sh_dc", "sh_rest"),
+    "sb": ("sb_base", "sb_lobes"),
+    "sg": ("sg_base", "sg_lobes"),
+}
+"""Names of the per-surfel parameters of each kind (docs/architecture.md gives their shapes)."""
+
+
+class _ViewColor(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, kind, terms, active, center, means, *params):
+        inputs = [dense(p, means) for p in params]
+        a, b, c = (*inputs, None) if len(inputs) == 2 else inputs
+        x, o = dense(means, means), dense(center, means)
+        out = means.new_empty(means.shape[0], 3)
+        kernel("view_color_forward", means)(kind, terms, a, b, c, x, o, active, out)
+        ctx.save_for_backward(x, o, active, *inputs)
+        ctx.kind, ctx.terms = kind, terms
+        return out
+
+    @staticmethod
+    def backward(ctx, dout):
+        x, o, active, *inputs = ctx.saved_tensors
+        a, b, c = (*inputs, None) if len(inputs) == 2 else inputs
+        da, db = torch.empty_like(a), torch.empty_like(b)
+        dc = None if c is None else torch.empty_like(c)
+        dx = torch.empty_like(x)
+        kernel("view_color_backward", x)(ctx.kind, ctx.terms, a, b, c, x, o, active, dense(dout, x), da, db, dc, dx)
+        return None, None, None, None, dx, *((da, db) if dc is None else (da, db, dc))
+
+
+def view_color(
+    kind: str, params: Mapping[str, Tensor], means: Tensor, center: Tensor, active: Tensor | None = None
+) -> Tensor:
+    """f_view(d) without the offset 0.5, d = (mean - centre) / |mean - centre| in the world frame.
+
+    Args:
+        kind: sv (Spherical Voronoi, the paper's), sh, sb or sg.
+        params: the parameters named in VIEW_COLORS[kind]; more are ignored.
+        means: [N, 3] world positions.
+        center: [3] camera centre, world.
+        active: [N] bool; rows that are not active give 0 and get no gradient. None = all.
+
+    Returns:
+        [N, 3].
+
+    Raises:
+        ValueError: unknown kind, or a parameter has the wrong shape.
+    """
+    if kind not in VIEW_COLORS:
+        raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
+    given = [params[name] for name in VIEW_COLORS[kind]]
+    n = means.shape[0]
+    terms = given[1].shape[1] + (1 if kind == "sh" else 0)
+    shapes = {
+        "sv": [(n, terms, 3), (n, terms), (n, terms, 3)],
+        "sh": [(n, 3), (n, terms - 1, 3)],
+        "sb": [(n, 3), (n, terms, 6)],
+        "sg": [(n, 3), (n, terms, 7)],
+    }[kind]
+    for name, tensor, shape in zip(VIEW_COLORS[kind], given, shapes):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    if kind == "sh" and terms not in (1, 4, 9, 16):
+        raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
+    if terms > 32:
+        raise ValueError(f"at most 32 sites or lobes a surfel, not {terms}")
+    flags = torch.ones(n, dtype=torch.uint8) if active is None else active.to(torch.uint8)
+    return _ViewColor.apply(kind, terms, flags.to(means.device), center, means, *given)

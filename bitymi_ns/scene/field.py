@@ -1,0 +1,86 @@
+"""The residual colour field as a module."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from bitymi_ns.ops.field import FEATURES, WIDTH, FieldGeometry, field
+
+from .config import SceneConfig
+
+
+class HashField(nn.Module):
+    """Multiresolution hash grid and MLP: view-independent residual colour rho(x), eq. (color).
+
+    The residual starts at zero: the last layer does. Table entries start at U(-1e-4, 1e-4).
+
+    Args:
+        config: levels, resolutions, table size.
+        mid: centre of the domain, world.
+        half: radius of the uncontracted ball, or half edge of the box, world units.
+        contract: contraction of space outside.
+        log2_table_size: entries a level, as a power of two.
+        generator: random numbers of the start.
+    """
+
+    def __init__(
+        self,
+        config: SceneConfig,
+        mid: tuple[float, float, float],
+        half: float,
+        contract: bool,
+        log2_table_size: int,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if not half > 0:
+            raise ValueError(f"the field's domain needs a positive size, not {half}")
+        if not 1 <= config.levels <= 4:
+            raise ValueError(f"levels must be 1 to 4, not {config.levels}")
+        self.levels, self.min_resolution = config.levels, config.min_resolution
+
+        def uniform(bound: float, *shape: int) -> nn.Parameter:
+            return nn.Parameter((torch.rand(*shape, generator=generator) * 2 - 1) * bound)
+
+        inputs = config.levels * FEATURES
+        self.field_table = uniform(1e-4, config.levels, 1 << log2_table_size, FEATURES)
+        # He's rule for ReLU layers
+        self.field_w1 = uniform((6 / inputs) ** 0.5, inputs, WIDTH)
+        self.field_w2 = uniform((6 / WIDTH) ** 0.5, WIDTH, WIDTH)
+        self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3))
+        # in the checkpoint: a loaded field lies where the trained one did
+        self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
+
+    @property
+    def geometry(self) -> FieldGeometry:
+        """Where the grid lies."""
+        *mid, half, contract = self.domain.tolist()
+        return FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
+
+    @property
+    def weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Table and MLP weights, in the order the operations take them."""
+        return self.field_table, self.field_w1, self.field_w2, self.field_w3
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Residual colour [M, 3] at world positions [M, 3]."""
+        return field(x, self.geometry, *self.weights)
+
+    def voxel_size(self, x: Tensor) -> Tensor:
+        """Edges of the finest voxel at world positions.
+
+        Outside the unit ball the contraction stretches a voxel by r^2 radially and by r / (2 - 1/r) tangentially.
+
+        Args:
+            x: [M, 3] world positions.
+
+        Returns:
+            [M, 2] radial and tangential edge, world units.
+        """
+        g = self.geometry
+        finest = g.min_resolution << (self.levels - 1)
+        if not g.contract:
+            return torch.full((x.shape[0], 2), 2 * g.half / finest, dtype=x.dtype, device=x.device)
+        r = ((x - x.new_tensor(g.mid)) / g.half).norm(dim=-1).clamp_min(1.0)
+        return (4 * g.half / finest) * torch.stack([r * r, r / (2 - 1 / r)], dim=-1)

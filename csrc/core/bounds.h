@@ -1,0 +1,114 @@
+// Which pixels a surfel can touch: SnugBox and AccuTile for the level set of the Beta kernel, united with the low pass.
+//
+// sigma >= 1/255  <=>  u^2 + v^2 <= r_c^2 with r_c^2 = 9 (1 - (255 o)^(-1/beta)), or d^2 <= ln(255 o).
+// In the offset (dx, dy) from the projected centre the first is the conic U^2 + V^2 <= r_c^2 W^2.
+//
+// Always evaluated in double, from the same (rounded) coefficients that the fragments use: the conic of a needle with
+// axis ratio k loses k^2 in its determinant, and a bound that misses a pixel is a hole in the picture.
+#pragma once
+
+#include "core/surfel.h"
+
+namespace bt {
+
+struct Extent {
+  using S = double;
+  bool visible;
+  bool whole;                // the disc crosses the camera plane: its image is no ellipse, use the whole screen
+  S x0, x1, y0, y1;          // box of offsets from the projected centre, pixels
+  S qa, qb, qc, qd, qe, qf;  // conic qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
+  S ex0, ex1, ey0, ey1;      // box of the ellipse alone
+  S blur;                    // radius of the low pass, pixels
+  bool thin;                 // the conic is too flat to intersect: use the box
+};
+
+template <class F>
+BT_HD Extent extent(const F* geom) {
+  using S = double;
+  S g[kGeom];
+  for (int i = 0; i < kGeom; ++i) g[i] = S(geom[i]);
+  Extent e;
+  const S o255 = S(255) * g[kOpacity];
+  e.visible = o255 >= S(1);
+  if (!e.visible) return e;
+  const S level = log_(o255);
+  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
+  // one part in 1e4 and a hundredth of a pixel wider: the bound must hold in spite of rounding
+  const S rc2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(1e-6));
+  e.blur = sqrt_(level) + S(0.01);
+  const S u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
+  e.qa = u1 * u1 + v1 * v1 - rc2 * w1 * w1;
+  e.qb = u1 * u2 + v1 * v2 - rc2 * w1 * w2;
+  e.qc = u2 * u2 + v2 * v2 - rc2 * w2 * w2;
+  e.qd = -rc2 * w0 * w1, e.qe = -rc2 * w0 * w2, e.qf = -rc2 * w0 * w0;
+  // dual conic by the adjugate of the point conic (entries needed for the box only)
+  const S c33 = e.qa * e.qc - e.qb * e.qb;
+  const S c13 = e.qb * e.qe - e.qc * e.qd, c23 = e.qb * e.qd - e.qa * e.qe;
+  const S c11 = e.qc * e.qf - e.qe * e.qe, c22 = e.qa * e.qf - e.qd * e.qd;
+  const S scale = (e.qa > S(0) ? e.qa : -e.qa) * (e.qc > S(0) ? e.qc : -e.qc);
+  // an ellipse exactly when the whole disc lies in front of the camera plane
+  const bool ellipse = c33 > S(1e-13) * scale && e.qa > S(0) && e.qc > S(0);
+  e.thin = !(c33 > S(1e-10) * scale);
+  e.whole = false;
+  if (!(w0 > S(0))) {  // seen exactly edge-on: no ray hits it, the low pass alone is drawn
+    e.ex0 = e.ey0 = S(1), e.ex1 = e.ey1 = S(-1);
+    e.x0 = e.y0 = -e.blur, e.x1 = e.y1 = e.blur;
+    return e;
+  }
+  if (!ellipse) {
+    e.whole = true;
+  } else {
+    const S mx = c13 / c33, my = c23 / c33;
+    const S hx = sqrt_(max_(mx * mx - c11 / c33, S(0))), hy = sqrt_(max_(my * my - c22 / c33, S(0)));
+    e.ex0 = mx - hx, e.ex1 = mx + hx, e.ey0 = my - hy, e.ey1 = my + hy;
+    const S pad = S(0.01) + S(1e-4) * max_(hx, hy);
+    e.ex0 -= pad, e.ex1 += pad, e.ey0 -= pad, e.ey1 += pad;
+    if (!finite_(e.ex0) || !finite_(e.ex1) || !finite_(e.ey0) || !finite_(e.ey1)) e.whole = true;
+  }
+  if (e.whole) {
+    e.x0 = e.y0 = S(-1e9), e.x1 = e.y1 = S(1e9);
+  } else {
+    e.x0 = min_(e.ex0, -e.blur), e.x1 = max_(e.ex1, e.blur);
+    e.y0 = min_(e.ey0, -e.blur), e.y1 = max_(e.ey1, e.blur);
+  }
+  return e;
+}
+
+// Interval of x offsets that the surfel can touch between the lines y = lo and y = hi (offsets); empty when x0 > x1.
+BT_HD void row_interval(const Extent& e, double lo, double hi, double& x0, double& x1) {
+  using S = double;
+  x0 = S(1), x1 = S(-1);
+  if (e.whole || (e.thin && e.ex0 <= e.ex1)) {
+    if (hi >= e.y0 && lo <= e.y1) x0 = e.x0, x1 = e.x1;
+    return;
+  }
+  if (hi >= e.ey0 && lo <= e.ey1) {
+    // at a boundary line: qa x^2 + 2 (qb y + qd) x + (qc y^2 + 2 qe y + qf) = 0
+    x0 = S(1e30), x1 = S(-1e30);
+    for (int side = 0; side < 2; ++side) {
+      const S y = side ? hi : lo;
+      const S b = e.qb * y + e.qd, c = e.qc * y * y + S(2) * e.qe * y + e.qf;
+      const S disc = b * b - e.qa * c;
+      if (disc >= S(0)) {
+        const S root = sqrt_(disc) / e.qa, mid = -b / e.qa;
+        const S pad = S(0.02) + S(1e-3) * root;
+        x0 = min_(x0, mid - root - pad), x1 = max_(x1, mid + root + pad);
+      }
+    }
+    // the leftmost and rightmost points of the ellipse count when they lie between the lines, generously
+    const S slack = S(0.02) + S(1e-3) * (e.ey1 - e.ey0);
+    const S yl = -(e.qb * e.ex0 + e.qe) / e.qc, yr = -(e.qb * e.ex1 + e.qe) / e.qc;
+    if (yl >= lo - slack && yl <= hi + slack) x0 = e.ex0;
+    if (yr >= lo - slack && yr <= hi + slack) x1 = e.ex1;
+    // between the lines but with no crossing of either: the ellipse lies wholly inside the slab
+    if (x0 > x1) x0 = e.ex0, x1 = e.ex1;
+    x0 = max_(x0, e.ex0), x1 = min_(x1, e.ex1);
+  }
+  if (hi >= -e.blur && lo <= e.blur) {
+    const bool none = x0 > x1;
+    x0 = none ? -e.blur : min_(x0, -e.blur);
+    x1 = none ? e.blur : max_(x1, e.blur);
+  }
+}
+
+}  // namespace bt

@@ -1,0 +1,131 @@
+// Scalars, small vectors and the few functions that every formula needs, for host and device.
+// A "real" T is float, double, or a SIMD pack of them (cpu/simd.h) that overloads the same functions.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#if defined(__CUDACC__)
+#define BT_HD __host__ __device__ __forceinline__
+#else
+#define BT_HD inline __attribute__((always_inline))
+#endif
+
+namespace bt {
+
+BT_HD float exp_(float x) { return expf(x); }
+BT_HD double exp_(double x) { return exp(x); }
+BT_HD float log_(float x) { return logf(x); }
+BT_HD double log_(double x) { return log(x); }
+BT_HD float sqrt_(float x) { return sqrtf(x); }
+BT_HD double sqrt_(double x) { return sqrt(x); }
+BT_HD float sin_(float x) { return sinf(x); }
+BT_HD double sin_(double x) { return sin(x); }
+BT_HD float cos_(float x) { return cosf(x); }
+BT_HD double cos_(double x) { return cos(x); }
+BT_HD float floor_(float x) { return floorf(x); }
+BT_HD double floor_(double x) { return floor(x); }
+BT_HD bool finite_(float x) { return fabsf(x) <= 3.402823466e38f; }  // false for NaN as well
+BT_HD bool finite_(double x) { return fabs(x) <= 1.7976931348623157e308; }
+
+template <class T>
+BT_HD T select(bool condition, T yes, T no) {
+  return condition ? yes : no;
+}
+template <class T>
+BT_HD T max_(T a, T b) {
+  return select(a > b, a, b);
+}
+template <class T>
+BT_HD T min_(T a, T b) {
+  return select(a < b, a, b);
+}
+template <class T>
+BT_HD T clamp_(T x, T low, T high) {
+  return min_(max_(x, low), high);
+}
+
+// sigmoid without overflow for any finite x
+template <class S>
+BT_HD S sigmoid(S x) {
+  const S e = exp_(x < S(0) ? x : -x);
+  return (x < S(0) ? e : S(1)) / (S(1) + e);
+}
+
+template <class S>
+struct Vec3 {
+  S x, y, z;
+};
+template <class S>
+BT_HD Vec3<S> operator+(Vec3<S> a, Vec3<S> b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class S>
+BT_HD Vec3<S> operator-(Vec3<S> a, Vec3<S> b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class S>
+BT_HD Vec3<S> operator*(S k, Vec3<S> a) {
+  return {k * a.x, k * a.y, k * a.z};
+}
+template <class S>
+BT_HD S dot(Vec3<S> a, Vec3<S> b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class S>
+BT_HD Vec3<S> cross(Vec3<S> a, Vec3<S> b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class S>
+BT_HD Vec3<S> load3(const S* p) {
+  return {p[0], p[1], p[2]};
+}
+template <class S>
+BT_HD void store3(S* p, Vec3<S> a) {
+  p[0] = a.x, p[1] = a.y, p[2] = a.z;
+}
+
+// Unit vector of a; a vector shorter than the floor keeps its direction at reduced length, so that nothing divides by
+// 0.
+template <class S>
+struct Unit {
+  Vec3<S> n;
+  S inv;      // 1 / max(|a|, floor)
+  bool full;  // |a| above the floor
+};
+template <class S>
+BT_HD Unit<S> normalize(Vec3<S> a) {
+  const S floor_len = S(1e-12);
+  // scaled by the largest entry: |a|^2 neither overflows nor underflows
+  const S ax = a.x < S(0) ? -a.x : a.x, ay = a.y < S(0) ? -a.y : a.y, az = a.z < S(0) ? -a.z : a.z;
+  const S big = max_(ax, max_(ay, az));
+  if (!(big > floor_len)) return {(S(1) / floor_len) * a, S(1) / floor_len, false};
+  const Vec3<S> b = (S(1) / big) * a;
+  const S inv = S(1) / (sqrt_(dot(b, b)));
+  return {inv * b, inv / big, true};
+}
+// d loss / d a from d loss / d n
+template <class S>
+BT_HD Vec3<S> normalize_vjp(const Unit<S>& u, Vec3<S> dn) {
+  if (!u.full) return u.inv * dn;
+  return u.inv * (dn - dot(dn, u.n) * u.n);
+}
+
+// World to camera: x_cam = R x + t; pinhole in pixels.
+template <class S>
+struct Pinhole {
+  S R[9], t[3];  // row major
+  S fx, fy, cx, cy;
+};
+template <class S>
+BT_HD Vec3<S> rotate(const S* R, Vec3<S> a) {
+  return {R[0] * a.x + R[1] * a.y + R[2] * a.z, R[3] * a.x + R[4] * a.y + R[5] * a.z,
+          R[6] * a.x + R[7] * a.y + R[8] * a.z};
+}
+template <class S>
+BT_HD Vec3<S> rotate_transposed(const S* R, Vec3<S> a) {
+  return {R[0] * a.x + R[3] * a.y + R[6] * a.z, R[1] * a.x + R[4] * a.y + R[7] * a.z,
+          R[2] * a.x + R[5] * a.y + R[8] * a.z};
+}
+
+}  // namespace bt

@@ -1,0 +1,117 @@
+// The residual colour field rho(x): contraction of space, multiresolution hash encoding and a small MLP, eq. (color).
+#pragma once
+
+#include "core/common.h"
+
+namespace bt {
+
+constexpr int kFeatures = 4;  // a level
+constexpr int kWidth = 16;    // of both hidden layers
+constexpr int kMaxLevels = 4;
+
+// Grid coordinate in [0, 1]^3 of a world position. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
+// (mip-NeRF 360) and the ball of radius 2 fills the cube; without it the cube of half edge `half` does, clamped.
+template <class S>
+BT_HD Vec3<S> grid_coordinate(Vec3<S> x, Vec3<S> mid, S half, bool contract) {
+  const Vec3<S> p = (S(1) / half) * (x - mid);
+  if (!contract)
+    return {clamp_(S(0.5) * (p.x + S(1)), S(0), S(1)), clamp_(S(0.5) * (p.y + S(1)), S(0), S(1)),
+            clamp_(S(0.5) * (p.z + S(1)), S(0), S(1))};
+  const S r2 = dot(p, p);
+  S k = S(1);
+  if (r2 > S(1)) {
+    const S ir = S(1) / sqrt_(r2);
+    k = (S(2) - ir) * ir;
+  }
+  return {S(0.25) * (k * p.x + S(2)), S(0.25) * (k * p.y + S(2)), S(0.25) * (k * p.z + S(2))};
+}
+template <class S>
+BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S half, bool contract, Vec3<S> dc) {
+  const Vec3<S> p = (S(1) / half) * (x - mid);
+  if (!contract) {
+    const S k = S(0.5) / half;
+    return {p.x > S(-1) && p.x < S(1) ? k * dc.x : S(0), p.y > S(-1) && p.y < S(1) ? k * dc.y : S(0),
+            p.z > S(-1) && p.z < S(1) ? k * dc.z : S(0)};
+  }
+  const S r2 = dot(p, p), k = S(0.25) / half;
+  if (!(r2 > S(1))) return k * dc;
+  const S ir = S(1) / sqrt_(r2);
+  const Vec3<S> n = ir * p;
+  const S tangential = (S(2) - ir) * ir, radial = ir * ir;
+  const S along = dot(n, dc);
+  return k * (tangential * (dc - along * n) + (radial * along) * n);
+}
+
+// Eight corners of a level's cell: entries of the hash table and trilinear weights. Corner c has bit 0 for x, 1 for y,
+// 2 for z. XOR of coordinate times prime with the standard primes.
+template <class S>
+struct Corners {
+  uint32_t index[8];
+  S weight[8];
+  S fx, fy, fz;
+};
+template <class S>
+BT_HD Corners<S> corners(Vec3<S> c, S resolution, uint32_t mask) {
+  const S px = c.x * resolution, py = c.y * resolution, pz = c.z * resolution;
+  const S bx = floor_(px), by = floor_(py), bz = floor_(pz);
+  Corners<S> r;
+  r.fx = px - bx, r.fy = py - by, r.fz = pz - bz;
+  const uint32_t x0 = uint32_t(int32_t(bx)), y0 = uint32_t(int32_t(by)) * 2654435761u;
+  const uint32_t z0 = uint32_t(int32_t(bz)) * 805459861u;
+  const uint32_t x1 = x0 + 1u, y1 = y0 + 2654435761u, z1 = z0 + 805459861u;
+  const uint32_t yz[4] = {y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1};
+  const S gx = S(1) - r.fx, gy = S(1) - r.fy, gz = S(1) - r.fz;
+  const S wyz[4] = {gy * gz, r.fy * gz, gy * r.fz, r.fy * r.fz};
+  for (int i = 0; i < 4; ++i) {
+    r.index[2 * i] = (x0 ^ yz[i]) & mask, r.index[2 * i + 1] = (x1 ^ yz[i]) & mask;
+    r.weight[2 * i] = gx * wyz[i], r.weight[2 * i + 1] = r.fx * wyz[i];
+  }
+  return r;
+}
+
+// The MLP on rows of kWidth values. `Row` is a pack of kWidth reals; weights are stored input-major, w3 output-major
+// (three rows), and the transposes serve the backward pass.
+template <class S, class Row>
+struct Mlp {
+  Row w1[kMaxLevels * kFeatures], w2[kWidth], w3[3], w1t[kWidth], w2t[kWidth];
+  int inputs;
+};
+template <class S, class Row>
+struct MlpState {
+  Row h1, h2;
+};
+template <class S, class Row>
+BT_HD Row product(const Row* w, const S* in, int n) {
+  Row a = Row(S(0)), b = Row(S(0));  // two chains hide the latency of the multiply-add
+  for (int i = 0; i < n; i += 2) {
+    a += w[i] * Row(in[i]);
+    b += w[i + 1] * Row(in[i + 1]);
+  }
+  return a + b;
+}
+template <class S, class Row>
+BT_HD Vec3<S> mlp(const Mlp<S, Row>& m, const S* features, MlpState<S, Row>& state) {
+  S h[kWidth];
+  state.h1 = max_(product(m.w1, features, m.inputs), Row(S(0)));
+  store(h, state.h1);
+  state.h2 = max_(product(m.w2, h, kWidth), Row(S(0)));
+  return {sum(state.h2 * m.w3[0]), sum(state.h2 * m.w3[1]), sum(state.h2 * m.w3[2])};
+}
+// Adds the weights' gradients to g (w1, w2, w3 used) and returns those of the features.
+template <class S, class Row>
+BT_HD Row mlp_vjp(const Mlp<S, Row>& m, const S* features, const MlpState<S, Row>& state, Vec3<S> d, Mlp<S, Row>& g) {
+  S h[kWidth];
+  const Row zero = Row(S(0));
+  g.w3[0] += state.h2 * Row(d.x), g.w3[1] += state.h2 * Row(d.y), g.w3[2] += state.h2 * Row(d.z);
+  Row g2 = m.w3[0] * Row(d.x) + m.w3[1] * Row(d.y) + m.w3[2] * Row(d.z);
+  g2 = select(state.h2 > zero, g2, zero);
+  store(h, state.h1);
+  for (int i = 0; i < kWidth; ++i) g.w2[i] += g2 * Row(h[i]);
+  store(h, g2);
+  const Row g1 = select(state.h1 > zero, product(m.w2t, h, kWidth), zero);
+  for (int i = 0; i < m.inputs; ++i) g.w1[i] += g1 * Row(features[i]);
+  store(h, g1);
+  return product(m.w1t, h, kWidth);
+}
+
+}  // namespace bt

@@ -1,0 +1,82 @@
+// Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel) with a
+// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))).
+#pragma once
+
+#include "core/surfel.h"
+
+namespace bt {
+
+template <class T>
+struct Fragment {
+  T u, v;      // surfel coordinates in scale units; clamped to the support in the low-pass branch, 0 without a hit
+  T depth;     // camera z of the hit; of the centre in the low-pass branch
+  T sigma;     // effective opacity
+  T low_pass;  // 1 in the low-pass branch, else 0
+};
+
+// S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected centre.
+template <class S, class T>
+BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
+  const T zero = T(S(0)), one = T(S(1));
+  const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
+  const S q = g[kW0] * g[kZ];
+  const auto hit = (W > zero) & (T(q) > T(near) * W);
+  const T inv = one / select(hit, W, one);
+  const T u = select(hit, (T(g[kU1]) * dx + T(g[kU2]) * dy) * inv, zero);
+  const T v = select(hit, (T(g[kV1]) * dx + T(g[kV2]) * dy) * inv, zero);
+  const T rest = one - (u * u + v * v) * T(S(1.0 / (kSupport * kSupport)));
+  const auto inside = hit & (rest > zero);
+  const T kernel = select(inside, exp_(T(g[kBeta]) * log_(select(inside, rest, one))), zero);
+  const T blur = exp_(-(dx * dx + dy * dy));
+  const auto low = blur > kernel;
+  const T r = T(S(kSupport));
+  Fragment<T> f;
+  f.u = clamp_(u, -r, r), f.v = clamp_(v, -r, r);
+  f.depth = select(low, T(g[kZ]), T(q) * inv);
+  f.sigma = min_(T(S(kAlphaMax)), T(g[kOpacity]) * select(low, blur, kernel));
+  f.low_pass = select(low, one, zero);
+  return f;
+}
+
+// Gradients towards a row of geom, added to d[kGeom]; ddx, ddy is the gradient with respect to the pixel's offset.
+// `rim` bounds 1 - x from below in the kernel's derivative, which diverges at the rim for beta < 1.
+template <class S, class T>
+BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
+                        T& ddy) {
+  const T zero = T(S(0)), one = T(S(1)), two = T(S(2));
+  const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
+  const S q = g[kW0] * g[kZ];
+  const auto hit = (W > zero) & (T(q) > T(near) * W);
+  const auto low = low_pass > zero;
+  const T inv = one / select(hit, W, one);
+  const T u = select(hit, (T(g[kU1]) * dx + T(g[kU2]) * dy) * inv, zero);
+  const T v = select(hit, (T(g[kV1]) * dx + T(g[kV2]) * dy) * inv, zero);
+  const T rest = one - (u * u + v * v) * T(S(1.0 / (kSupport * kSupport)));
+  const T log_rest = log_(max_(rest, T(S(1e-30))));
+  const T kernel = select(low, exp_(-(dx * dx + dy * dy)), exp_(T(g[kBeta]) * log_rest));
+  const auto open = T(g[kOpacity]) * kernel < T(S(kAlphaMax));  // the clamp passes no gradient
+  const T gs = select(open, dsigma, zero);
+  d[kOpacity] += gs * kernel;
+  const T gk = gs * T(g[kOpacity]) * kernel;  // d sigma / d log kernel
+  const T gk3 = select(low, zero, gk);
+  d[kBeta] += gk3 * log_rest;
+  const T drho = -gk3 * T(g[kBeta]) / max_(rest, T(rim)) * T(S(1.0 / (kSupport * kSupport)));
+  const T r = T(S(kSupport));
+  // the clamp of the low-pass branch passes gradient only inside the support
+  const T gu = select(hit & (u * u < r * r), du + two * u * drho, zero);
+  const T gv = select(hit & (v * v < r * r), dv + two * v * drho, zero);
+  const T gz = select(low, zero, ddepth);
+  d[kZ] += select(low, ddepth, gz * inv * T(g[kW0]));
+  const T dU = gu * inv, dV = gv * inv;
+  const T dW = -(gu * u + gv * v + gz * T(q) * inv) * inv;
+  d[kU1] += dU * dx, d[kU2] += dU * dy;
+  d[kV1] += dV * dx, d[kV2] += dV * dy;
+  d[kW0] += dW + gz * inv * T(g[kZ]);
+  d[kW1] += dW * dx, d[kW2] += dW * dy;
+  const T blur_gradient = select(low, two * gk, zero);
+  ddx = dU * T(g[kU1]) + dV * T(g[kV1]) + dW * T(g[kW1]) - blur_gradient * dx;
+  ddy = dU * T(g[kU2]) + dV * T(g[kV2]) + dW * T(g[kW2]) - blur_gradient * dy;
+  d[kCx] -= ddx, d[kCy] -= ddy;
+}
+
+}  // namespace bt

@@ -1,0 +1,143 @@
+// A surfel seen by a camera: everything that its fragments need, and the vector-Jacobian product of that.
+//
+// With the camera-frame tangents a, b (unit), normal n = a x b, centre p and the ray r = (x, y, 1) of a pixel whose
+// offset from the projected centre is (dx, dy) pixels, the ray meets the disc's plane at depth n.p / n.r, and
+//   u = U / W,  v = V / W,  W = n.r = n.p/z + n.x dx/fx + n.y dy/fy,
+//   U = -((p x b).x dx/fx + (p x b).y dy/fy) / s_u,   V = ((p x a).x dx/fx + (p x a).y dy/fy) / s_v.
+// This is the 2DGS homography's solution divided by fx fy s_u s_v. No coefficient is a difference of large numbers: the
+// principal point has cancelled, and n comes from the rotation and not from a determinant; float32 suffices. All are
+// multiplied by the sign of n.p, so that W > 0 means "in front".
+#pragma once
+
+#include "core/common.h"
+
+namespace bt {
+
+constexpr double kSupport = 3.0;         // R: the kernel ends at 3 scale units
+constexpr double kAlphaMax = 0.99;       // sigma is clamped to this
+constexpr double kAlphaMin = 1.0 / 255;  // fragments below this are skipped
+constexpr double kTransmittanceMin = 1e-4;
+constexpr double kBetaMax = 4.0;
+
+// Columns of a row of `geom` [N, kGeom].
+enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kGeom = 16 };
+// Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
+constexpr int kFrame = 9;
+
+// Rotation matrix columns of a quaternion wxyz of any length.
+template <class S>
+struct Rotation {
+  Vec3<S> tu, tv, n;
+  S w, x, y, z;  // the unit quaternion
+  S inv;         // 1 / |q|
+  bool ok;
+};
+template <class S>
+BT_HD Rotation<S> rotation(const S* q) {
+  Rotation<S> r;
+  S big = S(0);
+  for (int i = 0; i < 4; ++i) big = max_(big, q[i] < S(0) ? -q[i] : q[i]);
+  r.ok = big > S(0) && finite_(big);
+  const S scale = r.ok ? S(1) / big : S(0);
+  const S a = q[0] * scale, b = q[1] * scale, c = q[2] * scale, d = q[3] * scale;
+  const S length = sqrt_(a * a + b * b + c * c + d * d);
+  const S k = r.ok ? S(1) / length : S(0);
+  r.inv = k * scale;
+  r.w = r.ok ? a * k : S(1), r.x = b * k, r.y = c * k, r.z = d * k;
+  const S w = r.w, x = r.x, y = r.y, z = r.z;
+  r.tu = {S(1) - S(2) * (y * y + z * z), S(2) * (x * y + w * z), S(2) * (x * z - w * y)};
+  r.tv = {S(2) * (x * y - w * z), S(1) - S(2) * (x * x + z * z), S(2) * (y * z + w * x)};
+  r.n = {S(2) * (x * z + w * y), S(2) * (y * z - w * x), S(1) - S(2) * (x * x + y * y)};
+  return r;
+}
+template <class S>
+BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec3<S> dv, Vec3<S> dn, S* dq) {
+  const S w = r.w, x = r.x, y = r.y, z = r.z, two = S(2);
+  const S gw = two * (z * du.y - y * du.z - z * dv.x + x * dv.z + y * dn.x - x * dn.y);
+  const S gx =
+      two * (y * du.y + z * du.z + y * dv.x - two * x * dv.y + w * dv.z + z * dn.x - w * dn.y - two * x * dn.z);
+  const S gy =
+      two * (-two * y * du.x + x * du.y - w * du.z + x * dv.x + z * dv.z + w * dn.x + z * dn.y - two * y * dn.z);
+  const S gz =
+      two * (-two * z * du.x + w * du.y + x * du.z - w * dv.x - two * z * dv.y + y * dv.z + x * dn.x + y * dn.y);
+  const S along = gw * w + gx * x + gy * y + gz * z;  // the length of q has no effect
+  dq[0] = (gw - along * w) * r.inv, dq[1] = (gx - along * x) * r.inv;
+  dq[2] = (gy - along * y) * r.inv, dq[3] = (gz - along * z) * r.inv;
+}
+
+// Fills a row of geom and frames; false (and untouched rows) when the surfel is not finite or its centre is nearer than
+// `near` (camera z).
+template <class S>
+BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
+                   S beta_raw, S near, S* geom, S* frame) {
+  const Rotation<S> rot = rotation(quat);
+  const Vec3<S> m = load3(mean);
+  const S su = exp_(log_scales[0]), sv = exp_(log_scales[1]);
+  const Vec3<S> p = rotate(cam.R, m) + load3(cam.t);
+  if (!rot.ok || !finite_(p.x) || !finite_(p.y) || !finite_(p.z) || !(p.z > near)) return false;
+  if (!finite_(su) || !finite_(sv) || !(su > S(0)) || !(sv > S(0))) return false;
+  if (!finite_(opacity_logit) || !finite_(beta_raw)) return false;
+  const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
+  const Vec3<S> pa = cross(p, a), pb = cross(p, b);
+  const S np = dot(n, p);
+  const S sign = np < S(0) ? S(-1) : S(1);
+  const S iz = S(1) / p.z, ifx = S(1) / cam.fx, ify = S(1) / cam.fy, isu = S(1) / su, isv = S(1) / sv;
+  S g[kGeom];
+  g[kCx] = cam.fx * p.x * iz + cam.cx;
+  g[kCy] = cam.fy * p.y * iz + cam.cy;
+  g[kU1] = -sign * pb.x * ifx * isu, g[kU2] = -sign * pb.y * ify * isu;
+  g[kV1] = sign * pa.x * ifx * isv, g[kV2] = sign * pa.y * ify * isv;
+  g[kW0] = sign * np * iz, g[kW1] = sign * n.x * ifx, g[kW2] = sign * n.y * ify;
+  g[kZ] = p.z;
+  g[kOpacity] = sigmoid(opacity_logit);
+  g[kBeta] = S(kBetaMax) * sigmoid(beta_raw);
+  g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
+  g[15] = S(0);
+  for (int i = 0; i < kGeom; ++i)
+    if (!finite_(g[i])) return false;
+  for (int i = 0; i < kGeom; ++i) geom[i] = g[i];
+  store3(frame, m);
+  store3(frame + 3, su * rot.tu);
+  store3(frame + 6, sv * rot.tv);
+  return true;
+}
+
+// Gradients of the parameters of one projected surfel; they are written, not added.
+template <class S>
+BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, const S* geom,
+                       const S* dgeom, const S* dframe, S* dmean, S* dquat, S* dlog_scales, S* dopacity_logit,
+                       S* dbeta_raw) {
+  const Rotation<S> rot = rotation(quat);
+  const S su = exp_(log_scales[0]), sv = exp_(log_scales[1]);
+  const Vec3<S> p = rotate(cam.R, load3(mean)) + load3(cam.t);
+  const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
+  const S np = dot(n, p);
+  const S sign = np < S(0) ? S(-1) : S(1);
+  const S iz = S(1) / p.z, ifx = S(1) / cam.fx, ify = S(1) / cam.fy, isu = S(1) / su, isv = S(1) / sv;
+
+  const Vec3<S> dpb = {-sign * ifx * isu * dgeom[kU1], -sign * ify * isu * dgeom[kU2], S(0)};
+  const Vec3<S> dpa = {sign * ifx * isv * dgeom[kV1], sign * ify * isv * dgeom[kV2], S(0)};
+  const S dnp = sign * iz * dgeom[kW0];
+  Vec3<S> dn = {sign * ifx * dgeom[kW1] - sign * dgeom[kNx], sign * ify * dgeom[kW2] - sign * dgeom[kNy],
+                -sign * dgeom[kNz]};
+  dn = dn + dnp * p;
+  // d(p x b): dp += b x d, db += d x p
+  Vec3<S> dp = cross(b, dpb) + cross(a, dpa) + dnp * n;
+  const Vec3<S> db = cross(dpb, p), da = cross(dpa, p);
+  dp.x += cam.fx * iz * dgeom[kCx];
+  dp.y += cam.fy * iz * dgeom[kCy];
+  dp.z += dgeom[kZ] - iz * (dgeom[kW0] * geom[kW0] + iz * (cam.fx * p.x * dgeom[kCx] + cam.fy * p.y * dgeom[kCy]));
+
+  store3(dmean, rotate_transposed(cam.R, dp) + load3(dframe));
+  const Vec3<S> dtu = load3(dframe + 3), dtv = load3(dframe + 6);
+  const Vec3<S> gu = rotate_transposed(cam.R, da) + su * dtu;
+  const Vec3<S> gv = rotate_transposed(cam.R, db) + sv * dtv;
+  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
+  // u1, u2 scale with 1/s_u and the frame with s_u
+  dlog_scales[0] = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu);
+  dlog_scales[1] = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv);
+  *dopacity_logit = dgeom[kOpacity] * geom[kOpacity] * (S(1) - geom[kOpacity]);
+  *dbeta_raw = dgeom[kBeta] * geom[kBeta] * (S(1) - geom[kBeta] / S(kBetaMax));
+}
+
+}  // namespace bt

@@ -1,0 +1,207 @@
+// The residual field at points, and the colours of fragments.
+#include "cpu/field.h"
+
+namespace bt {
+
+namespace {
+constexpr int64_t kBlock = 1 << 15;  // points whose table gradients are collected before they are added
+}
+
+template <class S>
+void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho) {
+  const auto m = load_mlp(field);
+  parallel_parts(n, 256, [&](int, int64_t begin, int64_t end) {
+    Encoder<S> enc;
+    MlpState<S, Pack<S>> state;
+    Vec3<S> at[kBatch];
+    for (int64_t i = begin; i < end; i += kBatch) {
+      const int count = int(std::min<int64_t>(kBatch, end - i));
+      for (int p = 0; p < count; ++p) at[p] = load3(x + 3 * (i + p));
+      enc.find(field, count, at);
+      enc.gather(field, count);
+      for (int p = 0; p < count; ++p) store3(rho + 3 * (i + p), mlp(m, enc.features[p], state));
+    }
+  });
+}
+
+template <class S>
+void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S* drho, const FieldGradients<S>& out,
+                    S* dx) {
+  const auto m = load_mlp(field);
+  std::vector<Mlp<S, Pack<S>>> sums(std::max(num_threads(), 1));
+  for (auto& g : sums) clear(g);
+  clear_gradients(field, out);
+  TableScatter<S> scatter;
+  for (int64_t block = 0; block < n; block += kBlock) {
+    const int64_t size = std::min(kBlock, n - block);
+    scatter.resize(size, field.levels);
+    parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
+      Encoder<S> enc;
+      MlpState<S, Pack<S>> state;
+      Vec3<S> at[kBatch];
+      S lanes[kWidth];
+      for (int64_t i = begin; i < end; i += kBatch) {
+        const int count = int(std::min<int64_t>(kBatch, end - i));
+        for (int p = 0; p < count; ++p) at[p] = load3(x + 3 * (block + i + p));
+        enc.find(field, count, at);
+        enc.gather(field, count);
+        for (int p = 0; p < count; ++p) {
+          mlp(m, enc.features[p], state);
+          const Pack<S> d = mlp_vjp(m, enc.features[p], state, load3(drho + 3 * (block + i + p)), sums[part]);
+          scatter.put(i + p, field.levels, enc.at[p], d);
+          if (dx) {
+            store(lanes, d);
+            store3(dx + 3 * (block + i + p), enc.position_gradient(field, p, at[p], lanes));
+          }
+        }
+      }
+    });
+    scatter.add(field, out.table);
+  }
+  add_mlp_gradient(sums, int(sums.size()), field.levels * kFeatures, out);
+}
+
+namespace {
+template <class S>
+Vec3<S> world_point(const S* frame, S u, S v) {
+  return load3(frame) + u * load3(frame + 3) + v * load3(frame + 6);
+}
+template <class S>
+S view_base(S b) {
+  return max_(b + S(0.5), S(0));
+}
+}  // namespace
+
+template <class S>
+void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const S* base, const S* frames,
+                   const FieldArrays<S>* field, S* colors) {
+  Mlp<S, Pack<S>> m;
+  if (field) m = load_mlp(*field);
+  parallel_parts(fragments, 1024, [&](int, int64_t begin, int64_t end) {
+    Encoder<S> enc;
+    MlpState<S, Pack<S>> state;
+    Vec3<S> at[kBatch];
+    int64_t who[kBatch];
+    int count = 0;
+    for (int64_t i = begin; i < end; ++i) {
+      const S* b = base + 3 * int64_t(f.surfel[i]);
+      for (int c = 0; c < 3; ++c) colors[3 * i + c] = view_base(b[c]);
+      if (field && f.weight[i] >= bound) {
+        at[count] = world_point(frames + int64_t(f.surfel[i]) * kFrame, f.uv[i], f.uv[fragments + i]);
+        who[count++] = i;
+      }
+      if (count == kBatch || (count && i + 1 == end)) {
+        enc.find(*field, count, at);
+        enc.gather(*field, count);
+        for (int p = 0; p < count; ++p) {
+          S* to = colors + 3 * who[p];
+          const Vec3<S> rho = mlp(m, enc.features[p], state);
+          to[0] = max_(to[0] + rho.x, S(0)), to[1] = max_(to[1] + rho.y, S(0));
+          to[2] = max_(to[2] + rho.z, S(0));
+        }
+        count = 0;
+      }
+    }
+  });
+}
+
+template <class S>
+void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const FragmentArrays<S>& f, S bound,
+                    const S* base, const S* frames, const FieldArrays<S>* field, const S* colors, const S* dcolors,
+                    S* dbase, const FieldGradients<S>* dfield, S* duv, S* dframes) {
+  const int64_t fragments = tile_start[tiles];
+  const bool geometry = duv != nullptr;
+  const int threads = std::max(1, std::min(num_threads(), 64));
+  const int columns = geometry ? 3 + kFrame : 3;
+  std::vector<std::vector<S>> partial(threads);
+  for (auto& p : partial) p.assign(n * columns, S(0));
+  Mlp<S, Pack<S>> m;
+  std::vector<Mlp<S, Pack<S>>> sums;
+  TableScatter<S> scatter;
+  const bool learn = field && dfield;
+  if (learn) {
+    m = load_mlp(*field);
+    sums.resize(threads);
+    for (auto& g : sums) clear(g);
+    clear_gradients(*field, *dfield);
+  }
+  if (geometry) std::fill(duv, duv + 2 * fragments, S(0));
+  // the residual passes gradient where the outer ReLU is open, the view colour where both are
+  for (int64_t block = 0; block < fragments; block += learn ? kBlock : fragments) {
+    const int64_t size = learn ? std::min(kBlock, fragments - block) : fragments;
+    if (learn) scatter.resize(size, field->levels);
+    std::vector<int64_t> filled(threads, 0), from(threads, 0);
+    parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
+      std::vector<S>& own = partial[part];
+      Encoder<S> enc;
+      MlpState<S, Pack<S>> state;
+      Vec3<S> at[kBatch], gradient[kBatch];
+      int64_t who[kBatch];
+      int count = 0;
+      int64_t slot = begin;
+      from[part] = begin;
+      S lanes[kWidth];
+      for (int64_t k = begin; k < end; ++k) {
+        const int64_t i = block + k, id = f.surfel[i];
+        const S* b = base + 3 * id;
+        S g[3];
+        for (int c = 0; c < 3; ++c) {
+          g[c] = colors[3 * i + c] > S(0) ? dcolors[3 * i + c] : S(0);
+          own[id * columns + c] += b[c] > S(-0.5) ? g[c] : S(0);
+        }
+        if (learn && f.weight[i] >= bound) {
+          at[count] = world_point(frames + id * kFrame, f.uv[i], f.uv[fragments + i]);
+          gradient[count] = load3(g);
+          who[count++] = i;
+        }
+        if (count == kBatch || (count && k + 1 == end)) {
+          enc.find(*field, count, at);
+          enc.gather(*field, count);
+          for (int p = 0; p < count; ++p) {
+            mlp(m, enc.features[p], state);
+            const Pack<S> d = mlp_vjp(m, enc.features[p], state, gradient[p], sums[part]);
+            scatter.put(slot++, field->levels, enc.at[p], d);
+            if (!geometry) continue;
+            store(lanes, d);
+            const Vec3<S> dx = enc.position_gradient(*field, p, at[p], lanes);
+            const int64_t j = who[p], s = f.surfel[j];
+            const S u = f.uv[j], v = f.uv[fragments + j];
+            duv[j] = dot(dx, load3(frames + s * kFrame + 3));
+            duv[fragments + j] = dot(dx, load3(frames + s * kFrame + 6));
+            S* to = own.data() + s * columns + 3;
+            store3(to, load3(to) + dx);
+            store3(to + 3, load3(to + 3) + u * dx);
+            store3(to + 6, load3(to + 6) + v * dx);
+          }
+          count = 0;
+        }
+      }
+      filled[part] = slot - begin;
+    });
+    if (learn) {
+      scatter.compact(threads, from.data(), filled.data(), field->levels);
+      scatter.add(*field, dfield->table);
+    }
+  }
+  if (learn) add_mlp_gradient(sums, threads, field->levels * kFeatures, *dfield);
+  parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      S total[3 + kFrame] = {};
+      for (const auto& p : partial)
+        for (int c = 0; c < columns; ++c) total[c] += p[i * columns + c];
+      std::copy_n(total, 3, dbase + 3 * i);
+      if (geometry) std::copy_n(total + 3, kFrame, dframes + i * kFrame);
+    }
+  });
+}
+
+#define BT_INSTANTIATE(S)                                                                                              \
+  template void field_forward<S>(int64_t, const FieldArrays<S>&, const S*, S*);                                        \
+  template void field_backward<S>(int64_t, const FieldArrays<S>&, const S*, const S*, const FieldGradients<S>&, S*);   \
+  template void shade_forward<S>(int64_t, const FragmentArrays<S>&, S, const S*, const S*, const FieldArrays<S>*, S*); \
+  template void shade_backward<S>(int64_t, const int64_t*, int64_t, const FragmentArrays<S>&, S, const S*, const S*,   \
+                                  const FieldArrays<S>*, const S*, const S*, S*, const FieldGradients<S>*, S*, S*);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt

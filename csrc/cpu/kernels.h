@@ -1,0 +1,157 @@
+// The CPU kernels: loops over core/ with threads and SIMD. Arrays are dense and row major; nothing here knows Python.
+// Every kernel gives the same result however the threads run; the order of summation depends on their number alone.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "core/surfel.h"
+
+namespace bt {
+
+constexpr int kTile = 16;  // pixels a side
+
+int num_threads();
+void set_num_threads(int n);
+
+template <class S>
+struct Surfels {
+  int64_t n;
+  const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+};
+template <class S>
+struct SurfelGradients {
+  S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+};
+
+// geom [n, kGeom], frames [n, kFrame], radii [n, 2] (half extents of the level-set box in pixels, 0 where not visible),
+// rows of surfels that are not visible are zero. Returns how many rows are not finite.
+template <class S>
+int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in, S* geom, S* frames,
+                        S* radii);
+template <class S>
+void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
+                      const SurfelGradients<S>& out);
+
+// Per tile, the visible surfels front to back.
+struct Bins {
+  int tiles_x = 0, tiles_y = 0;
+  std::vector<int64_t> start;    // [tiles + 1]
+  std::vector<int32_t> surfels;  // [start.back()]
+};
+template <class S>
+void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins);
+
+// The fragments of a view, ordered by tile, then front to back by surfel, then by pixel.
+template <class S>
+struct FragmentList {
+  int width = 0, height = 0;
+  std::vector<int64_t> tile_start;  // [tiles + 1], in fragments
+  int64_t total = 0;
+  // filled by trace, read out by copy: one arena a thread
+  struct Arena {
+    std::vector<int32_t> surfel, pixel;
+    std::vector<S> weight, u, v, depth, sigma;
+    int64_t used = 0;
+  };
+  std::vector<Arena> arenas;
+  struct Piece {
+    int arena;
+    int64_t from, count;
+  };
+  std::vector<Piece> pieces;  // [tiles]
+};
+template <class S>
+struct FragmentArrays {
+  int32_t *surfel, *pixel;
+  S *weight, *uv, *depth, *sigma;  // uv [2, F]; sigma is negative in the low-pass branch
+};
+template <class S>
+void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   FragmentList<S>& list);
+template <class S>
+void trace_copy(const FragmentList<S>& list, const FragmentArrays<S>& out);
+
+// dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero).
+template <class S>
+void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
+                    const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad);
+
+// Image [pixels, channels]: rgb, alpha, sum w beta, and with maps sum w depth and sum w normal. Written.
+constexpr int kImageChannels = 5, kMapChannels = 9;
+template <class S>
+void composite_forward(int64_t pixels, bool maps, const S* geom, const int64_t* tile_start, int64_t tiles,
+                       const FragmentArrays<S>& f, const S* colors, S* image);
+// dweight [F], dcolors [F, 3], ddepth [F] (maps only) and dgeom [n, kGeom] (beta and normal columns) are written.
+template <class S>
+void composite_backward(int64_t n, bool maps, const S* geom, const int64_t* tile_start, int64_t tiles,
+                        const FragmentArrays<S>& f, const S* colors, const S* dimage, S* dweight, S* dcolors, S* ddepth,
+                        S* dgeom);
+
+void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixel, const uint8_t* mask,
+                   int32_t* counts);
+
+// View colours; kind: 0 sv, 1 sh, 2 sb, 3 sg; `terms` = sites, coefficients (with dc) or lobes.
+// Parameters: sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
+// sb, sg a = base [n,3], b = lobes [n,K,6 or 7]. Rows where active is 0 give 0 and get gradient 0.
+template <class S>
+struct ViewColorArrays {
+  int kind, terms;
+  S *a, *b, *c;
+};
+template <class S>
+void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const S* center,
+                        const uint8_t* active, S* out);
+template <class S>
+void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const S* center,
+                         const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans);
+
+// Residual colour field.
+template <class S>
+struct FieldArrays {
+  int levels, log2_size, min_resolution;
+  bool contract;
+  S mid[3], half;
+  const S *table, *w1, *w2, *w3;  // [levels, 2^log2_size, 4], [4 levels, 16], [16, 16], [16, 3]
+};
+template <class S>
+struct FieldGradients {
+  S *table, *w1, *w2, *w3;
+};
+template <class S>
+void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho);
+// dx may be null. Gradients are written.
+template <class S>
+void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S* drho, const FieldGradients<S>& out,
+                    S* dx);
+
+// colors [F, 3] = relu(relu(base + 0.5) + rho(x)); fragments of weight below `bound` keep relu(base + 0.5). field null:
+// no residual.
+template <class S>
+void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const S* base, const S* frames,
+                   const FieldArrays<S>* field, S* colors);
+// Written: dbase [n, 3]; and when not null the field's gradients, duv [2, F] and dframes [n, kFrame] (both or neither).
+template <class S>
+void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const FragmentArrays<S>& f, S bound,
+                    const S* base, const S* frames, const FieldArrays<S>* field, const S* colors, const S* dcolors,
+                    S* dbase, const FieldGradients<S>* dfield, S* duv, S* dframes);
+
+// Mean SSIM over the valid 11x11 windows of two [height, width, channels] images; da is written when not null.
+template <class S>
+S ssim(int height, int width, int channels, const S* a, const S* b, S* da);
+
+// Forward-only renderer of a baked scene.
+struct Atlas {
+  int layers, height, width;
+  const uint8_t* bytes;  // RGBA [layers, height, width, 4], or null
+  const float* floats;   // RGBA likewise, or null
+  float offset, scale;
+  const int32_t* tiles;  // [n, 5]: x, y, layer, r_u, r_v; r_u = 0: no tile
+};
+// image [pixels, channels] as composite_forward; overdraw [pixels] int32 or null
+template <class S>
+void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, bool maps,
+                   const S* base, const Atlas& atlas, S* image, int32_t* overdraw);
+
+}  // namespace bt

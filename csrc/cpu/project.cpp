@@ -1,0 +1,159 @@
+// Projection of all surfels, tile lists, and the number of threads.
+#include <cmath>
+#include <numeric>
+
+#include "core/bounds.h"
+#include "cpu/kernels.h"
+#include "cpu/threads.h"
+
+namespace bt {
+
+namespace {
+int g_threads = 0;
+}
+
+int num_threads() {
+  if (g_threads > 0) return g_threads;
+#if defined(_OPENMP)
+  return omp_get_max_threads();
+#else
+  return 1;
+#endif
+}
+void set_num_threads(int n) { g_threads = n; }
+
+template <class S>
+int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in, S* geom, S* frames,
+                        S* radii) {
+  std::vector<int64_t> broken(num_threads(), 0);
+  parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      S *g = geom + i * kGeom, *f = frames + i * kFrame, *r = radii + 2 * i;
+      r[0] = r[1] = S(0);
+      bool seen = project(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
+                          in.beta_raw[i], near, g, f);
+      if (seen) {
+        const Extent e = extent(g);
+        seen =
+            e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
+        if (seen) {
+          const double most = 1e6;
+          r[0] = S(std::min(most, std::max(e.x1, -e.x0)));
+          r[1] = S(std::min(most, std::max(e.y1, -e.y0)));
+        }
+      } else {
+        bool finite = true;
+        for (int k = 0; k < 3; ++k) finite &= finite_(in.means[3 * i + k]);
+        for (int k = 0; k < 4; ++k) finite &= finite_(in.quats[4 * i + k]);
+        for (int k = 0; k < 2; ++k) finite &= finite_(in.log_scales[2 * i + k]);
+        broken[thread] += !(finite && finite_(in.opacity_logits[i]) && finite_(in.beta_raw[i]));
+      }
+      if (!seen) {
+        std::fill(g, g + kGeom, S(0));
+        std::fill(f, f + kFrame, S(0));
+      }
+    }
+  });
+  return std::accumulate(broken.begin(), broken.end(), int64_t(0));
+}
+
+template <class S>
+void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
+                      const SurfelGradients<S>& out) {
+  const S none[kFrame] = {};
+  parallel_parts(in.n, 1024, [&](int, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      const S* g = geom + i * kGeom;
+      if (g[kZ] == S(0)) {
+        std::fill(out.means + 3 * i, out.means + 3 * i + 3, S(0));
+        std::fill(out.quats + 4 * i, out.quats + 4 * i + 4, S(0));
+        std::fill(out.log_scales + 2 * i, out.log_scales + 2 * i + 2, S(0));
+        out.opacity_logits[i] = out.beta_raw[i] = S(0);
+        continue;
+      }
+      project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, g, dgeom + i * kGeom,
+                  dframes ? dframes + i * kFrame : none, out.means + 3 * i, out.quats + 4 * i, out.log_scales + 2 * i,
+                  out.opacity_logits + i, out.beta_raw + i);
+    }
+  });
+}
+
+namespace {
+// Calls fn(tile) for every tile that the surfel may touch.
+template <class S, class F>
+void for_tiles(const S* g, int width, int height, int tiles_x, int tiles_y, F&& fn) {
+  const Extent e = extent(g);
+  // pixel centres i + 0.5 with offset i + 0.5 - c
+  const double cx = double(g[kCx]) - 0.5, cy = double(g[kCy]) - 0.5;
+  const int top = std::max(0, int(std::max(0.0, std::floor(cy + e.y0))) / kTile);
+  const int bottom = std::min(tiles_y - 1, int(std::min(double(height), std::ceil(cy + e.y1))) / kTile);
+  for (int ty = top; ty <= bottom; ++ty) {
+    double x0, x1;
+    row_interval(e, ty * kTile - cy, ty * kTile + kTile - 1 - cy, x0, x1);
+    if (x0 > x1 || cx + x1 < 0 || cx + x0 > width - 1) continue;
+    const int left = int(std::max(0.0, std::floor(cx + x0))) / kTile;
+    const int right = std::min(tiles_x - 1, int(std::min(double(width), std::ceil(cx + x1))) / kTile);
+    for (int tx = left; tx <= right; ++tx) fn(ty * tiles_x + tx);
+  }
+}
+}  // namespace
+
+template <class S>
+void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
+  bins.tiles_x = (width + kTile - 1) / kTile, bins.tiles_y = (height + kTile - 1) / kTile;
+  const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
+  // front to back once for all tiles; equal depths keep their order
+  std::vector<std::pair<S, int32_t>> order;
+  order.reserve(n);
+  for (int64_t i = 0; i < n; ++i)
+    if (radii[2 * i] > S(0)) order.emplace_back(geom[i * kGeom + kZ], int32_t(i));
+  std::sort(order.begin(), order.end());
+  // each thread counts and later fills its own run of the order: the lists come out sorted
+  const int64_t visible = int64_t(order.size());
+  const int parts = std::max(1, int(std::min<int64_t>(num_threads(), visible / 512)));
+  std::vector<std::vector<int32_t>> touched(parts);
+  std::vector<std::vector<int64_t>> at(parts, std::vector<int64_t>(tiles, 0));
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+  for (int t = 0; t < parts; ++t) {
+    std::vector<int32_t>& list = touched[t];
+    list.reserve(8 * (visible / parts + 1));
+    for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
+      const size_t head = list.size();
+      list.push_back(0);
+      for_tiles(geom + int64_t(order[k].second) * kGeom, width, height, bins.tiles_x, bins.tiles_y, [&](int tile) {
+        list.push_back(tile);
+        ++at[t][tile];
+      });
+      list[head] = int32_t(list.size() - head - 1);
+    }
+  }
+  bins.start.assign(tiles + 1, 0);
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    int64_t next = bins.start[tile];
+    for (int t = 0; t < parts; ++t) {
+      const int64_t count = at[t][tile];
+      at[t][tile] = next;
+      next += count;
+    }
+    bins.start[tile + 1] = next;
+  }
+  bins.surfels.resize(bins.start[tiles]);
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+  for (int t = 0; t < parts; ++t) {
+    const int32_t* p = touched[t].data();
+    for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
+      const int32_t count = *p++;
+      for (int32_t j = 0; j < count; ++j) bins.surfels[at[t][*p++]++] = order[k].second;
+    }
+  }
+}
+
+#define BT_INSTANTIATE(S)                                                                               \
+  template int64_t project_forward<S>(const Pinhole<S>&, int, int, S, const Surfels<S>&, S*, S*, S*);   \
+  template void project_backward<S>(const Pinhole<S>&, const Surfels<S>&, const S*, const S*, const S*, \
+                                    const SurfelGradients<S>&);                                         \
+  template void bin<S>(int64_t, const S*, const S*, int, int, Bins&);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt

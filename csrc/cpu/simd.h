@@ -1,0 +1,209 @@
+// Packs of 16 lanes on the compiler's vector extensions, with the functions that core/ expects of a real.
+#pragma once
+
+#include <cstring>
+
+#include "core/common.h"
+
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+#include <immintrin.h>
+#endif
+
+namespace bt {
+
+constexpr int kLanes = 16;
+
+// Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
+template <class S>
+struct LaneTypes;
+template <>
+struct LaneTypes<float> {
+  typedef float V __attribute__((vector_size(64)));
+  typedef int32_t M __attribute__((vector_size(64)));  // lanes of 0 or -1
+  typedef float Q __attribute__((vector_size(16)));
+};
+template <>
+struct LaneTypes<double> {
+  typedef double V __attribute__((vector_size(128)));
+  typedef int64_t M __attribute__((vector_size(128)));
+  typedef double Q __attribute__((vector_size(32)));
+};
+template <class S>
+using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry, or rgba
+
+template <class S>
+struct Pack {
+  using V = typename LaneTypes<S>::V;
+  using M = typename LaneTypes<S>::M;
+  V v;
+  Pack() = default;
+  BT_HD Pack(V value) : v(value) {}
+  BT_HD explicit Pack(S value) : v(value - V{}) {}
+  BT_HD S operator[](int i) const { return v[i]; }
+};
+
+template <class S>
+BT_HD Pack<S> operator+(Pack<S> a, Pack<S> b) {
+  return a.v + b.v;
+}
+template <class S>
+BT_HD Pack<S> operator-(Pack<S> a, Pack<S> b) {
+  return a.v - b.v;
+}
+template <class S>
+BT_HD Pack<S> operator-(Pack<S> a) {
+  return -a.v;
+}
+template <class S>
+BT_HD Pack<S> operator*(Pack<S> a, Pack<S> b) {
+  return a.v * b.v;
+}
+template <class S>
+BT_HD Pack<S> operator/(Pack<S> a, Pack<S> b) {
+  return a.v / b.v;
+}
+template <class S>
+BT_HD Pack<S>& operator+=(Pack<S>& a, Pack<S> b) {
+  a.v += b.v;
+  return a;
+}
+template <class S>
+BT_HD Pack<S>& operator-=(Pack<S>& a, Pack<S> b) {
+  a.v -= b.v;
+  return a;
+}
+// Comparisons give lane masks, which combine with & | ~.
+template <class S>
+BT_HD typename Pack<S>::M operator>(Pack<S> a, Pack<S> b) {
+  return a.v > b.v;
+}
+template <class S>
+BT_HD typename Pack<S>::M operator<(Pack<S> a, Pack<S> b) {
+  return a.v < b.v;
+}
+template <class S>
+BT_HD typename Pack<S>::M operator>=(Pack<S> a, Pack<S> b) {
+  return a.v >= b.v;
+}
+template <class S>
+BT_HD Pack<S> select(typename Pack<S>::M m, Pack<S> yes, Pack<S> no) {
+  return m ? yes.v : no.v;
+}
+template <class S>
+BT_HD Pack<S> max_(Pack<S> a, Pack<S> b) {
+  return a.v > b.v ? a.v : b.v;
+}
+template <class S>
+BT_HD Pack<S> min_(Pack<S> a, Pack<S> b) {
+  return a.v < b.v ? a.v : b.v;
+}
+
+// exp and log of floats: Cody-Waite reduction and a polynomial, below 2 ulp over the normal range.
+BT_HD Pack<float> exp_(Pack<float> x) {
+  using V = Pack<float>::V;
+  using M = Pack<float>::M;
+  V a = min_(max_(x, Pack<float>(-87.0f)), Pack<float>(88.0f)).v;
+  const V magic = Pack<float>(12582912.0f).v;  // 1.5 * 2^23: adding it rounds to an integer
+  const V n = (a * 1.44269504f + magic) - magic;
+  const V f = (a - n * 0.693145752f) - n * 1.42860677e-6f;
+  V p = 1.98412698e-4f * f + 1.38888889e-3f;
+  p = p * f + 8.33333333e-3f;
+  p = p * f + 4.16666667e-2f;
+  p = p * f + 1.66666667e-1f;
+  p = p * f + 0.5f;
+  p = p * f + 1.0f;
+  p = p * f + 1.0f;
+  const M e = (__builtin_convertvector(n, M) + 127) << 23;
+  V two_n;
+  std::memcpy(&two_n, &e, sizeof e);
+  return x.v < -87.0f ? V{} : p * two_n;
+}
+BT_HD Pack<float> log_(Pack<float> x) {
+  using V = Pack<float>::V;
+  using M = Pack<float>::M;
+  M bits;
+  std::memcpy(&bits, &x.v, sizeof bits);
+  // mantissa in [sqrt(1/2), sqrt(2)), so that the logarithm keeps its relative accuracy near 1
+  const M shifted = bits - 0x3f3504f3;
+  const M e = shifted >> 23;
+  const M m_bits = (shifted & 0x007fffff) + 0x3f3504f3;
+  V m;
+  std::memcpy(&m, &m_bits, sizeof m);
+  const V f = m - 1.0f;
+  const V s = f / (2.0f + f), s2 = s * s;
+  // log(1+f) = 2 atanh(s)
+  V p = 0.222221985f * s2 + 0.285714287f;
+  p = p * s2 + 0.4f;
+  p = p * s2 + 0.666666667f;
+  const V r = s * s2 * p + 2.0f * s;
+  const V n = __builtin_convertvector(e, V);
+  return (r + n * 1.42860677e-6f) + n * 0.693145752f;
+}
+BT_HD Pack<double> exp_(Pack<double> x) {
+  Pack<double> r;
+  for (int i = 0; i < kLanes; ++i) r.v[i] = std::exp(x.v[i]);
+  return r;
+}
+BT_HD Pack<double> log_(Pack<double> x) {
+  Pack<double> r;
+  for (int i = 0; i < kLanes; ++i) r.v[i] = std::log(x.v[i]);
+  return r;
+}
+
+// One bit a lane.
+BT_HD uint32_t bits(Pack<float>::M m) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  return _mm512_movepi32_mask((__m512i)m);
+#else
+  uint32_t r = 0;
+  for (int i = 0; i < kLanes; ++i) r |= uint32_t(m[i] & 1) << i;
+  return r;
+#endif
+}
+BT_HD uint32_t bits(Pack<double>::M m) {
+  uint32_t r = 0;
+  for (int i = 0; i < kLanes; ++i) r |= uint32_t(m[i] & 1) << i;
+  return r;
+}
+
+// The lanes' own numbers, 0 to 15.
+BT_HD Pack<float> lane_numbers_of(float) {
+  return Pack<float>(Pack<float>::V{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15});
+}
+BT_HD Pack<double> lane_numbers_of(double) {
+  return Pack<double>(Pack<double>::V{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15});
+}
+
+// The lanes named by `keep`, next to each other; `to` has room for a whole pack.
+template <class S>
+BT_HD void compress(S* to, Pack<S> a, uint32_t keep) {
+  int n = 0;
+  for (uint32_t k = keep; k; k &= k - 1) to[n++] = a.v[__builtin_ctz(k)];
+}
+#if defined(__AVX512F__)
+template <>
+BT_HD void compress(float* to, Pack<float> a, uint32_t keep) {
+  _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(keep), (__m512)a.v));
+}
+#endif
+
+template <class S>
+BT_HD Pack<S> load(const S* p) {
+  Pack<S> r;
+  std::memcpy(&r.v, p, sizeof r.v);
+  return r;
+}
+template <class S>
+BT_HD void store(S* p, Pack<S> a) {
+  std::memcpy(p, &a.v, sizeof a.v);
+}
+template <class S>
+BT_HD S sum(Pack<S> a) {
+  S lanes[kLanes];
+  store(lanes, a);
+  for (int half = kLanes / 2; half > 0; half /= 2)
+    for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
+  return lanes[0];
+}
+
+}  // namespace bt

@@ -1,0 +1,118 @@
+// Structural similarity over the valid 11 x 11 Gaussian windows, with its gradient, separable.
+#include <cmath>
+
+#include "cpu/kernels.h"
+#include "cpu/threads.h"
+
+namespace bt {
+
+namespace {
+constexpr int kTaps = 11;
+
+template <class S>
+struct Window {
+  S k[kTaps];
+  Window() {
+    double total = 0, value[kTaps];
+    for (int i = 0; i < kTaps; ++i) total += value[i] = std::exp(-(i - 5) * (i - 5) / (2 * 1.5 * 1.5));
+    for (int i = 0; i < kTaps; ++i) k[i] = S(value[i] / total);
+  }
+};
+
+// The five moments of a pair of rows, filtered along the row.
+template <class S>
+void filter_row(const S* a, const S* b, int n, int stride, const S* k, S* const* out) {
+  for (int x = 0; x < n; ++x) {
+    S m[5] = {};
+    for (int t = 0; t < kTaps; ++t) {
+      const S p = a[x + t * stride], q = b[x + t * stride], kp = k[t] * p, kq = k[t] * q;
+      m[0] += kp, m[1] += kq, m[2] += kp * p, m[3] += kq * q, m[4] += kp * q;
+    }
+    for (int j = 0; j < 5; ++j) out[j][x] = m[j];
+  }
+}
+}  // namespace
+
+template <class S>
+S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
+  static const Window<S> window;
+  const S* k = window.k;
+  const int rows = height - kTaps + 1, line = width * channels;
+  const int n = (width - kTaps + 1) * channels;  // filtered length of a row
+  if (da) std::fill(da, da + int64_t(height) * line, S(0));
+  if (rows < 1 || n < 1) return S(1);
+  const int64_t plane = int64_t(height) * n;
+  std::vector<S> moments(5 * plane), gradient(da ? 3 * int64_t(rows) * n : 0);
+  parallel_parts(height, 16, [&](int, int64_t begin, int64_t end) {
+    for (int64_t y = begin; y < end; ++y) {
+      S* out[5];
+      for (int j = 0; j < 5; ++j) out[j] = moments.data() + j * plane + y * n;
+      filter_row(a + y * line, b + y * line, n, channels, k, out);
+    }
+  });
+  const S c1 = S(0.01 * 0.01), c2 = S(0.03 * 0.03), share = S(1) / (S(rows) * S(n));
+  std::vector<double> row_sum(rows);
+  parallel_parts(rows, 16, [&](int, int64_t begin, int64_t end) {
+    std::vector<S> m(5 * n), s(n);
+    for (int64_t y = begin; y < end; ++y) {
+      std::fill(m.begin(), m.end(), S(0));
+      for (int j = 0; j < 5; ++j)
+        for (int t = 0; t < kTaps; ++t) {
+          const S* from = moments.data() + j * plane + (y + t) * n;
+          S* to = m.data() + j * n;
+          for (int x = 0; x < n; ++x) to[x] += k[t] * from[x];
+        }
+      const S *ma = m.data(), *mb = ma + n, *aa = mb + n, *bb = aa + n, *ab = bb + n;
+      S* g = da ? gradient.data() + 3 * y * n : nullptr;
+      for (int x = 0; x < n; ++x) {
+        const S p = S(2) * ma[x] * mb[x] + c1, q = S(2) * (ab[x] - ma[x] * mb[x]) + c2;
+        const S r = ma[x] * ma[x] + mb[x] * mb[x] + c1;
+        const S t = (aa[x] - ma[x] * ma[x]) + (bb[x] - mb[x] * mb[x]) + c2;
+        const S i = S(1) / (r * t), value = p * q * i;
+        s[x] = value;
+        if (g) {
+          // value as a function of the moments of a: mean, mean square, mean product
+          g[x] = share * S(2) * (mb[x] * (q - p) * i - ma[x] * value * (S(1) / r - S(1) / t));
+          g[n + x] = -share * value / t;
+          g[2 * n + x] = share * S(2) * p * i;
+        }
+      }
+      double total = 0;
+      for (int x = 0; x < n; ++x) total += s[x];
+      row_sum[y] = total;
+    }
+  });
+  double total = 0;
+  for (double r : row_sum) total += r;
+  if (da) {
+    // transpose of the filter: first down the columns, then along the row
+    parallel_parts(height, 16, [&](int, int64_t begin, int64_t end) {
+      std::vector<S> down(3 * n), wide(3 * (n + 2 * (kTaps - 1) * channels));
+      const int pad = (kTaps - 1) * channels, padded = n + 2 * pad;
+      for (int64_t y = begin; y < end; ++y) {
+        std::fill(down.begin(), down.end(), S(0));
+        for (int t = 0; t < kTaps; ++t) {
+          if (y - t < 0 || y - t >= rows) continue;
+          const S* from = gradient.data() + 3 * (y - t) * n;
+          for (int x = 0; x < 3 * n; ++x) down[x] += k[t] * from[x];
+        }
+        for (int j = 0; j < 3; ++j) std::copy_n(down.data() + j * n, n, wide.data() + j * padded + pad);
+        const S *p = a + y * line, *q = b + y * line, *w0 = wide.data(), *w1 = w0 + padded, *w2 = w1 + padded;
+        for (int x = 0; x < line; ++x) {
+          S m0 = S(0), m1 = S(0), m2 = S(0);
+          for (int t = 0; t < kTaps; ++t) {
+            const int at = x + pad - t * channels;
+            m0 += k[t] * w0[at], m1 += k[t] * w1[at], m2 += k[t] * w2[at];
+          }
+          da[y * line + x] = m0 + S(2) * p[x] * m1 + q[x] * m2;
+        }
+      }
+    });
+  }
+  return S(total * double(share));
+}
+
+template float ssim<float>(int, int, int, const float*, const float*, float*);
+template double ssim<double>(int, int, int, const double*, const double*, double*);
+
+}  // namespace bt

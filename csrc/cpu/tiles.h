@@ -1,0 +1,83 @@
+// Walking a tile's surfels: a tile is 16 packs of 4 x 4 pixels.
+#pragma once
+
+#include "core/fragment.h"
+#include "cpu/kernels.h"
+#include "cpu/simd.h"
+
+namespace bt {
+
+constexpr int kPackSide = 4, kPacksAcross = kTile / kPackSide, kPacks = kPacksAcross * kPacksAcross;
+
+// A tile's transmittance while its surfels are drawn front to back.
+template <class S>
+struct TileState {
+  using P = Pack<S>;
+  using M = typename P::M;
+  P transmittance[kPacks];
+  M open[kPacks];  // pixels inside the image that still take light
+  int open_packs = 0;
+  S x0, y0;  // the tile's first pixel
+  P lane_x, lane_y;
+
+  TileState(int tile_x, int tile_y, int width, int height) {
+    x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
+    for (int i = 0; i < kLanes; ++i) {
+      lane_x.v[i] = S(i % kPackSide) + S(0.5);
+      lane_y.v[i] = S(i / kPackSide) + S(0.5);
+    }
+    for (int p = 0; p < kPacks; ++p) {
+      transmittance[p] = P(S(1));
+      const P px = P(x0 + S(p % kPacksAcross * kPackSide)) + lane_x;
+      const P py = P(y0 + S(p / kPacksAcross * kPackSide)) + lane_y;
+      open[p] = (px < P(S(width))) & (py < P(S(height)));
+      open_packs += bits(open[p]) != 0;
+    }
+  }
+
+  // Blends a surfel: fn(pack, lanes, fragment, weight) for every pack in which some pixel takes it.
+  template <class F>
+  void blend(const S* g, const S* radius, S near, F&& fn) {
+    const S cx = g[kCx] - x0, cy = g[kCy] - y0;
+    const int left = first(cx - radius[0]), right = last(cx + radius[0]);
+    const int top = first(cy - radius[1]), bottom = last(cy + radius[1]);
+    const S blur2 = S(5.6);  // > ln 255: beyond this the low pass cannot reach 1/255
+    for (int py = top; py <= bottom; ++py) {
+      for (int px = left; px <= right; ++px) {
+        const int pack = py * kPacksAcross + px;
+        if (!bits(open[pack])) continue;
+        const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
+        // a cheap look first: does any lane lie in the support or near the centre?
+        const P W = P(g[kW0]) + P(g[kW1]) * dx + P(g[kW2]) * dy;
+        const P U = P(g[kU1]) * dx + P(g[kU2]) * dy, V = P(g[kV1]) * dx + P(g[kV2]) * dy;
+        const P reach = P(S(kSupport * kSupport)) * W * W;
+        const M near_centre = dx * dx + dy * dy < P(blur2);
+        if (!bits(open[pack] & ((U * U + V * V < reach) | near_centre))) continue;
+        const Fragment<P> f = fragment<S, P>(g, near, dx, dy);
+        M take = open[pack] & (f.sigma >= P(S(kAlphaMin)));
+        if (!bits(take)) continue;
+        const P weight = f.sigma * transmittance[pack];
+        const P next = transmittance[pack] - weight;
+        // the surfel that would take a pixel below the bound is not blended and ends it
+        const M ends = take & (next < P(S(kTransmittanceMin)));
+        open[pack] = open[pack] & ~ends;
+        take = take & ~ends;
+        transmittance[pack] = select(take, next, transmittance[pack]);
+        const uint32_t lanes = bits(take);
+        if (lanes) fn(pack, lanes, f, weight);
+        if (!bits(open[pack])) --open_packs;
+      }
+    }
+  }
+
+ private:
+  static int first(S offset) {  // pack that holds the pixel at this offset, at least 0
+    return offset <= S(0) ? 0 : int(offset) / kPackSide;
+  }
+  static int last(S offset) {
+    if (offset < S(0)) return -1;
+    return offset >= S(kTile) ? kPacksAcross - 1 : int(offset) / kPackSide;
+  }
+};
+
+}  // namespace bt

@@ -1,0 +1,172 @@
+// Fragments of a view and their backward pass; per-surfel counts.
+#include "core/fragment.h"
+#include "cpu/kernels.h"
+#include "cpu/simd.h"
+#include "cpu/threads.h"
+#include "cpu/tiles.h"
+
+namespace bt {
+
+namespace {
+template <class S>
+void reserve(typename FragmentList<S>::Arena& a, int64_t more) {
+  const int64_t need = a.used + more;
+  if (int64_t(a.surfel.size()) >= need) return;
+  const int64_t size = need + need / 2 + 4096;
+  a.surfel.resize(size), a.pixel.resize(size);
+  a.weight.resize(size), a.u.resize(size), a.v.resize(size), a.depth.resize(size), a.sigma.resize(size);
+}
+}  // namespace
+
+template <class S>
+void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   FragmentList<S>& list) {
+  using P = Pack<S>;
+  const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
+  const int threads = num_threads();
+  list.width = width, list.height = height;
+  if (int(list.arenas.size()) < threads) list.arenas.resize(threads);
+  for (auto& a : list.arenas) a.used = 0;
+  list.pieces.assign(tiles, {});
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+#if defined(_OPENMP)
+    const int thread = omp_get_thread_num();
+#else
+    const int thread = 0;
+#endif
+    auto& a = list.arenas[thread];
+    const int64_t from = a.used;
+    const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
+    TileState<S> state(tx, ty, width, height);
+    for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
+      const int32_t id = bins.surfels[k];
+      reserve<S>(a, kTile * kTile + kLanes);
+      state.blend(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
+                  [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
+                    const int64_t at = a.used;
+                    const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width + tx * kTile +
+                                           pack % kPacksAcross * kPackSide;
+                    int n = 0;
+                    for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
+                      const int lane = __builtin_ctz(rest);
+                      a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
+                      a.surfel[at + n] = id;
+                    }
+                    compress(&a.weight[at], weight, lanes);
+                    compress(&a.u[at], f.u, lanes);
+                    compress(&a.v[at], f.v, lanes);
+                    compress(&a.depth[at], f.depth, lanes);
+                    compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
+                    a.used = at + n;
+                  });
+    }
+    list.pieces[tile] = {thread, from, a.used - from};
+  }
+  list.tile_start.assign(tiles + 1, 0);
+  for (int64_t t = 0; t < tiles; ++t) list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
+  list.total = list.tile_start[tiles];
+}
+
+template <class S>
+void trace_copy(const FragmentList<S>& list, const FragmentArrays<S>& out) {
+  const int64_t tiles = int64_t(list.pieces.size());
+#pragma omp parallel for num_threads(num_threads()) schedule(static)
+  for (int64_t t = 0; t < tiles; ++t) {
+    const auto& p = list.pieces[t];
+    const auto& a = list.arenas[p.arena];
+    const int64_t to = list.tile_start[t];
+    std::copy_n(a.surfel.data() + p.from, p.count, out.surfel + to);
+    std::copy_n(a.pixel.data() + p.from, p.count, out.pixel + to);
+    std::copy_n(a.weight.data() + p.from, p.count, out.weight + to);
+    std::copy_n(a.u.data() + p.from, p.count, out.uv + to);
+    std::copy_n(a.v.data() + p.from, p.count, out.uv + list.total + to);
+    std::copy_n(a.depth.data() + p.from, p.count, out.depth + to);
+    std::copy_n(a.sigma.data() + p.from, p.count, out.sigma + to);
+  }
+}
+
+template <class S>
+void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
+                    const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad) {
+  using P = Pack<S>;
+  const int64_t total = tile_start[tiles];
+  const int tiles_x = (width + kTile - 1) / kTile;
+  const int most =
+      int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max<int64_t>(n, 1) / kGeom)));
+  std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
+  std::fill(dgeom, dgeom + n * kGeom, S(0));
+  std::fill(absgrad, absgrad + 2 * n, S(0));
+  // a part's own sums: 14 numbers a surfel (12 columns of geom and the two absolute gradients)
+  constexpr int kColumns = kBeta + 1, kSums = kColumns + 2;
+  const int parts = parallel_tiles(tile_start, tiles, most, [&](int part, int64_t first_tile, int64_t last_tile) {
+    std::vector<S>& sums = partial[part];
+    sums.assign(n * kSums, S(0));
+    S behind[kTile * kTile];  // per pixel: sum of w dL/dw over the fragments behind
+    S dsigma[kTile * kTile + kLanes], du[kTile * kTile + kLanes], dv[kTile * kTile + kLanes];
+    S dz[kTile * kTile + kLanes], dx[kTile * kTile + kLanes], dy[kTile * kTile + kLanes];
+    S low[kTile * kTile + kLanes];
+    for (int64_t tile = first_tile; tile < last_tile; ++tile) {
+      const int x0 = int(tile % tiles_x) * kTile, y0 = int(tile / tiles_x) * kTile;
+      std::fill(behind, behind + kTile * kTile, S(0));
+      int64_t end = tile_start[tile + 1];
+      while (end > tile_start[tile]) {
+        const int32_t id = f.surfel[end - 1];
+        const S* g = geom + int64_t(id) * kGeom;
+        int64_t begin = end;
+        int m = 0;
+        while (begin > tile_start[tile] && f.surfel[begin - 1] == id) {
+          const int64_t i = --begin;
+          const int y = f.pixel[i] / width, x = f.pixel[i] - y * width;
+          const S sigma = f.sigma[i] < S(0) ? -f.sigma[i] : f.sigma[i];
+          S& rest = behind[(y - y0) * kTile + x - x0];
+          const S gw = dweight ? dweight[i] : S(0);
+          dsigma[m] = f.weight[i] / sigma * gw - rest / (S(1) - sigma);
+          rest += f.weight[i] * gw;
+          du[m] = duv ? duv[i] : S(0), dv[m] = duv ? duv[total + i] : S(0);
+          dz[m] = ddepth ? ddepth[i] : S(0);
+          low[m] = f.sigma[i] < S(0) ? S(1) : S(0);
+          dx[m] = S(x) + S(0.5) - g[kCx], dy[m] = S(y) + S(0.5) - g[kCy];
+          ++m;
+        }
+        end = begin;
+        for (int k = m; k % kLanes; ++k) dsigma[k] = du[k] = dv[k] = dz[k] = dx[k] = dy[k] = S(0), low[k] = S(1);
+        P d[kGeom], ax = P(S(0)), ay = P(S(0));
+        for (int k = 0; k < kColumns; ++k) d[k] = P(S(0));
+        for (int k = 0; k < m; k += kLanes) {
+          P ddx, ddy;
+          fragment_vjp<S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k), load(du + k),
+                             load(dv + k), load(dz + k), d, ddx, ddy);
+          ax += max_(ddx, -ddx), ay += max_(ddy, -ddy);
+        }
+        S* to = sums.data() + int64_t(id) * kSums;
+        for (int k = 0; k < kColumns; ++k) to[k] += sum(d[k]);
+        to[kColumns] += sum(ax), to[kColumns + 1] += sum(ay);
+      }
+    }
+  });
+  parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
+    for (int p = 0; p < parts; ++p) {
+      for (int64_t i = begin; i < end; ++i) {
+        const S* from = partial[p].data() + i * kSums;
+        for (int k = 0; k < kColumns; ++k) dgeom[i * kGeom + k] += from[k];
+        absgrad[2 * i] += from[kColumns], absgrad[2 * i + 1] += from[kColumns + 1];
+      }
+    }
+  });
+}
+
+void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixel, const uint8_t* mask,
+                   int32_t* counts) {
+  for (int64_t i = 0; i < fragments; ++i) counts[surfel[i]] += mask[pixel[i]] != 0;
+}
+
+#define BT_INSTANTIATE(S)                                                                                          \
+  template void trace_forward<S>(const S*, const S*, S, const Bins&, int, int, FragmentList<S>&);                  \
+  template void trace_copy<S>(const FragmentList<S>&, const FragmentArrays<S>&);                                   \
+  template void trace_backward<S>(int64_t, const S*, S, S, int, const int64_t*, int64_t, const FragmentArrays<S>&, \
+                                  const S*, const S*, const S*, S*, S*);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt

@@ -1,0 +1,92 @@
+"""Surfels seen by a camera, in float64 and without tricks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+BETA_MAX = 4.0
+NORM_FLOOR = 1e-12
+
+
+def unit(x: Tensor) -> Tensor:
+    """`x` [..., C] divided by its length, or by 1e-12 where that is longer: a vector of length 0 stays 0."""
+    return torch.nn.functional.normalize(x, dim=-1, eps=NORM_FLOOR)
+
+
+def rotation(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any length."""
+    w, x, y, z = unit(quats).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+@dataclass
+class Projection:
+    """Surfels seen by a camera; row i belongs to surfel i."""
+
+    M: Tensor  # [N, 3, 3], takes (u, v, 1) to (x z, y z, z): x, y in pixels, z the camera's depth
+    mean2d: Tensor  # [N, 2] projected centre, pixels; 0 where not valid
+    depth: Tensor  # [N] camera z of the centre
+    opacity: Tensor  # [N] in (0, 1)
+    beta: Tensor  # [N] in (0, 4)
+    normal: Tensor  # [N, 3] unit normal on the side of the camera, camera frame (OpenCV)
+    frame: Tensor  # [N, 3, 3] world frame, rows: mean, s_u t_u, s_v t_v
+    valid: Tensor  # [N] bool: the centre is deeper than `near`, and the quaternion is not 0
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    beta_raw: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    near: float = 0.2,
+) -> Projection:
+    """Homography, centre and kernel parameters of every surfel (2DGS: Huang et al. 2024, eq. 5 to 9).
+
+    A surfel's point is mean + u s_u t_u + v s_v t_v, with t_u, t_v the first two columns of its rotation. M's columns
+    are K times the camera-frame s_u t_u, s_v t_v and mean.
+
+    Args:
+        means: [N, 3] world.
+        quats: [N, 4] wxyz, any length; a surfel whose quaternion is 0 is not valid.
+        log_scales: [N, 2] natural logarithm of the world-space tangent scales.
+        opacity_logits: [N], opacity = sigmoid.
+        beta_raw: [N], beta = 4 sigmoid.
+        viewmat: [4, 4] world to camera, OpenCV axes.
+        K: [3, 3] intrinsics in pixels.
+        near: surfels whose centre has camera z <= near are not valid.
+    """
+    R = rotation(quats)  # [N, 3, 3]
+    tangents = R[:, :, :2] * log_scales.exp()[:, None, :]  # [N, 3, 2] world
+    view_R, view_t = viewmat[:3, :3], viewmat[:3, 3]
+    center = means @ view_R.T + view_t  # [N, 3] camera
+    H = torch.cat([view_R @ tangents, center[:, :, None]], dim=-1)  # [N, 3, 3]
+    M = K @ H
+
+    depth = center[:, 2]
+    valid = (depth > near) & (quats != 0).any(-1)
+    z = torch.where(valid, depth, torch.ones_like(depth))
+    mean2d = torch.where(valid[:, None], M[:, :2, 2] / z[:, None], torch.zeros_like(M[:, :2, 2]))
+
+    normal = R[:, :, 2] @ view_R.T  # [N, 3] camera
+    away = (normal * center).sum(-1, keepdim=True) >= 0
+    return Projection(
+        M=M,
+        mean2d=mean2d,
+        depth=depth,
+        opacity=torch.sigmoid(opacity_logits),
+        beta=BETA_MAX * torch.sigmoid(beta_raw),
+        normal=torch.where(away, -normal, normal),
+        frame=torch.stack([means, tangents[..., 0], tangents[..., 1]], dim=1),
+        valid=valid,
+    )

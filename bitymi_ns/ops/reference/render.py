@@ -1,0 +1,89 @@
+"""The whole image formation, in float64: brute-force visibility, colours, weighted sums."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops.reference.project import project, unit
+from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.ops.reference.trace import Trace, trace
+
+
+@dataclass
+class Render:
+    """Images of a render; all sums run over the blended fragments and are not divided by alpha."""
+
+    rgb: Tensor  # [H, W, 3] sum of w c, plus the background times the remaining transmittance
+    alpha: Tensor  # [H, W] sum of w
+    depth: Tensor  # [H, W] sum of w z, camera z
+    beta_map: Tensor  # [H, W] sum of w beta
+    normal: Tensor  # [H, W, 3] sum of w n; n faces the camera, in the camera frame (OpenCV: x right, y down, z forward)
+    overdraw: Tensor  # [H, W] int64, number of blended surfels
+    trace: Trace
+
+
+def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
+    """World-frame unit vectors [N, 3] from the camera centre to the surfels' centres (differentiable in `means`)."""
+    return unit(means + viewmat[:3, :3].T @ viewmat[:3, 3])
+
+
+def render(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    beta_raw: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None = None,
+    tiles: Sequence[Tensor] | None = None,
+    residual: Callable[[Tensor], Tensor] | None = None,
+    near: float = 0.2,
+) -> Render:
+    """Render surfels; colour of a fragment: ReLU(f_view + 0.5), then ReLU(that + texture) where there is a texture.
+
+    Args:
+        means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near: see `project`.
+        colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
+        background: [3], black if not given.
+        tiles: one texture tile [r_v, r_u, 3] a surfel.
+        residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
+    """
+    p = project(means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near)
+    t = trace(p, width, height, near)
+    base = torch.relu(colors + 0.5)  # [N, 3]
+    color = base.expand(width * height, -1, -1)  # [P, N, 3]
+    if tiles is not None:
+        pixel, surfel = t.blended.nonzero(as_tuple=True)
+        texture = torch.zeros_like(color)
+        for i, tile in enumerate(tiles):
+            pick = surfel == i
+            texture = texture.index_put((pixel[pick], surfel[pick]), texel(tile, t.uv[pixel[pick], i]))
+        color = torch.relu(color + texture)
+    if residual is not None:
+        pixel, surfel = t.blended.nonzero(as_tuple=True)
+        u, v = t.uv[pixel, surfel, :, None].unbind(1)  # [F, 1]
+        mean, axis_u, axis_v = p.frame[surfel].unbind(1)  # [F, 3]
+        texture = torch.zeros_like(color).index_put((pixel, surfel), residual(mean + u * axis_u + v * axis_v))
+        color = torch.relu(color + texture)
+
+    shape = (height, width)
+    rgb = (t.weight[..., None] * color).sum(1)
+    if background is not None:
+        rgb = rgb + t.transmittance[:, None] * background
+    return Render(
+        rgb=rgb.reshape(*shape, 3),
+        alpha=t.weight.sum(1).reshape(shape),
+        depth=torch.where(t.blended, t.weight * t.depth, 0.0).sum(1).reshape(shape),
+        beta_map=(t.weight @ p.beta).reshape(shape),
+        normal=(t.weight @ p.normal).reshape(*shape, 3),
+        overdraw=t.blended.sum(1).reshape(shape),
+        trace=t,
+    )

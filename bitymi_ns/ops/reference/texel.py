@@ -1,0 +1,35 @@
+"""Bilinear fetch from a surfel's texture tile, in float64."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops.reference.trace import SUPPORT
+
+
+def texel_centers(resolution: int) -> Tensor:
+    """Surfel coordinates [resolution] float64 of the texel centres along one axis: (i + 0.5) / r * 6 - 3."""
+    return (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution * (2 * SUPPORT) - SUPPORT
+
+
+def texel(tile: Tensor, uv: Tensor) -> Tensor:
+    """Colour of a tile at surfel coordinates: bilinear between texel centres, constant beyond the outer ones.
+
+    Args:
+        tile: [r_v, r_u, C]; the tile covers the support square [-3, 3]^2.
+        uv: [M, 2] in scale units.
+
+    Returns:
+        [M, C].
+    """
+    rows, columns = tile.shape[:2]
+    size = torch.tensor([columns, rows], dtype=uv.dtype)
+    position = (uv.clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # [M, 2] texels
+    position = torch.minimum(position.clamp(min=0), size - 1)
+    low = position.detach().floor().long()
+    high = torch.minimum(low + 1, size.long() - 1)
+    fu, fv = (position - low)[:, :, None].unbind(1)  # [M, 1]
+    top = tile[low[:, 1], low[:, 0]] * (1 - fu) + tile[low[:, 1], high[:, 0]] * fu
+    bottom = tile[high[:, 1], low[:, 0]] * (1 - fu) + tile[high[:, 1], high[:, 0]] * fu
+    return top * (1 - fv) + bottom * fv

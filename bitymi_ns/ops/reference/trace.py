@@ -1,0 +1,87 @@
+"""Which surfels cover which pixels, with what weight: every pixel against every surfel, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops.reference.project import Projection
+
+SUPPORT = 3.0  # R: the kernel ends at 3 scale units
+ALPHA_MAX = 0.99
+ALPHA_MIN = 1.0 / 255.0
+TRANSMITTANCE_MIN = 1e-4
+
+
+@dataclass
+class Trace:
+    """Dense blending weights: P pixels (row major, y * width + x) against N surfels in their own order."""
+
+    weight: Tensor  # [P, N] w = sigma T, 0 where not blended
+    uv: Tensor  # [P, N, 2] scale units; clamped to the support in the low-pass branch, 0 without a hit
+    depth: Tensor  # [P, N] camera z of the hit; of the surfel's centre in the low-pass branch
+    low_pass: Tensor  # [P, N] bool: the screen-space term of the kernel is the larger one
+    blended: Tensor  # [P, N] bool
+    order: Tensor  # [N] surfels front to back
+    transmittance: Tensor  # [P] what is left for the background
+
+
+def pixel_centers(width: int, height: int) -> Tensor:
+    """Sample positions [H W, 2] float64 in pixels, (i + 0.5, j + 0.5), row major."""
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
+    )
+    return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
+
+
+def trace(projection: Projection, width: int, height: int, near: float = 0.2) -> Trace:
+    """Intersections, effective opacities and front-to-back weights of all surfels in all pixels.
+
+    With k = x M2 - M0, l = y M2 - M1 and c = k x l, the ray of pixel (x, y) meets the surfel at (u, v) = (c.x, c.y) /
+    c.z, at camera depth M2 . (u, v, 1). Then sigma = min(0.99, o G) with the kernel
+    G = max((1 - (u^2 + v^2) / 9)+^beta, exp(-d^2)), d the distance in pixels to the projected centre. A ray parallel to
+    the surfel, or meeting it at a depth <= near, has no hit: the first term is 0 there and u = v = 0.
+    A fragment is skipped when sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
+    centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
+    ends the pixel.
+    """
+    pixels = pixel_centers(width, height)  # [P, 2]
+    M = projection.M
+    k = pixels[:, None, 0:1] * M[None, :, 2] - M[None, :, 0]  # [P, N, 3]
+    l = pixels[:, None, 1:2] * M[None, :, 2] - M[None, :, 1]
+    c = torch.linalg.cross(k, l)
+    crosses = c[..., 2] != 0
+    uv = c[..., :2] / torch.where(crosses, c[..., 2], 1.0)[..., None]  # [P, N, 2]
+    depth = (uv * M[None, :, 2, :2]).sum(-1) + M[None, :, 2, 2]  # [P, N]
+    hit = crosses & (depth > near)
+    uv = torch.where(hit[..., None], uv, 0.0)
+
+    rest = 1 - (uv**2).sum(-1) / SUPPORT**2
+    inside = hit & (rest > 0)
+    kernel = torch.where(inside, torch.where(inside, rest, 1.0) ** projection.beta, 0.0)
+    blur = torch.exp(-((pixels[:, None] - projection.mean2d[None]) ** 2).sum(-1))
+    low_pass = blur > kernel
+    sigma = (projection.opacity * torch.where(low_pass, blur, kernel)).clamp(max=ALPHA_MAX)
+
+    covered = projection.valid & (sigma >= ALPHA_MIN)
+    order = torch.argsort(projection.depth, stable=True)
+    sigma_sorted = torch.where(covered, sigma, 0.0)[:, order]
+    after = torch.cumprod(1 - sigma_sorted, dim=1)  # [P, N] transmittance behind each surfel, were all blended
+    blended_sorted = covered[:, order] & (after >= TRANSMITTANCE_MIN)
+    sigma_sorted = torch.where(blended_sorted, sigma_sorted, 0.0)
+    first = torch.ones(len(pixels), 1, dtype=pixels.dtype)
+    transmittance = torch.cumprod(torch.cat([first, 1 - sigma_sorted], dim=1), dim=1)  # [P, N + 1]
+    weight_sorted = sigma_sorted * transmittance[:, :-1]
+
+    back = torch.argsort(order)
+    return Trace(
+        weight=weight_sorted[:, back],
+        uv=torch.where(low_pass[..., None], uv.clamp(-SUPPORT, SUPPORT), uv),
+        depth=torch.where(low_pass, projection.depth, depth),
+        low_pass=low_pass,
+        blended=blended_sorted[:, back],
+        order=order,
+        transmittance=transmittance[:, -1],
+    )

@@ -60,7 +60,7 @@ $(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(CXX_FILES)
 	@touch $@
 
 demo: setup
-	PATH="$(CURDIR)/$(BIN):$$PATH" bash scripts/demo.sh $(DATA)
+	PATH="$(CURDIR)/$(BIN):$$PATH" bash scripts/demo.sh $(if $(DATA),"$(DATA)")
 
 test: setup
 	$(BIN)/python -m pytest -q

@@ -1,0 +1,70 @@
+#!/usr/bin/env bash
+# Train, bake, evaluate and report: the sample room, or your own capture.
+#
+#   scripts/demo.sh [FOLDER]     FOLDER: a nerfstudio capture (transforms.json and images)
+#
+# The commands are on PATH after `make setup` when called by `make demo`, or in an environment with this package
+# installed. Each step is skipped when its result is there; remove the result to do it again.
+# METHOD (default bitymi) and STEPS (default: the method's own) choose what is trained.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+method=${METHOD:-bitymi}
+if [ $# -ge 1 ]; then
+  data=$(realpath -- "$1" 2>/dev/null) && [ -f "$data/transforms.json" ] || {
+    echo "demo: $1 is no nerfstudio capture (a folder with transforms.json and images);" \
+      "ns-process-data makes one from photographs or a video" >&2
+    exit 1
+  }
+  out=demo/$(basename -- "$data")
+else
+  out=demo
+  data=$PWD/demo/data
+fi
+run=$out/outputs/demo/$method/run
+steps=()
+[ -z "${STEPS:-}" ] || steps=(--max-num-iterations "$STEPS")
+
+say() { printf '\n== %s (%d s so far)\n' "$*" "$SECONDS"; }
+
+if [ ! -f "$data/transforms.json" ]; then
+  say "Rendering the sample room into $data"
+  bitymi sample --output-dir "$data"
+fi
+
+if [ ! -f "$run/finished" ]; then
+  say "Training $method on $data"
+  rm -rf "$run" "$out/bundle" "$out/renders" "$out/report" "$out"/eval-*.json
+  ns-train "$method" --data "$data" --output-dir "$out/outputs" --experiment-name demo --timestamp run \
+    --vis tensorboard "${steps[@]}"
+  touch "$run/finished"
+fi
+
+if [ ! -f "$out/bundle/bundle.json" ]; then
+  say "Baking into $out/bundle"
+  ns-export bitymi-atlas --load-config "$run/config.yml" --output-dir "$out/bundle"
+  rm -rf "$out/eval-baked.json" "$out/renders"
+fi
+
+if [ ! -f "$out/eval-neural.json" ]; then
+  say "Evaluating the trained model"
+  ns-eval --load-config "$run/config.yml" --output-path "$out/eval-neural.json"
+fi
+
+if [ ! -f "$out/eval-baked.json" ]; then
+  say "Evaluating the bundle"
+  ns-eval --load-config "$out/bundle/config.yml" --output-path "$out/eval-baked.json" \
+    --render-output-path "$out/renders"
+fi
+
+say "Writing the report"
+bitymi report "$out/eval-neural.json" "$out/eval-baked.json" "$run" "$out/renders" --output-dir "$out/report"
+
+cat <<END
+
+Done in $SECONDS s.
+  report    $out/report/index.html
+  bundle    $out/bundle             (ns-viewer --load-config $out/bundle/config.yml)
+  renders   $out/renders            held-out views, rendered from the bundle
+  model     $run
+END

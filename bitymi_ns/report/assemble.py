@@ -1,0 +1,110 @@
+"""Put a report together and write it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from bitymi_ns import __version__
+from bitymi_ns.report.collect import collect
+from bitymi_ns.report.gallery import make_gallery
+from bitymi_ns.report.page import GENERATOR, Content, to_page, to_report_md
+from bitymi_ns.report.plots import PLOT_NAMES, draw_plots
+from bitymi_ns.report.records import Records, ReportError
+from bitymi_ns.report.tables import everything_table, quality_tables, summary, training_table
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def compose(records: Records, title: str) -> Content:
+    """Everything that a report says about these records."""
+    gallery, notes = make_gallery(records.images)
+    counts = [
+        _counted(number, noun)
+        for number, noun in (
+            (len(records.evaluations), "evaluation"),
+            (len(records.curves), "training run"),
+            (len({row.scene for row in records.evaluations}), "scene"),
+        )
+        if number
+    ]
+    panels = len({e.scene for e in records.evaluations} | {c.scene for c in records.curves}) > 1
+    return Content(
+        title=title,
+        intro=f"{', '.join(counts)}. Made by bitymi {__version__}.",
+        summary=summary(records),
+        quality=quality_tables(records),
+        training=training_table(records.curves),
+        everything=everything_table(records.evaluations),
+        plots=draw_plots(records),
+        panels=panels,
+        gallery=gallery,
+        notes=[*records.notes, *notes],
+    )
+
+
+def _check_output(output_dir: Path) -> None:
+    """Refuse a destination that is a file, or whose index.html somebody else made."""
+    if output_dir.exists() and not output_dir.is_dir():
+        raise ReportError(f"{output_dir} is a file; give a folder for the report.")
+    page = output_dir / "index.html"
+    if page.exists() and GENERATOR not in page.read_bytes()[:4096].decode("utf8", "replace"):
+        raise ReportError(f"{page} was not made by bitymi report and will not be replaced; give another folder.")
+
+
+def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
+    """Write all files into a folder beside `output_dir` first, then rename them into place, index.html last.
+
+    A write that fails leaves an older report as it was. Plots that an older report had and this one has not are
+    removed; other files in the folder stay.
+    """
+    aside: Path | None = None
+    try:
+        output_dir.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{output_dir.name}-", dir=output_dir.parent))
+        for name, data in files.items():
+            (aside / name).write_bytes(data)
+        output_dir.mkdir(exist_ok=True)
+        for name in sorted(files, key=lambda name: name == "index.html"):
+            os.replace(aside / name, output_dir / name)
+        for name in PLOT_NAMES:
+            if f"{name}.png" not in files:
+                (output_dir / f"{name}.png").unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ReportError(
+            f"the report cannot be written to {output_dir}: {reason}. Make room or give another folder."
+        ) from error
+    finally:
+        if aside is not None:
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
+    """Make a report: index.html (one self-contained page), report.md and the plots as PNG.
+
+    Args:
+        inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
+            `fragments`, `psnr`), PNG images, and folders that are searched for all of these.
+        output_dir: folder of the report; made if needed. A report of an earlier call is replaced.
+        title: heading of the page.
+
+    Returns:
+        The path of index.html.
+
+    Raises:
+        ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.
+    """
+    output_dir = Path(output_dir).expanduser().absolute()
+    _check_output(output_dir)
+    content = compose(collect(list(inputs), output_dir), title)
+    files = {f"{plot.name}.png": plot.light for plot in content.plots}
+    files["report.md"] = to_report_md(content).encode("utf8")
+    files["index.html"] = to_page(content).encode("utf8")
+    write_aside(files, output_dir)
+    return output_dir / "index.html"

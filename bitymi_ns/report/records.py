@@ -1,0 +1,247 @@
+"""What a report is made of: evaluations written by ns-eval and training curves, read from files."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+MAX_JSON_BYTES = 4 << 20
+"""An ns-eval file has about a kilobyte; a larger JSON file is something else."""
+MAX_JSONL_BYTES = 64 << 20
+"""Largest training curve that is read."""
+
+_BUNDLE = re.compile(r"(?<![a-z])(bundle|baked)(?![a-z])")
+_BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
+_FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7)(?![a-z0-9])")
+
+
+class ReportError(Exception):
+    """A report cannot be made; the message says which input is at fault and what to do."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One evaluation of a model on the held-out views.
+
+    Attributes:
+        scene: the experiment's name; evaluations are compared within one scene.
+        method: method name without any mark of baking, so that a bundle shares it with its neural parent.
+        baked: whether the images came from a baked bundle.
+        label: the name shown in tables, unique within its scene and stage after `disambiguate`.
+        results: finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...).
+        checkpoint: path of the checkpoint as recorded, possibly empty.
+        source: the file that it was read from.
+    """
+
+    scene: str
+    method: str
+    baked: bool
+    label: str
+    results: dict[str, float]
+    checkpoint: str
+    source: Path
+
+    def get(self, key: str) -> float | None:
+        """The result of that name, or None when it is missing or was not finite."""
+        return self.results.get(key)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One training run as it went: a list of points, each a dict of finite numbers with at least `step`."""
+
+    scene: str
+    label: str
+    points: list[dict[str, float]]
+    source: Path
+
+    def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
+        """The points that have both numbers, in order of steps."""
+        pairs = [(p[x], p[y]) for p in self.points if x in p and y in p]
+        return [a for a, _ in pairs], [b for _, b in pairs]
+
+    def last(self, key: str) -> float | None:
+        """The last recorded value of `key`."""
+        return next((p[key] for p in reversed(self.points) if key in p), None)
+
+    def best(self, key: str) -> float | None:
+        """The largest recorded value of `key`."""
+        return max((p[key] for p in self.points if key in p), default=None)
+
+
+@dataclass
+class Records:
+    """Everything that was read, with notes on what was skipped and why."""
+
+    evaluations: list[Evaluation] = field(default_factory=list)
+    curves: list[Curve] = field(default_factory=list)
+    images: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def finite_numbers(values: dict[str, Any]) -> dict[str, float]:
+    """The entries of a JSON object that are finite numbers; NaN, infinities, text and nested values are left out."""
+    numbers = {}
+    for key, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        try:
+            number = float(value)
+        except OverflowError:  # an integer beyond the range of a double
+            continue
+        if math.isfinite(number):
+            numbers[key] = number
+    return numbers
+
+
+def parse_json(text: str, where: str) -> Any:
+    """Parse JSON (NaN and Infinity tokens allowed).
+
+    Raises:
+        ReportError: with the file, line, column and reason.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        reason = "it is empty" if not text.strip() else f"{error.msg} at line {error.lineno}, column {error.colno}"
+    except RecursionError:
+        reason = "it is nested too deeply"
+    except ValueError as error:  # an integer with thousands of digits
+        reason = str(error)
+    raise ReportError(f"{where} is not valid JSON: {reason}. Write it again, or leave it out.") from None
+
+
+def read_text(path: Path, limit: int) -> str:
+    """The text of a file of at most `limit` bytes; what goes wrong becomes a ReportError naming the file."""
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            raise ReportError(f"{path} is too large ({size:,} bytes) for an evaluation or a training curve.")
+        return path.read_text("utf8")
+    except UnicodeDecodeError:
+        raise ReportError(f"{path} is not a text file (it is not UTF-8).") from None
+    except OSError as error:
+        raise ReportError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def is_evaluation(data: Any) -> bool:
+    """Whether a JSON value has ns-eval's shape."""
+    return isinstance(data, dict) and isinstance(data.get("results"), dict)
+
+
+def is_point(data: Any) -> bool:
+    """Whether a JSON value is a line of a training curve."""
+    return isinstance(data, dict) and "step" in finite_numbers(data)
+
+
+def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
+    """Build an evaluation from ns-eval's JSON object."""
+    results = finite_numbers(data["results"])
+    checkpoint = str(data.get("checkpoint") or "")
+    name = str(data.get("method_name") or "unnamed method")
+    # Of the checkpoint only .../<folder>/<folder>/nerfstudio_models/step-*.ckpt counts: not the name of some data set.
+    tail = "/".join(Path(checkpoint.replace("\\", "/")).parts[-4:]).lower()
+    baked = results.get("atlas_bytes", 0.0) > 0 or bool(_BUNDLE.search(name.lower()) or _BUNDLE.search(tail))
+    method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
+    atlas_format = _FORMAT.search(tail) or _FORMAT.search(f"{source.parent.name}/{source.stem}".lower())
+    return Evaluation(
+        scene=str(data.get("experiment_name") or source.parent.name or "unnamed scene"),
+        method=method,
+        baked=baked,
+        label=f"{method}, {atlas_format[1]}" if baked and atlas_format else method,
+        results=results,
+        checkpoint=checkpoint,
+        source=source,
+    )
+
+
+def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
+    """Build a curve from the objects of a JSONL file.
+
+    A step that occurs twice (a resumed run) keeps its last line. Scene and label come from the lines themselves
+    (`experiment_name`, `method_name`) or from nerfstudio's folders <experiment>/<method>/<time>, else from the file.
+    """
+    points: dict[float, dict[str, float]] = {}
+    for line in lines:
+        numbers = finite_numbers(line)
+        points[numbers["step"]] = numbers
+    named = {key: value for line in lines for key, value in line.items() if isinstance(value, str) and value}
+    scene, label = named.get("experiment_name", ""), named.get("method_name", "")
+    if not (scene and label) and (source.parent / "config.yml").is_file() and len(source.resolve().parts) > 4:
+        experiment, method = source.resolve().parts[-4:-2]
+        scene, label = scene or experiment, label or method
+    return Curve(scene, label or source.stem, [points[step] for step in sorted(points)], source)
+
+
+def read_json(path: Path) -> list[Evaluation]:
+    """The evaluation in a JSON file; an empty list when the file holds something else."""
+    data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
+    return [evaluation_from(data, path)] if is_evaluation(data) else []
+
+
+def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
+    """Evaluations, the curve and notes of a JSONL file; all empty when it holds something else.
+
+    A last line that is cut off (a run that was killed while it wrote) is left out with a note; an earlier broken line
+    is an error.
+    """
+    numbered = [(i, s) for i, s in enumerate(read_text(path, MAX_JSONL_BYTES).splitlines(), 1) if s.strip()]
+    values, notes = [], []
+    for position, (number, line) in enumerate(numbered):
+        try:
+            values.append(parse_json(line, f"{path}, line {number},"))
+        except ReportError:
+            if position + 1 < len(numbered) or position == 0:
+                raise
+            notes.append(f"{path}: the last line is cut off and was left out.")
+    evaluations = [evaluation_from(value, path) for value in values if is_evaluation(value)]
+    points = [value for value in values if is_point(value) and not is_evaluation(value)]
+    return evaluations, [curve_from(points, path)] if points else [], notes
+
+
+def link_curves(curves: list[Curve], evaluations: list[Evaluation]) -> list[Curve]:
+    """Name curves after the evaluation whose checkpoint lies in the curve's folder (the run that wrote both)."""
+    linked = []
+    for curve in curves:
+        folder = str(curve.source.resolve().parent)
+        parents = (e for e in evaluations if not e.baked and e.checkpoint)
+        owner = next((e for e in parents if folder in map(str, Path(e.checkpoint).parents)), None)
+        linked.append(replace(curve, scene=owner.scene, label=owner.method) if owner else curve)
+    return linked
+
+
+def _suffixes(sources: list[Path]) -> list[str]:
+    """The shortest piece of each path, folder or stem, that tells equal names apart."""
+    parts = [[*path.resolve().parts[:-1], path.stem] for path in sources]
+    for depth in range(1, max(map(len, parts)) + 1):
+        pieces = [p[-depth] if len(p) >= depth else "" for p in parts]
+        if len(set(pieces)) == len(pieces):
+            return pieces
+    return [str(i + 1) for i in range(len(sources))]
+
+
+def disambiguate(records: Records) -> None:
+    """Give evaluations (within a scene and stage) and curves (within a scene) labels that are unique."""
+    for items in (records.evaluations, records.curves):
+        groups: dict[tuple, list[int]] = {}
+        for i, item in enumerate(items):
+            groups.setdefault((item.scene, getattr(item, "baked", None), item.label), []).append(i)
+        for indices in groups.values():
+            if len(indices) > 1:
+                for i, suffix in zip(indices, _suffixes([items[i].source for i in indices]), strict=True):
+                    items[i] = replace(items[i], label=f"{items[i].label} ({suffix})")
+
+
+def neural_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
+    """The neural evaluation that a baked one is compared with.
+
+    Same scene and method; of several, the one whose file lies in the same folder. None when that leaves a doubt.
+    """
+    same = [e for e in evaluations if not e.baked and (e.scene, e.method) == (row.scene, row.method)]
+    if len(same) > 1:
+        same = [e for e in same if e.source.parent == row.source.parent]
+    return same[0] if row.baked and len(same) == 1 else None

@@ -1,0 +1,311 @@
+import errno
+import hashlib
+import json
+import os
+import stat
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bitymi_ns.bake import bundle as bundle_module
+from bitymi_ns.bake import ktx2, ply
+from bitymi_ns.bake.bundle import BundleError, World, check_target, read_bundle, verify_bundle, write_bundle
+from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.quantise import Range, encode
+
+
+def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
+    """A bundle of a few surfels and random texels; returns what went in."""
+    params = surfels(count, kind)
+    packing = pack([[8, 4]] * count)
+    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
+    atlas = None if format is None else encode(texels, packing, format, Range(-0.5, 2.0, "test"))
+    tiles = packing.tiles if atlas else np.zeros_like(packing.tiles)
+    write_bundle(folder, params, tiles, atlas, **kwargs)
+    return params, tiles, texels, atlas
+
+
+def amend(folder, change):
+    """Rewrites bundle.json after change(info)."""
+    info = json.loads((folder / "bundle.json").read_text())
+    change(info)
+    (folder / "bundle.json").write_text(json.dumps(info))
+
+
+def names_beside(folder):
+    return sorted(path.name for path in folder.parent.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("format", ["bc7", "uint8", "fp16", None])
+def test_what_is_written_is_read(surfels, tmp_path, kind, format):
+    params, tiles, texels, atlas = make(surfels, tmp_path / "b", kind, format, near=0.3, background=(1, 0.5, 0))
+    loaded = read_bundle(tmp_path / "b")
+    assert loaded.view_color == kind and len(loaded) == 6
+    np.testing.assert_array_equal(loaded.tiles.numpy(), tiles)
+    assert loaded.tiles.dtype == torch.int32
+    torch.testing.assert_close(loaded.surfels["log_scales"], params["log_scales"], rtol=0, atol=0)
+    assert loaded.info["render"] == {
+        "alpha_max": 0.99,
+        "alpha_min": 1 / 255,
+        "t_min": 1e-4,
+        "near": 0.3,
+        "low_pass": 1.0,
+        "background": [1, 0.5, 0],
+    }
+    if format is None:
+        assert loaded.atlas is None and loaded.info["atlas"] is None
+        assert sorted(os.listdir(tmp_path / "b")) == ["bundle.json", "surfels.ply"]
+        return
+    assert loaded.atlas.shape == (*texels.shape[:3], 4)
+    assert loaded.atlas.dtype == (torch.float32 if format == "fp16" else torch.uint8)
+    assert (loaded.offset, loaded.scale) == ((0, 1) if format == "fp16" else (-0.5, 2.0))
+    error = float((loaded.residuals() - torch.from_numpy(texels)).square().mean())
+    if format != "bc7":  # random texels are what block compression cannot hold
+        assert error < (1e-6 if format == "fp16" else (2.0 / 255) ** 2 / 11)
+    assert error == pytest.approx(atlas.mse, rel=0.2)
+    assert loaded.info["atlas"]["psnr"] == pytest.approx(atlas.psnr)
+
+
+def test_the_manifest_states_files_world_and_statistics(surfels, tmp_path):
+    world = World(np.arange(12).reshape(3, 4), 0.25)
+    statistics = {"psnr": np.float32(27.5), "never": float("nan"), "views": torch.tensor([1, 2]), "path": tmp_path}
+    extra = {"preview.png": b"\x89PNG...", "config.yml": b"method: bitymi\n"}
+    params, *_ = make(surfels, tmp_path / "b", world=world, statistics=statistics, extra_files=extra)
+    info = verify_bundle(tmp_path / "b")
+    assert (info["format"], info["version"]) == ("bitymi-bundle", "1.0")
+    assert info["generator"].startswith("bitymi-ns ")
+    assert info["world"] == {"transform": [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]], "scale": 0.25}
+    assert info["statistics"] == {"psnr": 27.5, "never": None, "views": [1, 2], "path": str(tmp_path)}
+    assert info["bounds"]["min"] == pytest.approx(params["means"].amin(0).tolist())
+    assert info["color_bias"] == 0.5 and info["surfels"]["sites"] == 7 and info["surfels"]["support"] == 3
+    assert sorted(info["files"]) == ["atlas.ktx2", "config.yml", "preview.png", "surfels.ply"]
+    for name, entry in info["files"].items():
+        data = (tmp_path / "b" / name).read_bytes()
+        assert entry == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def test_an_existing_folder_is_refused_unless_it_is_a_bundle_to_overwrite(surfels, tmp_path):
+    target = tmp_path / "b"
+    target.mkdir()
+    make(surfels, target)  # an empty folder is no loss
+    with pytest.raises(BundleError, match="exists"):
+        make(surfels, target, "sh")
+    assert read_bundle(target).view_color == "sv"
+    make(surfels, target, "sh", overwrite=True)
+    assert read_bundle(target).view_color == "sh"
+    assert names_beside(target) == ["b"]
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "thesis.tex").write_text("years of work")
+    with pytest.raises(BundleError, match="not a bundle"):
+        make(surfels, home, overwrite=True)
+    with pytest.raises(BundleError, match="not a folder"):
+        make(surfels, home / "thesis.tex", overwrite=True)
+    with pytest.raises(ValueError, match="not a bundle"):
+        check_target(home, overwrite=True)
+    assert (home / "thesis.tex").read_text() == "years of work"
+
+
+def raiser(error):
+    def fail(*args, **kwargs):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("step", [(ply, "write_ply"), (ktx2, "write_ktx2"), (bundle_module, "_fingerprint")])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_full_disk_leaves_nothing_behind(surfels, tmp_path, monkeypatch, step, overwrite):
+    target = tmp_path / "b"
+    if overwrite:
+        make(surfels, target, "sg")
+    monkeypatch.setattr(*step, raiser(OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(BundleError, match=r"disk is full.*MB"):
+        make(surfels, target, overwrite=overwrite)
+    assert names_beside(target) == (["b"] if overwrite else [])
+    if overwrite:
+        assert read_bundle(target).view_color == "sg"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), RuntimeError("bug")])
+def test_an_interrupted_write_leaves_nothing_behind(surfels, tmp_path, monkeypatch, error):
+    monkeypatch.setattr(ktx2, "write_ktx2", raiser(error))
+    with pytest.raises(type(error)):
+        make(surfels, tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_swap_puts_the_old_bundle_back(surfels, tmp_path, monkeypatch):
+    target = tmp_path / "b"
+    make(surfels, target, "sg")
+    rename = type(target).rename
+
+    def fail_for_the_new_one(self, to):
+        if ".new-" in self.name:
+            raise OSError(errno.EIO, "Input/output error")
+        return rename(self, to)
+
+    monkeypatch.setattr(type(target), "rename", fail_for_the_new_one)
+    with pytest.raises(BundleError, match="Input/output error"):
+        make(surfels, target, overwrite=True)
+    monkeypatch.undo()
+    assert read_bundle(target).view_color == "sg" and names_beside(target) == ["b"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_a_clear_error(surfels, tmp_path):
+    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    try:
+        with pytest.raises(BundleError, match="cannot be written"):
+            make(surfels, tmp_path / "b")
+    finally:
+        tmp_path.chmod(stat.S_IRWXU)
+
+
+def test_parameters_that_are_not_finite_are_not_written(surfels, tmp_path):
+    params = surfels(3)
+    params["log_scales"][1, 0] = float("nan")
+    with pytest.raises(BundleError, match="log_scales is not finite in row 1"):
+        write_bundle(tmp_path / "b", params, np.zeros((3, 5), dtype=np.int32), None)
+    with pytest.raises(BundleError, match="rows"):
+        write_bundle(tmp_path / "b", surfels(3), np.zeros((2, 5), dtype=np.int32), None)
+    with pytest.raises(BundleError, match="cannot be the name"):
+        make(surfels, tmp_path / "b", extra_files={"../escape": b""})
+    with pytest.raises(BundleError, match="may not replace"):
+        make(surfels, tmp_path / "b", extra_files={"surfels.ply": b""})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damage_is_named(surfels, tmp_path):
+    target = tmp_path / "b"
+    make(surfels, target, extra_files={"preview.png": b"picture"})
+    originals = {path.name: path.read_bytes() for path in target.iterdir()}
+    for name in ("surfels.ply", "atlas.ktx2", "preview.png"):
+        path = target / name
+        path.write_bytes(originals[name][:-1])
+        with pytest.raises(BundleError, match=f"{name} is truncated"):
+            read_bundle(target)
+        path.write_bytes(originals[name][:-1] + bytes([originals[name][-1] ^ 1]))
+        with pytest.raises(BundleError, match=f"{name} is altered"):
+            read_bundle(target)
+        path.unlink()
+        with pytest.raises(BundleError, match=f"{name} is missing"):
+            read_bundle(target)
+        path.write_bytes(originals[name])
+    read_bundle(target)
+    (target / "bundle.json").unlink()
+    with pytest.raises(BundleError, match="not a bundle"):
+        read_bundle(target)
+    with pytest.raises(BundleError, match="not a bundle"):
+        read_bundle(tmp_path / "nothing")
+
+
+def test_versions(surfels, tmp_path):
+    target = tmp_path / "b"
+    make(surfels, target)
+    amend(target, lambda info: info.update(version="1.7", holograms={"yes": True}))
+    assert read_bundle(target).info["holograms"] == {"yes": True}
+    amend(target, lambda info: info.update(version="2.0"))
+    with pytest.raises(BundleError, match="update bitymi-ns"):
+        read_bundle(target)
+    amend(target, lambda info: info.update(version="one"))
+    with pytest.raises(BundleError, match="must look like"):
+        read_bundle(target)
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (lambda i: i.update(format="zip"), "not a bundle"),
+        (lambda i: i.pop("surfels"), "surfels.count is missing"),
+        (lambda i: i["surfels"].update(count=7), "says 7"),
+        (lambda i: i["surfels"].update(count=-1), "whole number"),
+        (lambda i: i["surfels"].update(count=True), "whole number"),
+        (lambda i: i["surfels"].update(view_color="sh"), "surfels.ply"),
+        (lambda i: i["atlas"].update(width=20), "not those of"),
+        (lambda i: i["atlas"].update(scale=float("inf")), "finite"),
+        (lambda i: i["atlas"].update(offset=10**400), "finite"),
+        (lambda i: i["atlas"].update(scale=0), "positive"),
+        (lambda i: i.update(atlas=None), "disagree"),
+        (lambda i: i["files"].pop("atlas.ktx2"), "disagree"),
+        (lambda i: i["files"].update({"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}), "cannot be the name"),
+        (lambda i: i["files"].update({"extra": []}), "missing"),
+        (lambda i: i["files"]["surfels.ply"].update(sha256="no"), "hexadecimal"),
+        (lambda i: i["render"].update(near="close"), "finite number"),
+        (lambda i: i["world"].update(transform=[[1]]), "shape"),
+    ],
+)
+def test_a_manifest_that_contradicts_the_files_is_refused(surfels, tmp_path, change, reason):
+    make(surfels, tmp_path / "b")
+    amend(tmp_path / "b", change)
+    with pytest.raises(BundleError, match=reason):
+        read_bundle(tmp_path / "b")
+
+
+def test_tiles_outside_the_atlas_are_refused(surfels, tmp_path):
+    params = surfels(1)
+    packing = pack([[8, 8]])
+    atlas = encode(np.zeros((1, 8, 8, 3), dtype=np.float32), packing, "uint8")
+    bad_tiles = [[4, 0, 0, 8, 8], [0, 4, 0, 8, 8], [0, 0, 1, 8, 8], [-4, 0, 0, 8, 8], [0, 0, 0, 8, 0]]
+    for i, tile in enumerate(bad_tiles):
+        write_bundle(tmp_path / str(i), params, np.array([tile], dtype=np.int32), atlas)
+        with pytest.raises(BundleError, match="outside the atlas"):
+            read_bundle(tmp_path / str(i))
+
+
+@pytest.fixture(scope="module")
+def good_bundle(tmp_path_factory):
+    return tmp_path_factory.mktemp("damage") / "b"
+
+
+@settings(deadline=None, max_examples=250)
+@given(st.data())
+def test_damaged_files_raise_only_bundle_errors(surfels, good_bundle, data):
+    if not good_bundle.exists():
+        make(surfels, good_bundle, "sb", "bc7", count=2)
+    name = data.draw(st.sampled_from(["surfels.ply", "atlas.ktx2", "bundle.json"]))
+    path = good_bundle / name
+    good = path.read_bytes()
+    bad = bytearray(good[: data.draw(st.one_of(st.just(len(good)), st.integers(0, len(good))))])
+    for _ in range(data.draw(st.integers(0, 3))):
+        if bad:
+            bad[data.draw(st.integers(0, len(bad) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(bad)
+    try:
+        for verify in (True, False):
+            try:
+                read_bundle(good_bundle, verify)
+                assert name == "bundle.json" or not verify or bytes(bad) == good
+            except BundleError as error:
+                assert str(error)
+    finally:
+        path.write_bytes(good)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+                    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)), st.data())  # fmt: skip
+def test_any_json_in_any_place_raises_only_bundle_errors(surfels, good_bundle, value, data):
+    if not good_bundle.exists():
+        make(surfels, good_bundle, "sb", "bc7", count=2)
+    path = good_bundle / "bundle.json"
+    good = path.read_bytes()
+    info = json.loads(good)
+    at = info
+    while True:
+        key = data.draw(st.sampled_from(sorted(at)))
+        if not isinstance(at[key], dict) or not at[key] or data.draw(st.booleans()):
+            break
+        at = at[key]
+    at[key] = value
+    path.write_bytes(json.dumps(info).encode("utf-8", "surrogatepass"))
+    try:
+        read_bundle(good_bundle)
+    except BundleError as error:
+        assert str(error)
+    finally:
+        path.write_bytes(good)

@@ -1,0 +1,142 @@
+import io
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from bitymi_ns.bake.ktx2 import Ktx2Error, layer_bytes, parse_ktx2, write_ktx2
+from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.quantise import decode_pages, encode
+
+FORMATS = ["bc7", "uint8", "fp16"]
+
+
+def make(folder, format, width=8, height=12, layers=3, **metadata):
+    g = np.random.default_rng(0)
+    payload = [g.bytes(layer_bytes(format, width, height)) for _ in range(layers)]
+    write_ktx2(folder / "a.ktx2", payload, format, width, height, "test 1.0", metadata)
+    return payload, (folder / "a.ktx2").read_bytes()
+
+
+def by_the_specification(data):
+    """The fields of a KTX2 file at the offsets of the specification's tables, sharing no code with the writer."""
+
+    def u32(at):
+        return int.from_bytes(data[at : at + 4], "little")
+
+    def u64(at):
+        return int.from_bytes(data[at : at + 8], "little")
+
+    names = "vkFormat typeSize pixelWidth pixelHeight pixelDepth layerCount faceCount levelCount scheme".split()
+    names += "dfdByteOffset dfdByteLength kvdByteOffset kvdByteLength".split()
+    f = {name: u32(12 + 4 * i) for i, name in enumerate(names)}
+    f |= {"identifier": data[:12], "sgdByteOffset": u64(64), "sgdByteLength": u64(72)}
+    f |= {"byteOffset": u64(80), "byteLength": u64(88), "uncompressedByteLength": u64(96)}
+    dfd = f["dfdByteOffset"]
+    word = [u32(dfd + 4 + 4 * i) for i in range((f["dfdByteLength"] - 4) // 4)]
+    f |= {"dfdTotalSize": u32(dfd), "vendor": word[0] & 0x1FFFF, "descriptorType": word[0] >> 17}
+    f |= {"versionNumber": word[1] & 0xFFFF, "blockSize": word[1] >> 16}
+    f |= {"model": word[2] & 255, "primaries": word[2] >> 8 & 255, "transfer": word[2] >> 16 & 255}
+    f |= {"flags": word[2] >> 24, "texelBlock": [word[3] >> 8 * i & 255 for i in range(4)]}
+    f |= {"bytesPlane": [word[4 + i // 4] >> 8 * (i % 4) & 255 for i in range(8)], "samples": []}
+    for i in range(6, len(word), 4):
+        sample = (word[i] & 0xFFFF, (word[i] >> 16 & 255) + 1, word[i] >> 24 & 15, word[i] >> 28)
+        f["samples"].append((*sample, word[i + 1], word[i + 2], word[i + 3]))
+    f["keys"], at = [], f["kvdByteOffset"]
+    while at < f["kvdByteOffset"] + f["kvdByteLength"]:
+        length = u32(at)
+        f["keys"].append(tuple(data[at + 4 : at + 4 + length].split(b"\0", 1)))
+        assert not any(data[at + 4 + length : at + 4 + (length + 3) // 4 * 4])
+        at += 4 + (length + 3) // 4 * 4
+    assert at == f["kvdByteOffset"] + f["kvdByteLength"]
+    return f
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_every_field_is_what_the_specification_asks_for(tmp_path, format):
+    payload, data = make(tmp_path, format)
+    f = by_the_specification(data)
+    assert f["identifier"] == bytes([0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A])
+    assert f["vkFormat"] == {"bc7": 145, "uint8": 37, "fp16": 97}[format]
+    assert f["typeSize"] == {"bc7": 1, "uint8": 1, "fp16": 2}[format]
+    assert (f["pixelWidth"], f["pixelHeight"], f["pixelDepth"]) == (8, 12, 0)
+    assert (f["layerCount"], f["faceCount"], f["levelCount"], f["scheme"]) == (3, 1, 1, 0)
+    assert f["dfdByteOffset"] == 80 + 24 and f["dfdTotalSize"] == f["dfdByteLength"]
+    assert f["kvdByteOffset"] == f["dfdByteOffset"] + f["dfdByteLength"] and f["kvdByteOffset"] % 4 == 0
+    assert (f["sgdByteOffset"], f["sgdByteLength"]) == (0, 0)
+    assert f["byteOffset"] % {"bc7": 16, "uint8": 4, "fp16": 8}[format] == 0
+    assert f["byteLength"] == f["uncompressedByteLength"] == len(data) - f["byteOffset"]
+    assert data[f["byteOffset"] :] == b"".join(payload)
+    assert (f["vendor"], f["descriptorType"], f["versionNumber"]) == (0, 0, 2)
+    assert f["blockSize"] == f["dfdTotalSize"] - 4 == 24 + 16 * len(f["samples"])
+    assert (f["transfer"], f["primaries"], f["flags"]) == (1, 1, 0)  # linear, BT.709, straight alpha
+    assert f["keys"] == [(b"KTXorientation", b"rd\0"), (b"KTXwriter", b"test 1.0\0")]
+    if format == "bc7":
+        assert (f["model"], f["texelBlock"], f["bytesPlane"]) == (134, [3, 3, 0, 0], [16, 0, 0, 0, 0, 0, 0, 0])
+        assert f["samples"] == [(0, 128, 0, 0, 0, 0, 0xFFFFFFFF)]
+    else:
+        bits, qualifier = (8, 0) if format == "uint8" else (16, 0xC)  # float and signed
+        low, high = (0, 255) if format == "uint8" else struct.unpack("<2I", struct.pack("<2f", -1, 1))
+        assert (f["model"], f["texelBlock"], f["bytesPlane"][:2]) == (1, [0, 0, 0, 0], [bits // 2, 0])
+        assert f["samples"] == [(bits * i, bits, c, qualifier, 0, low, high) for i, c in enumerate((0, 1, 2, 15))]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_is_written_is_read(tmp_path, format):
+    payload, data = make(tmp_path, format, bitymiNote="Ωmega", aFirst="")
+    image = parse_ktx2(data)
+    assert (image.format, image.width, image.height) == (format, 8, 12)
+    assert [bytes(layer) for layer in image.payload] == payload
+    assert image.metadata == {"KTXorientation": "rd", "KTXwriter": "test 1.0", "bitymiNote": "Ωmega", "aFirst": ""}
+
+
+def test_the_payload_opens_as_dds_in_pillow(tmp_path):
+    packing = pack([[16, 16]] * 5)
+    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
+    encoded = encode(texels, packing, "bc7")
+    write_ktx2(tmp_path / "a.ktx2", encoded.payload, "bc7", encoded.width, encoded.height, "test")
+    image = parse_ktx2((tmp_path / "a.ktx2").read_bytes())
+    dds = b"DDS " + struct.pack("<7I44x", 124, 0x81007, image.height, image.width, len(image.payload[0]), 0, 0)
+    dds += struct.pack("<II4s5I", 32, 4, b"DX10", 0, 0, 0, 0, 0) + struct.pack("<5I", 0x1000, 0, 0, 0, 0)
+    dds += struct.pack("<5I", 98, 3, 0, 1, 0)  # DXGI_FORMAT_BC7_UNORM, a 2D texture
+    opened = np.asarray(Image.open(io.BytesIO(dds + bytes(image.payload[0]))).convert("RGBA"))
+    np.testing.assert_array_equal(opened, decode_pages(image.payload, "bc7", image.width, image.height)[0])
+
+
+def test_layers_of_the_wrong_size_are_refused(tmp_path):
+    with pytest.raises(Ktx2Error, match="have 16 bytes each"):
+        write_ktx2(tmp_path / "a", [bytes(15)], "bc7", 4, 4, "test")
+    with pytest.raises(Ktx2Error):
+        write_ktx2(tmp_path / "a", [], "bc7", 4, 4, "test")
+
+
+def test_other_files_are_refused_with_a_reason(tmp_path):
+    _, data = make(tmp_path, "bc7")
+
+    def patched(at, value):
+        return data[:at] + struct.pack("<I", value) + data[at + 4 :]
+
+    cases = {"not a KTX2": b"DDS " + data[4:], "truncated": data[:-1], "texel format": patched(12, 146)}
+    cases |= {"supercompressed": patched(44, 2), "2D array": patched(36, 6), "level index": patched(32, 4)}
+    cases |= {"whole 4 x 4": patched(20, 9), "descriptor": patched(108, 7), "key/value": patched(60, 1 << 31)}
+    for reason, bad in cases.items():
+        with pytest.raises(Ktx2Error, match=reason):
+            parse_ktx2(bad)
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data(), st.sampled_from(FORMATS))
+def test_damaged_bytes_raise_only_the_readers_own_error(tmp_path_factory, data, format):
+    folder = tmp_path_factory.getbasetemp()
+    _, good = make(folder, format)
+    bad = bytearray(good[: data.draw(st.integers(0, len(good)))])
+    for _ in range(data.draw(st.integers(0, 4))):
+        if bad:
+            bad[data.draw(st.integers(0, min(len(bad), 260) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        parse_ktx2(bytes(bad))
+    except Ktx2Error:
+        pass

@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.bake import BakeOptions, bake, export, read_bundle, rich_progress
+from bitymi_ns.bake.geometry import tangent_vectors
+
+
+def bilinear(bundle, surfel, u, v, extent=3.0):
+    """The residual at (u, v) in [-3, 3]^2 of a surfel, clamped to the outer texel centres as in a renderer."""
+    x, y, layer, r_u, r_v = bundle.tiles[surfel].tolist()
+    texels = bundle.residuals()[layer, y : y + r_v, x : x + r_u].permute(2, 0, 1)[None]
+    grid = torch.stack([u, v], dim=-1)[None, None] / extent
+    sampled = torch.nn.functional.grid_sample(texels, grid, padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].T
+
+
+@pytest.mark.parametrize("format, tolerance", [("fp16", 1e-3), ("uint8", 4e-3), ("bc7", 2e-2)])
+def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format, tolerance):
+    """Points inside the tiles, by bilinear sampling, against the analytic field."""
+    made = scene(60)
+    made.field.voxel = 0.02  # well below the wavelength, so that interpolation is not what is measured
+    export(bake(made, options=BakeOptions(format=format)), tmp_path / "b")
+    bundle = read_bundle(tmp_path / "b")
+    scales = bundle.surfels["log_scales"].exp()
+    axes = tangent_vectors(bundle.surfels["quats"]) * scales[:, None]
+    errors = []
+    for i in torch.nonzero(scales.amax(1) < 0.08).squeeze(1).tolist():
+        uv = torch.rand(50, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2
+        x = bundle.surfels["means"][i] + uv @ axes[i].T
+        errors.append(bilinear(bundle, i, uv[:, 0], uv[:, 1]) - made.field(x))
+    errors = torch.cat(errors)
+    assert len(errors) > 1000
+    assert errors.abs().mean() < tolerance
+
+
+def test_the_layout_is_independent_of_the_run(scene):
+    one, two = bake(scene()), bake(scene())
+    np.testing.assert_array_equal(one.packing.tiles, two.packing.tiles)
+    assert one.atlas.payload == two.atlas.payload and one.atlas.range == two.atlas.range
+
+
+def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
+    made = scene(100)
+    made.surfels["opacity_logits"][:7] = -8.0
+    made.surfels["means"][7, 1] = float("nan")
+    made.surfels["log_scales"][8, 0] = 1e30
+    made.surfels["quats"][9] = 0.0
+    made.surfels["sv_rgb"][10, 3, 1] = float("inf")
+    baked = bake(made)
+    assert baked.statistics["surfels"] == {
+        "trained": 100,
+        "kept": 89,
+        "left_out": {"not_finite": 4, "transparent": 7},
+    }
+    assert baked.rows.tolist() == list(range(11, 100))
+    torch.testing.assert_close(baked.surfels["means"], made.surfels["means"][11:])
+    export(baked, tmp_path / "b", statistics={"psnr": 30.0})
+    info = read_bundle(tmp_path / "b").info
+    assert info["statistics"]["surfels"]["left_out"]["transparent"] == 7 and info["statistics"]["psnr"] == 30.0
+    assert info["render"]["near"] == 0.25 and info["atlas"]["extent"] == 3.0
+
+
+def test_nothing_left_is_an_error(scene):
+    made = scene(3)
+    made.surfels["opacity_logits"][:] = -20.0
+    with pytest.raises(ValueError, match="no surfel is left.*'transparent': 3"):
+        bake(made)
+
+
+def test_views_cap_the_tiles_and_say_what_that_saved(scene, camera):
+    made = scene(300)
+    free = bake(made, [camera()], BakeOptions(cap_by_views=False)).statistics["texels"]
+    capped = bake(made, [camera()]).statistics["texels"]
+    assert free["nyquist"] == free["after_cap_by_views"] == capped["nyquist"]
+    assert capped["after_cap_by_views"] < free["nyquist"] / 2
+    assert bake(made, []).statistics["texels"] == free  # no views, no cap
+
+
+def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
+    made = scene(50)
+    made.surfels["means"] *= 0.3
+    made.surfels["means"][::2, 2] -= 100.0  # behind the camera
+    kept = bake(made, [camera()])
+    assert (kept.packing.tiles[::2, 3:] == 4).all() and len(kept.rows) == 50
+    dropped = bake(made, [camera()], BakeOptions(drop_unseen=True))
+    assert dropped.rows.tolist() == list(range(1, 50, 2))
+    assert dropped.statistics["surfels"]["left_out"]["unseen"] == 25
+
+
+def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
+    baked = bake(scene(20, field=None, kind="sh"))
+    assert baked.atlas is None and baked.texels is None and not baked.packing.tiles.any()
+    export(baked, tmp_path / "b")
+    loaded = read_bundle(tmp_path / "b")
+    assert loaded.atlas is None and not loaded.tiles.any() and loaded.info["atlas"] is None
+    with pytest.raises(ValueError):
+        baked.with_texels(torch.zeros(1, 4, 4, 3))
+
+
+def test_fine_tuned_texels_are_encoded_anew(scene):
+    baked = bake(scene(30))
+    tuned = baked.with_texels(baked.texels + 1.0)
+    torch.testing.assert_close(tuned.mean_residual, baked.mean_residual + 1.0)
+    assert tuned.atlas.range.offset == pytest.approx(baked.atlas.range.offset + 1.0, abs=1e-4)
+    with pytest.raises(ValueError, match="do not fit"):
+        baked.with_texels(baked.texels[:, :4])
+
+
+def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
+    made = scene(200)
+    made.field.voxel_size = lambda x: torch.tensor([0.4, 0.05]).expand(len(x), 2)
+    isotropic = bake(made).statistics["texels"]["nyquist"]
+    made.field.center = torch.zeros(3)
+    assert bake(made).statistics["texels"]["nyquist"] < isotropic
+
+
+@pytest.mark.parametrize(
+    "options, reason",
+    [
+        (BakeOptions(extent=0.0), "extent"),
+        (BakeOptions(format="jpeg"), "format"),
+        (BakeOptions(bc7_profile="best"), "profile"),
+        (BakeOptions(r_max=50), "r_max"),
+        (BakeOptions(page_width=100), "page width"),
+        (BakeOptions(range="sigma1"), "range rule"),
+    ],
+)
+def test_options_out_of_range_are_refused(scene, options, reason):
+    with pytest.raises(ValueError, match=reason):
+        bake(scene(5), options=options)
+
+
+def test_rich_progress_draws_every_step(scene, capsys):
+    with rich_progress() as progress:
+        bake(scene(20), progress=progress)
+    out = capsys.readouterr().out
+    assert "evaluating texels" in out and "encoding the atlas" in out

@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bitymi_ns.bake.ply import PlyError, parse_ply, write_ply
+
+COLUMNS = {
+    "x": np.array([1.5, -2.0, 3e30], dtype=np.float32),
+    "y": np.zeros(3, dtype=np.float32),
+    "tile_x": np.array([0, 4, 2**31 - 1], dtype=np.int32),
+}
+
+
+def written(folder, columns=COLUMNS, **kwargs):
+    write_ply(folder / "a.ply", columns, **kwargs)
+    return (folder / "a.ply").read_bytes()
+
+
+def test_the_file_is_plain_ply(tmp_path):
+    data = written(tmp_path, comments=["made by a test"])
+    header, body = data.split(b"end_header\n")
+    assert header.decode().split("\n") == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment made by a test",
+        "element vertex 3",
+        "property float x",
+        "property float y",
+        "property int tile_x",
+        "",
+    ]
+    assert body[:12] == np.float32(1.5).tobytes() + np.float32(0).tobytes() + np.int32(0).tobytes()
+    assert len(body) == 36
+
+
+def test_what_is_written_is_read(tmp_path):
+    columns = parse_ply(written(tmp_path))
+    assert list(columns) == list(COLUMNS)
+    for name, column in COLUMNS.items():
+        assert columns[name].dtype == column.dtype
+        np.testing.assert_array_equal(columns[name], column)
+
+
+def test_no_vertices_are_fine(tmp_path):
+    assert parse_ply(written(tmp_path, {"x": np.zeros(0, dtype=np.float32)}))["x"].shape == (0,)
+
+
+def test_columns_of_different_lengths_are_refused(tmp_path):
+    with pytest.raises(PlyError, match="one length"):
+        write_ply(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(3)})
+
+
+def test_other_files_are_refused_with_a_reason(tmp_path):
+    data = written(tmp_path)
+    cases = {
+        "not a PLY": b"plx" + data[3:],
+        "binary little-endian": data.replace(b"little", b"big"),
+        "truncated": data[:-1],
+        "too long": data + b"\0",
+        "not a number": data.replace(b"vertex 3", b"vertex -3"),
+        "not understood": data.replace(b"property int", b"property list"),
+        "twice": data.replace(b"float y", b"float x"),
+        "no vertices": data.replace(b"element vertex 3\n", b""),
+        "ASCII": data.replace(b"float y", b"float \xff"),
+    }
+    cases["no vertices"] = b"ply\nformat binary_little_endian 1.0\nend_header\n"
+    for reason, bad in cases.items():
+        with pytest.raises(PlyError, match=reason):
+            parse_ply(bad)
+    with pytest.raises(PlyError, match="x is not finite in row 1"):
+        parse_ply(written(tmp_path, {"x": np.array([0, np.nan, np.inf])}))
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data())
+def test_damaged_bytes_raise_only_the_readers_own_error(tmp_path_factory, data):
+    good = written(tmp_path_factory.getbasetemp())
+    bad = bytearray(good[: data.draw(st.integers(0, len(good)))])
+    for _ in range(data.draw(st.integers(0, 4))):
+        if bad:
+            bad[data.draw(st.integers(0, len(bad) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        parse_ply(bytes(bad))
+    except PlyError:
+        pass

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.bake.ply import PlyError
+from bitymi_ns.bake.surfel_table import SH_C0, from_columns, mean_view_color, to_columns
+
+KINDS = ["sv", "sh", "sb", "sg"]
+TILES = np.arange(25, dtype=np.int32).reshape(5, 5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_surfels_survive_the_columns(surfels, kind):
+    params = surfels(5, kind)
+    columns = to_columns(params, TILES)
+    found, tiles = from_columns(columns, kind)
+    np.testing.assert_array_equal(tiles.numpy(), TILES)
+    assert set(found) == set(params)
+    for name, value in params.items():
+        expected = torch.nn.functional.normalize(value, dim=1) if name == "quats" else value
+        torch.testing.assert_close(found[name], expected, rtol=0, atol=1e-7 if name == "quats" else 0)
+
+
+def test_the_columns_begin_with_those_of_gaussian_splatting(surfels):
+    columns = to_columns(surfels(5), TILES)
+    names = list(columns)
+    assert names[:15] == (
+        "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 beta".split()
+    )
+    assert names[15:17] == ["sv_sites_0", "sv_sites_1"] and names[-5:][0] == "tile_x"
+    assert len(names) == 15 + 49 + 5
+    assert (columns["scale_2"] == -31).all() and columns["tile_ru"].dtype == np.int32
+
+
+def test_viewers_see_the_mean_colour_with_the_mean_of_the_tile(surfels):
+    params = surfels(5, "sh")
+    params["sh_dc"] = torch.tensor([[0.1, 0.2, -0.3]]).expand(5, 3) / SH_C0
+    columns = to_columns(params, TILES, torch.full((5, 3), 0.25))
+    shown = [0.5 + SH_C0 * columns[f"f_dc_{i}"][0] for i in range(3)]
+    assert shown == pytest.approx([0.85, 0.95, 0.45])
+    bright = to_columns(params, TILES, torch.full((5, 3), 9.0))
+    assert 0.5 + SH_C0 * bright["f_dc_0"][0] == pytest.approx(1.0)
+
+
+def test_mean_view_colours_match_a_sum_over_the_sphere(surfels):
+    d = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    sv = surfels(1, "sv")
+    sites = torch.nn.functional.normalize(sv["sv_sites"][0], dim=1) * sv["sv_log_tau"][0].exp()[:, None]
+    expected = (torch.softmax(d @ sites.T, dim=1) @ sv["sv_rgb"][0]).mean(0)
+    torch.testing.assert_close(mean_view_color(sv)[0], expected, atol=0.02, rtol=0)
+    sg = surfels(1, "sg")
+    color = sg["sg_base"][0].clone()
+    for lobe in sg["sg_lobes"][0]:
+        mu = torch.nn.functional.normalize(lobe[:3], dim=0)
+        color += lobe[4:] * torch.exp(lobe[3].exp() * (d @ mu - 1)).mean()
+    torch.testing.assert_close(mean_view_color(sg)[0], color, atol=0.02, rtol=0)
+
+
+def test_extreme_temperatures_leave_the_colour_finite(surfels):
+    for kind, name in (("sv", "sv_log_tau"), ("sb", "sb_lobes"), ("sg", "sg_lobes")):
+        params = surfels(3, kind)
+        params[name] = params[name] * 0 + torch.tensor([[-80.0], [0.0], [9.0]]).reshape(
+            3, *[1] * (params[name].dim() - 1)
+        )
+        columns = to_columns(params, TILES[:3])
+        assert all(np.isfinite(columns[f"f_dc_{i}"]).all() for i in range(3))
+
+
+def test_degree_zero_and_one_site_keep_their_shapes(surfels):
+    params = surfels(5, "sh")
+    params["sh_rest"] = params["sh_rest"][:, :0]
+    assert from_columns(to_columns(params, TILES), "sh")[0]["sh_rest"].shape == (5, 0, 3)
+    params = surfels(5, "sv")
+    params = {name: value[:, :1] if name.startswith("sv_") else value for name, value in params.items()}
+    assert from_columns(to_columns(params, TILES), "sv")[0]["sv_sites"].shape == (5, 1, 3)
+
+
+def test_missing_or_extra_columns_are_refused(surfels):
+    good = to_columns(surfels(5), TILES)
+    for name in ("x", "rot_3", "beta", "tile_ru"):
+        with pytest.raises(PlyError, match=f"{name} is missing"):
+            from_columns({k: v for k, v in good.items() if k != name}, "sv")
+    with pytest.raises(PlyError, match="groups of 3"):
+        from_columns({k: v for k, v in good.items() if k != "sv_rgb_4"}, "sv")
+    with pytest.raises(PlyError, match="number of sites"):
+        from_columns({k: v for k, v in good.items() if k != "sv_log_tau_6"}, "sv")
+    with pytest.raises(PlyError, match="groups of 3"):
+        from_columns(good, "sh")
+    with pytest.raises(PlyError, match="holds float32"):
+        from_columns(good | {"tile_x": good["x"]}, "sv")
+    with pytest.raises(PlyError, match="none of"):
+        from_columns(good, "phong")

@@ -42,8 +42,8 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
         maps: add depth and normal.
 
     Returns:
-        [H * W, 5] rgb, alpha, sum w beta; with maps [H * W, 9]: also sum w z (camera z) and sum w n (unit normals in the
-        camera frame, OpenCV axes, facing the camera). Nothing is divided by alpha; the background is not included.
+        [H * W, 5] rgb, alpha, sum w beta; with maps [H * W, 9]: also sum w z (camera z) and sum w n (unit normals in
+        the camera frame, OpenCV axes, facing the camera). Nothing is divided by alpha; the background is not included.
     """
     return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)
 

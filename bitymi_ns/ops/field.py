@@ -22,7 +22,7 @@ class FieldGeometry:
     Attributes:
         min_resolution: cells along an edge of the coarsest level; each level doubles it.
         contract: mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps
-            into the shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped.
+            into the shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped
         mid: centre, world units.
         half: radius or half edge, world units.
     """
@@ -44,7 +44,7 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
     if features != FEATURES or size != 1 << log2_size:
         raise ValueError(f"field_table must be [levels, power of two, {FEATURES}], not {list(table.shape)}")
     expected = [(levels * FEATURES, WIDTH), (WIDTH, WIDTH), (WIDTH, 3)]
-    for name, weight, shape in zip(("field_w1", "field_w2", "field_w3"), (w1, w2, w3), expected):
+    for name, weight, shape in zip(("field_w1", "field_w2", "field_w3"), (w1, w2, w3), expected, strict=True):
         if tuple(weight.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(weight.shape)}")
     weights = [dense(t, table) for t in (table, w1, w2, w3)]
@@ -72,8 +72,8 @@ class _Field(torch.autograd.Function):
 
 
 def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
-    """Residual colour at world positions, eq. (color): four levels are interpolated trilinearly, concatenated and decoded by
-    an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
+    """Residual colour at world positions, eq. (color): four levels are interpolated trilinearly, concatenated and decoded
+    by an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
 
     Args:
         x: [M, 3] world positions.

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.scene.camera import Camera
-
 from .backend import dense, kernel
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.camera import Camera
 
 GEOM = 16
 """Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), unused."""

@@ -114,7 +114,8 @@ class _Trace(torch.autograd.Function):
 
 def trace(projection: Projection, rim: float = 1e-3) -> Fragments:
     """Finds the fragments of a view: for each pixel, front to back by centre depth, the surfels with
-    sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255, until the transmittance would fall below 1e-4.
+    sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255, until the
+    transmittance would fall below 1e-4.
 
     The backward pass fills `projection.mean2d_grad` and `projection.mean2d_absgrad`.
 

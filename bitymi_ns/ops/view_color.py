@@ -70,7 +70,7 @@ def view_color(
         "sb": [(n, 3), (n, terms, 6)],
         "sg": [(n, 3), (n, terms, 7)],
     }[kind]
-    for name, tensor, shape in zip(VIEW_COLORS[kind], given, shapes):
+    for name, tensor, shape in zip(VIEW_COLORS[kind], given, shapes, strict=True):
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
     if kind == "sh" and terms not in (1, 4, 9, 16):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Optional
+from typing import Literal
 
 
 @dataclass
@@ -25,7 +25,7 @@ class SceneConfig:
     """Hash grid levels; the paper's 4, with resolutions min_resolution * 2^level."""
     min_resolution: int = 256
     """Resolution of the coarsest hash grid level."""
-    log2_table_size: Optional[int] = None
+    log2_table_size: int | None = None
     """Entries a hash level, as a power of two; not given: chosen so that the table fits the scene and the cache."""
     contraction: Literal["auto", "on", "off"] = "auto"
     """mip-NeRF 360 contraction of space outside the unit ball of the cameras; auto: off for scenes with alpha."""
@@ -36,4 +36,4 @@ class SceneConfig:
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels."""
     rim: float = 1e-3
-    """Lower bound of 1 - x in the derivative of the Beta kernel; the derivative itself diverges at the rim for beta < 1."""
+    """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1."""

@@ -9,21 +9,26 @@ constexpr int kFeatures = 4;  // a level
 constexpr int kWidth = 16;    // of both hidden layers
 constexpr int kMaxLevels = 4;
 
+// Unsigned integers as wide as a real; hashing needs their low 32 bits only.
+template <class T>
+struct IndexOf {
+  using type = uint32_t;
+};
+BT_HD uint32_t to_index(float x) { return uint32_t(int32_t(x)); }
+BT_HD uint32_t to_index(double x) { return uint32_t(int32_t(x)); }
+
 // Grid coordinate in [0, 1]^3 of a world position. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
 // (mip-NeRF 360) and the ball of radius 2 fills the cube; without it the cube of half edge `half` does, clamped.
-template <class S>
-BT_HD Vec3<S> grid_coordinate(Vec3<S> x, Vec3<S> mid, S half, bool contract) {
-  const Vec3<S> p = (S(1) / half) * (x - mid);
+template <class S, class T>
+BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
+  const T k = T(S(1) / half), one = T(S(1)), zero = T(S(0));
+  const Vec3<T> p = {k * (x.x - T(mid.x)), k * (x.y - T(mid.y)), k * (x.z - T(mid.z))};
+  const T h = T(S(0.5));
   if (!contract)
-    return {clamp_(S(0.5) * (p.x + S(1)), S(0), S(1)), clamp_(S(0.5) * (p.y + S(1)), S(0), S(1)),
-            clamp_(S(0.5) * (p.z + S(1)), S(0), S(1))};
-  const S r2 = dot(p, p);
-  S k = S(1);
-  if (r2 > S(1)) {
-    const S ir = S(1) / sqrt_(r2);
-    k = (S(2) - ir) * ir;
-  }
-  return {S(0.25) * (k * p.x + S(2)), S(0.25) * (k * p.y + S(2)), S(0.25) * (k * p.z + S(2))};
+    return {clamp_(h * (p.x + one), zero, one), clamp_(h * (p.y + one), zero, one), clamp_(h * (p.z + one), zero, one)};
+  const T ir = one / sqrt_(max_(dot(p, p), one));  // 1 inside the ball, where the factor below is then 1
+  const T q = T(S(0.25)) * (T(S(2)) - ir) * ir;
+  return {q * p.x + h, q * p.y + h, q * p.z + h};
 }
 template <class S>
 BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S half, bool contract, Vec3<S> dc) {
@@ -44,29 +49,27 @@ BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S half, bool contract,
 
 // Eight corners of a level's cell: entries of the hash table and trilinear weights. Corner c has bit 0 for x, 1 for y,
 // 2 for z. XOR of coordinate times prime with the standard primes.
-template <class S>
+template <class T>
 struct Corners {
-  uint32_t index[8];
-  S weight[8];
-  S fx, fy, fz;
+  typename IndexOf<T>::type index[8];
+  T weight[8];
+  T fx, fy, fz;  // position in the cell
 };
-template <class S>
-BT_HD Corners<S> corners(Vec3<S> c, S resolution, uint32_t mask) {
-  const S px = c.x * resolution, py = c.y * resolution, pz = c.z * resolution;
-  const S bx = floor_(px), by = floor_(py), bz = floor_(pz);
-  Corners<S> r;
+template <class T>
+BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
+  using U = typename IndexOf<T>::type;
+  const T px = c.x * resolution, py = c.y * resolution, pz = c.z * resolution;
+  const T bx = floor_(px), by = floor_(py), bz = floor_(pz), one = T(1.0f);
   r.fx = px - bx, r.fy = py - by, r.fz = pz - bz;
-  const uint32_t x0 = uint32_t(int32_t(bx)), y0 = uint32_t(int32_t(by)) * 2654435761u;
-  const uint32_t z0 = uint32_t(int32_t(bz)) * 805459861u;
-  const uint32_t x1 = x0 + 1u, y1 = y0 + 2654435761u, z1 = z0 + 805459861u;
-  const uint32_t yz[4] = {y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1};
-  const S gx = S(1) - r.fx, gy = S(1) - r.fy, gz = S(1) - r.fz;
-  const S wyz[4] = {gy * gz, r.fy * gz, gy * r.fz, r.fy * r.fz};
+  const U x0 = to_index(bx), y0 = to_index(by) * 2654435761u, z0 = to_index(bz) * 805459861u;
+  const U x1 = x0 + 1u, y1 = y0 + 2654435761u, z1 = z0 + 805459861u;
+  const U yz[4] = {y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1};
+  const T gx = one - r.fx, gy = one - r.fy, gz = one - r.fz;
+  const T wyz[4] = {gy * gz, r.fy * gz, gy * r.fz, r.fy * r.fz};
   for (int i = 0; i < 4; ++i) {
     r.index[2 * i] = (x0 ^ yz[i]) & mask, r.index[2 * i + 1] = (x1 ^ yz[i]) & mask;
     r.weight[2 * i] = gx * wyz[i], r.weight[2 * i + 1] = r.fx * wyz[i];
   }
-  return r;
 }
 
 // The MLP on rows of kWidth values. `Row` is a pack of kWidth reals; weights are stored input-major, w3 output-major

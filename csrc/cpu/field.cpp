@@ -13,12 +13,10 @@ void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho) {
   parallel_parts(n, 256, [&](int, int64_t begin, int64_t end) {
     Encoder<S> enc;
     MlpState<S, Pack<S>> state;
-    Vec3<S> at[kBatch];
     for (int64_t i = begin; i < end; i += kBatch) {
       const int count = int(std::min<int64_t>(kBatch, end - i));
-      for (int p = 0; p < count; ++p) at[p] = load3(x + 3 * (i + p));
-      enc.find(field, count, at);
-      enc.gather(field, count);
+      for (int p = 0; p < count; ++p) enc.set(p, load3(x + 3 * (i + p)));
+      enc.encode(field, count);
       for (int p = 0; p < count; ++p) store3(rho + 3 * (i + p), mlp(m, enc.features[p], state));
     }
   });
@@ -28,37 +26,37 @@ template <class S>
 void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S* drho, const FieldGradients<S>& out,
                     S* dx) {
   const auto m = load_mlp(field);
-  std::vector<Mlp<S, Pack<S>>> sums(std::max(num_threads(), 1));
+  const int threads = std::max(num_threads(), 1);
+  std::vector<Mlp<S, Pack<S>>> sums(threads);
   for (auto& g : sums) clear(g);
   clear_gradients(field, out);
   TableScatter<S> scatter;
   for (int64_t block = 0; block < n; block += kBlock) {
     const int64_t size = std::min(kBlock, n - block);
-    scatter.resize(size, field.levels);
+    scatter.resize(size, threads);
     parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
       Encoder<S> enc;
       MlpState<S, Pack<S>> state;
-      Vec3<S> at[kBatch];
       S lanes[kWidth];
+      int64_t slot = scatter.slot(part, begin);
       for (int64_t i = begin; i < end; i += kBatch) {
         const int count = int(std::min<int64_t>(kBatch, end - i));
-        for (int p = 0; p < count; ++p) at[p] = load3(x + 3 * (block + i + p));
-        enc.find(field, count, at);
-        enc.gather(field, count);
+        for (int p = 0; p < count; ++p) enc.set(p, load3(x + 3 * (block + i + p)));
+        enc.encode(field, count);
+        auto& batch = scatter.open(slot++, enc, field.levels, count);
         for (int p = 0; p < count; ++p) {
           mlp(m, enc.features[p], state);
-          const Pack<S> d = mlp_vjp(m, enc.features[p], state, load3(drho + 3 * (block + i + p)), sums[part]);
-          scatter.put(i + p, field.levels, enc.at[p], d);
+          batch.dfeatures[p] = mlp_vjp(m, enc.features[p], state, load3(drho + 3 * (block + i + p)), sums[part]);
           if (dx) {
-            store(lanes, d);
-            store3(dx + 3 * (block + i + p), enc.position_gradient(field, p, at[p], lanes));
+            store(lanes, batch.dfeatures[p]);
+            store3(dx + 3 * (block + i + p), enc.position_gradient(field, p, lanes));
           }
         }
       }
     });
     scatter.add(field, out.table);
   }
-  add_mlp_gradient(sums, int(sums.size()), field.levels * kFeatures, out);
+  add_mlp_gradient(sums, threads, field.levels * kFeatures, out);
 }
 
 namespace {
@@ -80,19 +78,17 @@ void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const
   parallel_parts(fragments, 1024, [&](int, int64_t begin, int64_t end) {
     Encoder<S> enc;
     MlpState<S, Pack<S>> state;
-    Vec3<S> at[kBatch];
     int64_t who[kBatch];
     int count = 0;
     for (int64_t i = begin; i < end; ++i) {
       const S* b = base + 3 * int64_t(f.surfel[i]);
       for (int c = 0; c < 3; ++c) colors[3 * i + c] = view_base(b[c]);
       if (field && f.weight[i] >= bound) {
-        at[count] = world_point(frames + int64_t(f.surfel[i]) * kFrame, f.uv[i], f.uv[fragments + i]);
+        enc.set(count, world_point(frames + int64_t(f.surfel[i]) * kFrame, f.uv[i], f.uv[fragments + i]));
         who[count++] = i;
       }
       if (count == kBatch || (count && i + 1 == end)) {
-        enc.find(*field, count, at);
-        enc.gather(*field, count);
+        enc.encode(*field, count);
         for (int p = 0; p < count; ++p) {
           S* to = colors + 3 * who[p];
           const Vec3<S> rho = mlp(m, enc.features[p], state);
@@ -129,17 +125,15 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
   // the residual passes gradient where the outer ReLU is open, the view colour where both are
   for (int64_t block = 0; block < fragments; block += learn ? kBlock : fragments) {
     const int64_t size = learn ? std::min(kBlock, fragments - block) : fragments;
-    if (learn) scatter.resize(size, field->levels);
-    std::vector<int64_t> filled(threads, 0), from(threads, 0);
+    if (learn) scatter.resize(size, threads);
     parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
       std::vector<S>& own = partial[part];
       Encoder<S> enc;
       MlpState<S, Pack<S>> state;
-      Vec3<S> at[kBatch], gradient[kBatch];
+      Vec3<S> gradient[kBatch];
       int64_t who[kBatch];
       int count = 0;
-      int64_t slot = begin;
-      from[part] = begin;
+      int64_t slot = scatter.slot(part, begin);
       S lanes[kWidth];
       for (int64_t k = begin; k < end; ++k) {
         const int64_t i = block + k, id = f.surfel[i];
@@ -150,20 +144,19 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
           own[id * columns + c] += b[c] > S(-0.5) ? g[c] : S(0);
         }
         if (learn && f.weight[i] >= bound) {
-          at[count] = world_point(frames + id * kFrame, f.uv[i], f.uv[fragments + i]);
+          enc.set(count, world_point(frames + id * kFrame, f.uv[i], f.uv[fragments + i]));
           gradient[count] = load3(g);
           who[count++] = i;
         }
         if (count == kBatch || (count && k + 1 == end)) {
-          enc.find(*field, count, at);
-          enc.gather(*field, count);
+          enc.encode(*field, count);
+          auto& batch = scatter.open(slot++, enc, field->levels, count);
           for (int p = 0; p < count; ++p) {
             mlp(m, enc.features[p], state);
-            const Pack<S> d = mlp_vjp(m, enc.features[p], state, gradient[p], sums[part]);
-            scatter.put(slot++, field->levels, enc.at[p], d);
+            batch.dfeatures[p] = mlp_vjp(m, enc.features[p], state, gradient[p], sums[part]);
             if (!geometry) continue;
-            store(lanes, d);
-            const Vec3<S> dx = enc.position_gradient(*field, p, at[p], lanes);
+            store(lanes, batch.dfeatures[p]);
+            const Vec3<S> dx = enc.position_gradient(*field, p, lanes);
             const int64_t j = who[p], s = f.surfel[j];
             const S u = f.uv[j], v = f.uv[fragments + j];
             duv[j] = dot(dx, load3(frames + s * kFrame + 3));
@@ -176,12 +169,8 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
           count = 0;
         }
       }
-      filled[part] = slot - begin;
     });
-    if (learn) {
-      scatter.compact(threads, from.data(), filled.data(), field->levels);
-      scatter.add(*field, dfield->table);
-    }
+    if (learn) scatter.add(*field, dfield->table);
   }
   if (learn) add_mlp_gradient(sums, threads, field->levels * kFeatures, *dfield);
   parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {

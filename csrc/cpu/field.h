@@ -33,112 +33,105 @@ void clear(Mlp<S, Pack<S>>& m) {
   std::fill(std::begin(m.w3), std::end(m.w3), Pack<S>(S(0)));
 }
 
-// Encodes a batch of up to kBatch points; the indices and weights stay for the backward pass.
+// Encodes a batch of kBatch points; the indices and weights stay for the backward pass. Points beyond the count repeat
+// whatever lies in x and are not looked up.
 template <class S>
 struct Encoder {
-  Corners<S> at[kBatch][kMaxLevels];
+  using P = Pack<S>;
+  Corners<P> at[kMaxLevels];
   alignas(64) S features[kBatch][kMaxLevels * kFeatures];
+  alignas(64) S x[3][kBatch] = {};
 
-  void find(const FieldArrays<S>& f, int count, const Vec3<S>* x) {
-    const Vec3<S> mid = load3(f.mid);
+  void set(int p, Vec3<S> a) { x[0][p] = a.x, x[1][p] = a.y, x[2][p] = a.z; }
+  Vec3<S> point(int p) const { return {x[0][p], x[1][p], x[2][p]}; }
+  static const S* level(const FieldArrays<S>& f, int l) { return f.table + (int64_t(l) << f.log2_size) * kFeatures; }
+
+  void encode(const FieldArrays<S>& f, int count) {
     const uint32_t mask = (1u << f.log2_size) - 1u;
-    for (int p = 0; p < count; ++p) {
-      const Vec3<S> c = grid_coordinate(x[p], mid, f.half, f.contract);
-      for (int l = 0; l < f.levels; ++l) {
-        at[p][l] = corners(c, S(f.min_resolution << l), mask);
-        const S* table = f.table + (int64_t(l) << f.log2_size) * kFeatures;
-        for (int k = 0; k < 8; ++k) __builtin_prefetch(table + int64_t(at[p][l].index[k]) * kFeatures);
-      }
-    }
-  }
-  void gather(const FieldArrays<S>& f, int count) {
-    for (int p = 0; p < count; ++p)
-      for (int l = 0; l < f.levels; ++l) {
-        const S* table = f.table + (int64_t(l) << f.log2_size) * kFeatures;
+    const Vec3<P> c = grid_coordinate(Vec3<P>{load(x[0]), load(x[1]), load(x[2])}, load3(f.mid), f.half, f.contract);
+    for (int l = 0; l < f.levels; ++l) corners(c, P(S(f.min_resolution << l)), mask, at[l]);
+    // all lines are on their way before the first is needed
+    for (int l = 0; l < f.levels; ++l)
+      for (int k = 0; k < 8; ++k)
+        for (int p = 0; p < count; ++p) __builtin_prefetch(level(f, l) + int64_t(at[l].index[k][p]) * kFeatures);
+    for (int l = 0; l < f.levels; ++l) {
+      const S* table = level(f, l);
+      for (int p = 0; p < count; ++p) {
         Quad<S> sum = {};
         for (int k = 0; k < 8; ++k) {
           Quad<S> entry;
-          std::memcpy(&entry, table + int64_t(at[p][l].index[k]) * kFeatures, sizeof entry);
-          sum += at[p][l].weight[k] * entry;
+          std::memcpy(&entry, table + int64_t(at[l].index[k][p]) * kFeatures, sizeof entry);
+          sum += at[l].weight[k].v[p] * entry;
         }
         std::memcpy(features[p] + l * kFeatures, &sum, sizeof sum);
       }
+    }
   }
   // d loss / d x of point p from that of its features
-  Vec3<S> position_gradient(const FieldArrays<S>& f, int p, Vec3<S> x, const S* dfeatures) const {
+  Vec3<S> position_gradient(const FieldArrays<S>& f, int p, const S* dfeatures) const {
     Vec3<S> dc = {S(0), S(0), S(0)};
     for (int l = 0; l < f.levels; ++l) {
-      const S* table = f.table + (int64_t(l) << f.log2_size) * kFeatures;
-      const Corners<S>& c = at[p][l];
+      const Corners<P>& c = at[l];
       S d[8];
       for (int k = 0; k < 8; ++k) {
-        const S* entry = table + int64_t(c.index[k]) * kFeatures;
+        const S* entry = level(f, l) + int64_t(c.index[k][p]) * kFeatures;
         d[k] = S(0);
         for (int j = 0; j < kFeatures; ++j) d[k] += dfeatures[l * kFeatures + j] * entry[j];
       }
-      const S gx = S(1) - c.fx, gy = S(1) - c.fy, gz = S(1) - c.fz, r = S(f.min_resolution << l);
-      dc.x += r * (gy * gz * (d[1] - d[0]) + c.fy * gz * (d[3] - d[2]) + gy * c.fz * (d[5] - d[4]) +
-                   c.fy * c.fz * (d[7] - d[6]));
-      dc.y += r * (gx * gz * (d[2] - d[0]) + c.fx * gz * (d[3] - d[1]) + gx * c.fz * (d[6] - d[4]) +
-                   c.fx * c.fz * (d[7] - d[5]));
-      dc.z += r * (gx * gy * (d[4] - d[0]) + c.fx * gy * (d[5] - d[1]) + gx * c.fy * (d[6] - d[2]) +
-                   c.fx * c.fy * (d[7] - d[3]));
+      const S fx = c.fx[p], fy = c.fy[p], fz = c.fz[p], gx = S(1) - fx, gy = S(1) - fy, gz = S(1) - fz;
+      const S r = S(f.min_resolution << l);
+      dc.x +=
+          r * (gy * gz * (d[1] - d[0]) + fy * gz * (d[3] - d[2]) + gy * fz * (d[5] - d[4]) + fy * fz * (d[7] - d[6]));
+      dc.y +=
+          r * (gx * gz * (d[2] - d[0]) + fx * gz * (d[3] - d[1]) + gx * fz * (d[6] - d[4]) + fx * fz * (d[7] - d[5]));
+      dc.z +=
+          r * (gx * gy * (d[4] - d[0]) + fx * gy * (d[5] - d[1]) + gx * fy * (d[6] - d[2]) + fx * fy * (d[7] - d[3]));
     }
-    return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
+    return grid_coordinate_vjp(point(p), load3(f.mid), f.half, f.contract, dc);
   }
 };
 
-// Collects what points give to the table and adds it, level by level: no two threads write one level, and every entry
-// sums its points in their order.
+// Collects what batches of points give to the table and adds it, level by level: no two threads write one level, and
+// every entry sums its points in their order.
 template <class S>
 struct TableScatter {
-  int64_t count = 0;
-  std::vector<uint32_t> index;  // [count, levels, 8]
-  std::vector<S> weight;        // likewise
-  std::vector<S> dfeatures;     // [count, 16]
-  void resize(int64_t n, int levels) {
-    count = n;
-    index.resize(n * levels * 8), weight.resize(n * levels * 8), dfeatures.resize(n * kMaxLevels * kFeatures);
+  struct Batch {
+    int count = 0;
+    typename IndexOf<Pack<S>>::type index[kMaxLevels][8];
+    Pack<S> weight[kMaxLevels][8];
+    Pack<S> dfeatures[kBatch];
+  };
+  std::vector<Batch> batches;
+  // room for n points in `parts` parts; part p, which begins at point b, uses batches from slot(p, b) on
+  void resize(int64_t n, int parts) {
+    batches.resize(n / kBatch + 2 * parts + 1);
+    for (Batch& b : batches) b.count = 0;
   }
-  void put(int64_t i, int levels, const Corners<S>* at, Pack<S> d) {
-    for (int l = 0; l < levels; ++l) {
-      std::memcpy(&index[(i * levels + l) * 8], at[l].index, sizeof at[l].index);
-      std::memcpy(&weight[(i * levels + l) * 8], at[l].weight, sizeof at[l].weight);
-    }
-    store(&dfeatures[i * kMaxLevels * kFeatures], d);
-  }
-  // Closes the gaps between the parts, part p having filled `filled[p]` slots from `from[p]` on.
-  void compact(int parts, const int64_t* from, const int64_t* filled, int levels) {
-    int64_t to = 0;
-    for (int p = 0; p < parts; ++p) {
-      if (to != from[p] && filled[p]) {
-        std::memmove(&index[to * levels * 8], &index[from[p] * levels * 8], filled[p] * levels * 8 * 4);
-        std::memmove(&weight[to * levels * 8], &weight[from[p] * levels * 8], filled[p] * levels * 8 * sizeof(S));
-        std::memmove(&dfeatures[to * kMaxLevels * kFeatures], &dfeatures[from[p] * kMaxLevels * kFeatures],
-                     filled[p] * kMaxLevels * kFeatures * sizeof(S));
-      }
-      to += filled[p];
-    }
-    count = to;
+  static int64_t slot(int part, int64_t begin) { return begin / kBatch + 2 * part; }
+  Batch& open(int64_t at, const Encoder<S>& e, int levels, int count) {
+    Batch& b = batches[at];
+    b.count = count;
+    for (int l = 0; l < levels; ++l)
+      for (int k = 0; k < 8; ++k) b.index[l][k] = e.at[l].index[k], b.weight[l][k] = e.at[l].weight[k];
+    return b;
   }
   void add(const FieldArrays<S>& f, S* dtable) const {
-    const int levels = f.levels;
-#pragma omp parallel for num_threads(std::min(num_threads(), levels)) schedule(static, 1)
-    for (int l = 0; l < levels; ++l) {
+#pragma omp parallel for num_threads(std::min(num_threads(), f.levels)) schedule(static, 1)
+    for (int l = 0; l < f.levels; ++l) {
       S* table = dtable + (int64_t(l) << f.log2_size) * kFeatures;
-      for (int64_t i = 0; i < count; ++i) {
-        Quad<S> d;
-        std::memcpy(&d, &dfeatures[(i * kMaxLevels + l) * kFeatures], sizeof d);
-        const uint32_t* at = &index[(i * levels + l) * 8];
-        const S* w = &weight[(i * levels + l) * 8];
-        if (i + 4 < count)
-          for (int k = 0; k < 8; ++k) __builtin_prefetch(table + int64_t(at[4 * levels * 8 + k]) * kFeatures, 1);
-        for (int k = 0; k < 8; ++k) {
-          S* entry = table + int64_t(at[k]) * kFeatures;
-          Quad<S> e;
-          std::memcpy(&e, entry, sizeof e);
-          e += w[k] * d;
-          std::memcpy(entry, &e, sizeof e);
+      for (const Batch& b : batches) {
+        for (int k = 0; k < 8; ++k)
+          for (int p = 0; p < b.count; ++p) __builtin_prefetch(table + int64_t(b.index[l][k][p]) * kFeatures, 1);
+        for (int p = 0; p < b.count; ++p) {
+          Quad<S> d;
+          std::memcpy(&d, reinterpret_cast<const S*>(&b.dfeatures[p]) + l * kFeatures, sizeof d);
+          for (int k = 0; k < 8; ++k) {
+            S* entry = table + int64_t(b.index[l][k][p]) * kFeatures;
+            Quad<S> e;
+            std::memcpy(&e, entry, sizeof e);
+            e += b.weight[l][k].v[p] * d;
+            std::memcpy(entry, &e, sizeof e);
+          }
         }
       }
     }

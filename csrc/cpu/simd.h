@@ -2,8 +2,10 @@
 #pragma once
 
 #include <cstring>
+#include <type_traits>
 
 #include "core/common.h"
+#include "core/field.h"
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 #include <immintrin.h>
@@ -12,6 +14,9 @@
 namespace bt {
 
 constexpr int kLanes = 16;
+
+template <class S>
+struct Pack;
 
 // Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
 template <class S>
@@ -31,6 +36,15 @@ struct LaneTypes<double> {
 template <class S>
 using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry, or rgba
 
+template <>
+struct IndexOf<Pack<float>> {
+  typedef uint32_t type __attribute__((vector_size(64)));
+};
+template <>
+struct IndexOf<Pack<double>> {
+  typedef uint64_t type __attribute__((vector_size(128)));
+};
+
 template <class S>
 struct Pack {
   using V = typename LaneTypes<S>::V;
@@ -39,6 +53,8 @@ struct Pack {
   Pack() = default;
   BT_HD Pack(V value) : v(value) {}
   BT_HD explicit Pack(S value) : v(value - V{}) {}
+  template <class F, class = std::enable_if_t<std::is_floating_point_v<F> && !std::is_same_v<F, S>>>
+  BT_HD explicit Pack(F value) : Pack(S(value)) {}
   BT_HD S operator[](int i) const { return v[i]; }
 };
 
@@ -198,12 +214,37 @@ BT_HD void store(S* p, Pack<S> a) {
   std::memcpy(p, &a.v, sizeof a.v);
 }
 template <class S>
-BT_HD S sum(Pack<S> a) {
-  S lanes[kLanes];
+BT_HD Pack<S> sqrt_(Pack<S> a) {
+  Pack<S> r;
+  for (int i = 0; i < kLanes; ++i) r.v[i] = bt::sqrt_(a.v[i]);
+  return r;
+}
+template <class S>
+BT_HD Pack<S> floor_(Pack<S> a) {
+  // truncation, then one less where that went up; exact below 2^31
+  const typename Pack<S>::V t =
+      __builtin_convertvector(__builtin_convertvector(a.v, typename Pack<S>::M), typename Pack<S>::V);
+  return t - (t > a.v ? Pack<S>(S(1)).v : typename Pack<S>::V{});
+}
+template <class S>
+BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
+  return (typename IndexOf<Pack<S>>::type) __builtin_convertvector(a.v, typename Pack<S>::M);
+}
+BT_HD float sum(Pack<float> a) {
+#if defined(__AVX512F__)
+  return _mm512_reduce_add_ps((__m512)a.v);
+#else
+  float lanes[kLanes];
   store(lanes, a);
   for (int half = kLanes / 2; half > 0; half /= 2)
     for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
   return lanes[0];
+#endif
+}
+BT_HD double sum(Pack<double> a) {
+  double total = 0;
+  for (int i = 0; i < kLanes; ++i) total += a.v[i];
+  return total;
 }
 
 }  // namespace bt

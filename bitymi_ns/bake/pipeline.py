@@ -27,7 +27,11 @@ OPACITY_FLOOR = 1.0 / 255.0  # below it a surfel is skipped at every pixel
 
 
 class Field(Protocol):
-    """The part of the residual field that the bake uses."""
+    """The part of the residual field that the bake uses.
+
+    A field that also has `geometry.mid`, the centre of its contraction, gets tiles that follow the direction in which
+    its voxels are stretched; without it the smaller voxel edge holds for both axes.
+    """
 
     def __call__(self, x: Tensor) -> Tensor:
         """[M, 3] world positions to [M, 3] residual colours."""
@@ -170,9 +174,8 @@ def bake(
         mean_residual = torch.zeros(len(kept), 3)
     else:
         means = surfels["means"]
-        center = getattr(scene.field, "center", None)
         voxel = torch.cat([scene.field.voxel_size(part) for part in means.split(options.chunk)])
-        delta = voxel_along_axes(voxel, axes, means, center if isinstance(center, Tensor) else None)
+        delta = voxel_along_axes(voxel, axes, means, _center(scene.field))
         bounds = (options.extent, options.r_min, options.r_max)
         uncapped = nyquist_resolution(scales, delta, *bounds)
         capped = nyquist_resolution(scales, delta, *bounds, pixels) if options.cap_by_views else uncapped
@@ -221,6 +224,12 @@ def export(
         extra_files=extra_files,
         overwrite=overwrite,
     )
+
+
+def _center(field: Field) -> Tensor | None:
+    """[3] centre of the field's contraction, world frame, if it tells."""
+    geometry = getattr(field, "geometry", None)
+    return None if geometry is None else torch.tensor(geometry.mid, dtype=torch.float32)
 
 
 def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:

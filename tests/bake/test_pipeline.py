@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -111,7 +113,7 @@ def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
     made = scene(200)
     made.field.voxel_size = lambda x: torch.tensor([0.4, 0.05]).expand(len(x), 2)
     isotropic = bake(made).statistics["texels"]["nyquist"]
-    made.field.center = torch.zeros(3)
+    made.field.geometry = SimpleNamespace(mid=(0.0, 0.0, 0.0))
     assert bake(made).statistics["texels"]["nyquist"] < isotropic
 
 

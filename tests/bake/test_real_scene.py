@@ -1,0 +1,61 @@
+"""The bake of the project's own scene and hash field."""
+
+import pytest
+import torch
+
+pytest.importorskip("bitymi_ns._cpu")
+
+from bitymi_ns.bake import BakeOptions, bake, export, read_bundle
+from bitymi_ns.bake.geometry import tangent_vectors
+from bitymi_ns.bake.surfel_table import VIEW_COLORS
+from bitymi_ns.ops import VIEW_COLORS as PARAMETERS
+from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.scene import Scene
+
+
+def real_scene(surfels, count=80, kind="sv", min_resolution=8):
+    """A scene whose field varies over whole voxels that the tiles resolve."""
+    generator = torch.Generator().manual_seed(0)
+    config = SceneConfig(view_color=kind, min_resolution=min_resolution, log2_table_size=14)
+    field = HashField(config, (0.1, 0.2, -0.1), 1.0, True, 14, generator)
+    with torch.no_grad():
+        field.field_table.normal_(0.0, 0.5, generator=generator)
+        field.field_w3.normal_(0.0, 0.2, generator=generator)
+    return Scene(config, surfels(count, kind), field)
+
+
+@pytest.mark.parametrize("kind", list(VIEW_COLORS))
+def test_every_view_colour_reaches_the_bundle(surfels, camera, tmp_path, kind):
+    scene = real_scene(surfels, kind=kind)
+    export(bake(scene, [camera()]), tmp_path / "b")
+    bundle = read_bundle(tmp_path / "b")
+    assert set(bundle.surfels) == set(scene.surfels) and set(VIEW_COLORS[kind]) == set(PARAMETERS[kind])
+    Scene(scene.config, bundle.surfels, None)  # the parameters fit a scene again
+
+
+def test_tiles_at_the_nyquist_rate_hold_the_field(surfels, tmp_path):
+    scene = real_scene(surfels)
+    baked = bake(scene, options=BakeOptions(format="fp16"))
+    export(baked, tmp_path / "b")
+    bundle = read_bundle(tmp_path / "b")
+    scales = bundle.surfels["log_scales"].exp()
+    axes = tangent_vectors(bundle.surfels["quats"]) * scales[:, None]
+    errors, values = [], []
+    for i, (x, y, layer, r_u, r_v) in enumerate(bundle.tiles.tolist()):
+        uv = torch.rand(100, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2
+        with torch.no_grad():
+            expected = scene.field(bundle.surfels["means"][i] + uv @ axes[i].T)
+        tile = bundle.residuals()[layer, y : y + r_v, x : x + r_u]
+        errors.append((texel(tile, uv) - expected).square().mean())
+        values.append(expected.square().mean())
+    assert torch.stack(errors).mean() < 0.02 * torch.stack(values).mean()
+
+
+def test_tiles_shrink_in_the_contracted_background(surfels):
+    near, far = real_scene(surfels), real_scene(surfels)
+    with torch.no_grad():
+        near.surfels["means"].mul_(0.2)
+        far.surfels["means"].copy_(torch.nn.functional.normalize(far.surfels["means"], dim=1) * 20.0)
+    assert bake(far).packing.tiles[:, 3:].prod(1).sum() < 0.3 * bake(near).packing.tiles[:, 3:].prod(1).sum()

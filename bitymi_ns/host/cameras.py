@@ -41,16 +41,26 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     return camera if device is None else camera.to(device)
 
 
-def distance_along_ray(depth: Tensor, camera: Camera) -> Tensor:
-    """Depth along the viewing axis as distance along each pixel's ray, which is what nerfstudio's tools expect.
+def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    """Expected distance along each pixel's ray, which is what nerfstudio's tools take for depth.
 
     Args:
-        depth: [H, W, 1] camera z.
+        depth: [H, W, 1] sum of w z, camera z.
+        alpha: [H, W, 1] sum of w.
 
     Returns:
-        [H, W, 1].
+        [H, W, 1]; where nothing is seen the largest distance in the picture.
     """
     height, width = depth.shape[:2]
     x = (torch.arange(width, device=depth.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (torch.arange(height, device=depth.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
-    return depth * torch.sqrt(1.0 + x[None, :, None] ** 2 + y[:, None, None] ** 2)
+    distance = depth / alpha.clamp(min=1e-6) * torch.sqrt(1.0 + x[None, :, None] ** 2 + y[:, None, None] ** 2)
+    seen = alpha > 1e-3
+    return torch.where(seen, distance, torch.where(seen, distance, 0.0).max())
+
+
+def normal_image(normal: Tensor, camera: Camera) -> Tensor:
+    """Blended normals of the camera frame, [H, W, 3], as colours of the unit world normal, (n + 1) / 2; 0 for none."""
+    length = normal.norm(dim=-1, keepdim=True)
+    world = (normal / length.clamp(min=1e-6)) @ camera.viewmat[:3, :3]  # R^T n for each row
+    return torch.where(length > 1e-3, 0.5 * (world + 1.0), 0.0)

@@ -1,11 +1,22 @@
-"""The scene as a nerfstudio model."""
+"""The scene in training as a nerfstudio model."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
-from nerfstudio.models.base_model import Model, ModelConfig
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.base_model import ModelConfig
+from torch import Tensor
+from torch.nn import Parameter
 
+from bitymi_ns.host.errors import fail
+from bitymi_ns.host.surfel_model import SurfelModel
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 
@@ -28,6 +39,11 @@ SURFEL_PARAMETERS = (
 PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
 """Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
 
+EXTRA = "_extra_state"
+STATE_VERSION = 1
+RENDER_ONLY = ("near", "weight_bound")
+"""Scene options that may differ from those that a checkpoint was trained with."""
+
 
 @dataclass
 class BitymiModelConfig(ModelConfig):
@@ -45,5 +61,127 @@ class BitymiModelConfig(ModelConfig):
     """Held-out views rendered for a point of that curve, all for the last one; 0 = all."""
 
 
-class BitymiModel(Model):
-    pass
+def train_config_for(config: TrainConfig, alpha_color: Tensor | None) -> TrainConfig:
+    """The training options with the background that the capture states for its transparent images, if any."""
+    if alpha_color is None or config.background == "random":
+        return config
+    for name, value in (("black", 0.0), ("white", 1.0)):
+        if bool((alpha_color == value).all()):
+            return dataclasses.replace(config, background=name)  # type: ignore[arg-type]
+    fail(f"the capture's alpha colour {alpha_color.tolist()} cannot be trained on; choose black or white")
+
+
+class BitymiModel(SurfelModel):
+    """Textured Beta surfels.
+
+    The checkpoint holds, beside the parameters, everything that a resumed run needs to go on as if it had not been
+    interrupted: the state of the strategy, of the random generators and of the clocks.
+    """
+
+    config: BitymiModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        from bitymi_ns.host.scene_setup import new_scene
+
+        self.metadata: dict[str, Any] = self.kwargs.get("metadata") or {}
+        self.train_config = train_config_for(self.config.train, self.metadata.get("alpha_color"))
+        points = self.kwargs.pop("seed_points", None)
+        self.scene = new_scene(points, self.scene_box, self.config.scene, self.train_config, self.metadata)
+        self.trained_for: int | None = None
+        self.resume_state: dict[str, Any] = {}
+        self._run: list[Any] = []  # in a list: not a module of this one
+
+    # rendering
+
+    @property
+    def background(self) -> Tensor:
+        """[3]: the capture's own colour behind its alpha where it states one, else the preset's."""
+        color = self.metadata.get("alpha_color")
+        if color is None:
+            color = torch.ones(3) if self.config.train.background == "white" else torch.zeros(3)
+        return color.to(self.device)
+
+    def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
+        with torch.no_grad():
+            return self.scene.render(camera, background=background, field_mode="frozen", maps=maps)
+
+    def surfel_count(self) -> int:
+        return len(self.scene)
+
+    def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
+        if self.training and self._run:
+            return self._run[0].render(ray_bundle)
+        return super().get_outputs(ray_bundle)
+
+    # training
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        groups = {name: [parameter] for name, parameter in self.scene.surfels.items()}
+        if self.scene.field is not None:
+            named = dict(self.scene.field.named_parameters())
+            groups["field_table"] = [p for n, p in named.items() if n.endswith("table")]
+            groups["field_mlp"] = [p for n, p in named.items() if not n.endswith("table")]
+        return groups
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        from bitymi_ns.host.training import TrainingRun
+
+        self.measure_time = False
+        self._run = [TrainingRun(self, training_callback_attributes)]
+        return self._run[0].callbacks()
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
+        if not self._run:
+            raise RuntimeError("losses exist in training only")
+        return self._run[0].losses(outputs, batch)
+
+    # checkpoints
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Tensors, numbers and text only, so that torch loads it in its safe mode."""
+        state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
+        if self._run:
+            state["trained_for"] = self._run[0].total
+            state["run"] = self._run[0].state()
+        elif self.trained_for is not None:
+            state["trained_for"] = self.trained_for
+        return state
+
+    def set_extra_state(self, state: Any) -> None:
+        self.trained_for = state.get("trained_for")
+        self.resume_state = state.get("run", {})
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Load a checkpoint: check that it belongs to this preset, then take over its number of surfels."""
+        self._check_preset(state_dict)
+        self.scene.resize(len(state_dict["scene.surfels.means"]))
+        for name, parameter in self.named_parameters():
+            saved = state_dict.get(name)
+            if saved is not None and saved.shape != parameter.shape:
+                # the same Parameter object: nerfstudio's optimisers hold it already
+                parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
+        return super().load_state_dict(state_dict, strict=True)
+
+    def _check_preset(self, state_dict: Mapping[str, Any]) -> None:
+        extra = state_dict.get(EXTRA)
+        if not isinstance(extra, dict) or "scene.surfels.means" not in state_dict:
+            fail("the checkpoint is not one of this method: it holds no surfels. Load it with the method it is from.")
+        if extra.get("version", 0) > STATE_VERSION:
+            fail("the checkpoint is from a newer bitymi-ns; update it to load this checkpoint")
+        saved = json.loads(extra["scene"])
+        mine = dataclasses.asdict(self.config.scene)
+        different = [k for k in saved if k in mine and k not in RENDER_ONLY and saved[k] != mine[k]]
+        if different:
+            listed = "\n".join(
+                f"  --pipeline.model.scene.{k.replace('_', '-')}: {saved[k]} there, {mine[k]} here" for k in different
+            )
+            fail(
+                "the checkpoint was trained with another preset:\n"
+                f"{listed}\n"
+                "Use the method that it was trained with (see the config.yml beside its nerfstudio_models folder)."
+            )

@@ -1,0 +1,97 @@
+"""The scene that training starts from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from bitymi_ns.host.errors import fail
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.init import scene_extent, surfels_from_points
+
+
+def new_scene(
+    points: tuple[Tensor, Tensor] | None,
+    scene_box: SceneBox | None,
+    config: SceneConfig,
+    train: TrainConfig,
+    metadata: dict[str, Any],
+) -> Scene:
+    """Surfels at the capture's points, or at random in its box, and an empty texture field around them.
+
+    Args:
+        points: positions [N, 3] and colours [N, 3] (uint8, or empty when the cloud has none).
+        scene_box: where random points are placed.
+        config: the representation.
+        train: training options.
+        metadata: what the data manager says about the capture.
+    """
+    centers = metadata.get("camera_centers", torch.zeros(0, 3))
+    xyz, rgb = _points(points)
+    box = None
+    if not bool(torch.isfinite(xyz).all(1).any()):
+        box = _box(scene_box, len(xyz))
+    try:
+        surfels, report = surfels_from_points(xyz, rgb, centers, train, config, box)
+    except ValueError as error:
+        fail(str(error), error)
+    if report.random:
+        CONSOLE.print(f"The capture has no points: training starts from {report.random:,} random ones.")
+    if report.not_finite:
+        row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
+        CONSOLE.print(
+            f"[bold yellow]{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
+            f"first is point {row}); they are left out."
+        )
+    if config.texture == "none":
+        return Scene(config, surfels, None)
+    contract = config.contraction == "on" or (config.contraction == "auto" and not metadata.get("has_alpha", False))
+    mid, half = _domain(surfels["means"], centers, contract)
+    generator = torch.Generator().manual_seed(train.seed)
+    log2_size = config.log2_table_size if config.log2_table_size is not None else 17
+    return Scene(config, surfels, HashField(config, mid, half, contract, log2_size, generator))
+
+
+def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+    if points is None:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    xyz, rgb = points
+    xyz = xyz.detach().float().reshape(-1, 3)
+    if rgb.shape[:1] != xyz.shape[:1]:
+        return xyz, torch.full_like(xyz, 0.5)  # a cloud without colours
+    return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
+
+
+def _box(scene_box: SceneBox | None, given: int) -> Tensor | None:
+    """[2, 3] corners for random points."""
+    if given:
+        fail(
+            f"all {given} points of the capture's point cloud are NaN or infinite. Make the cloud again, or remove "
+            "ply_file_path from transforms.json to start from random points."
+        )
+    if scene_box is None:
+        return None
+    low, high = scene_box.aabb.float().cpu()
+    if not bool(torch.isfinite(scene_box.aabb).all()) or not bool((high > low).all()):
+        fail(
+            f"the capture has no points, and its scene box from {low.tolist()} to {high.tolist()} is empty. Give a "
+            "point cloud (ply_file_path in transforms.json), or a positive --scene-scale after `nerfstudio-data`."
+        )
+    return torch.stack([low, high])
+
+
+def _domain(means: Tensor, centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
+    """Middle and half size of the field's domain: the ball of the cameras, or a box around the surfels."""
+    if contract and len(centers):
+        mid = centers.mean(0)
+        return tuple(mid.tolist()), scene_extent(centers, means)  # type: ignore[return-value]
+    low, high = means.amin(0), means.amax(0)
+    mid, half = (low + high) / 2, 0.55 * float((high - low).max())
+    return tuple(mid.tolist()), max(half, 1e-3)  # type: ignore[return-value]

@@ -1,0 +1,111 @@
+"""What a trained and a baked scene have in common as nerfstudio models: outputs, metrics and images."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.base_model import Model
+from torch import Tensor
+from torch.nn import Parameter
+
+from bitymi_ns.host.cameras import normal_image, ray_distance, to_camera
+from bitymi_ns.host.device import kernel_device
+from bitymi_ns.host.metrics import image_metrics, render_milliseconds
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import as_float, over_background, reduce_image, reduce_mask
+
+
+class SurfelModel(Model):
+    """Renders whole images from surfels."""
+
+    measure_time = True
+    """Whether image metrics include the time of rendering; off while training."""
+
+    @abstractmethod
+    def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
+        """A RenderOutput: rgb, alpha, beta, overdraw, and with maps also depth and normal."""
+
+    @abstractmethod
+    def surfel_count(self) -> int:
+        """Number of primitives."""
+
+    @property
+    @abstractmethod
+    def background(self) -> Tensor:
+        """[3] colour behind the scene in evaluation."""
+
+    def size_metrics(self) -> dict[str, float]:
+        """Sizes that are reported with the image metrics."""
+        return {"surfels": float(self.surfel_count())}
+
+    def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
+        """Moves the model, except to a device that this installation has no kernels for: there it stays on the CPU.
+
+        nerfstudio's tools use a GPU whenever they see one.
+        """
+        device, dtype, _, _ = torch._C._nn._parse_to(*args, **kwargs)
+        if dtype is not None:
+            raise ValueError("the scene is float32")
+        return self if device is None else super().to(kernel_device(device))
+
+    def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
+        """Outputs that the viewer and ns-render offer, each [H, W, C] float32:
+
+        rgb, accumulation; depth = expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0
+        where nothing is seen), beta = blended kernel exponent (0 to 4), overdraw = surfels blended at the pixel.
+        """
+        if not isinstance(ray_bundle, Cameras):
+            raise TypeError("this model renders cameras, not bundles of rays")
+        camera = to_camera(ray_bundle, self.device)
+        output = self.render(camera, self.background, maps=True)
+        outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
+        if output.depth is not None:
+            outputs["depth"] = ray_distance(output.depth, output.alpha, camera)
+        if output.normal is not None:
+            outputs["normal"] = normal_image(output.normal, camera)
+        if getattr(output, "beta", None) is not None:
+            outputs["beta"] = output.beta
+        outputs["overdraw"] = output.overdraw.float()
+        return outputs
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Render a camera; the viewer's crop box is not supported and ignored."""
+        self._last_camera = to_camera(camera, self.device)
+        outputs = self.get_outputs(camera)
+        return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Quality of a held-out view, what it cost to draw, and photograph and render side by side."""
+        rgb = outputs["rgb"]
+        height, width = rgb.shape[:2]
+        target = reduce_image(as_float(batch["image"].to(rgb.device)), width, height)
+        target = over_background(target, self.background)
+        mask = batch.get("mask")
+        mask = None if mask is None else reduce_mask(mask.to(rgb.device), width, height)
+        metrics = image_metrics(rgb, target, mask)
+        metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean())
+        metrics.update(self.size_metrics())
+        camera = getattr(self, "_last_camera", None)
+        if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
+            metrics["render_ms"] = render_milliseconds(
+                lambda: self.render(camera, self.background, maps=False), self.device
+            )
+        return metrics, {"img": torch.cat([target, rgb], dim=1)}
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        return {"surfels": torch.tensor(float(self.surfel_count()))}
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
+        raise NotImplementedError("this scene is not trained any further")
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        return {}

@@ -1,6 +1,6 @@
 """Trained field to texture atlas: resolution, packing, evaluation, quantisation and the files of a bundle."""
 
-from bitymi_ns.bake.bundle import Bundle, BundleError, read_bundle, verify_bundle, write_bundle
+from bitymi_ns.bake.bundle import Bundle, BundleError, World, check_target, read_bundle, verify_bundle, write_bundle
 from bitymi_ns.bake.pipeline import Baked, BakeOptions, bake, export
 from bitymi_ns.bake.progress import Progress, rich_progress
 
@@ -10,7 +10,9 @@ __all__ = [
     "Bundle",
     "BundleError",
     "Progress",
+    "World",
     "bake",
+    "check_target",
     "export",
     "read_bundle",
     "rich_progress",

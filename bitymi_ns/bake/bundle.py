@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bitymi_ns import __version__
 from bitymi_ns.bake import ktx2, ply
-from bitymi_ns.bake.folder import FolderError, check_target, complete_folder
+from bitymi_ns.bake.folder import check_target, complete_folder
 from bitymi_ns.bake.manifest import (
     ATLAS,
     FORMAT,
@@ -139,8 +139,6 @@ def write_bundle(
                 (new / name).write_bytes(data)
             info["files"] = {path.name: _fingerprint(path) for path in sorted(new.iterdir())}
             (new / MANIFEST).write_bytes(dump(info))
-    except FolderError as error:
-        raise BundleError(str(error)) from error
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)

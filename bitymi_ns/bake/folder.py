@@ -9,30 +9,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MARKER = "bundle.json"
-
-
-class FolderError(ValueError):
-    """The target may not be written; the message says why."""
+from bitymi_ns.bake.manifest import MANIFEST, BundleError
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
     """Checks that a bundle may be written to `folder`, before the work of making one.
 
     Raises:
-        FolderError: it exists and `overwrite` is off, or it is something other than a bundle.
+        BundleError: it exists and `overwrite` is off, or it is something other than a bundle.
     """
     folder = Path(folder)
     if not os.path.lexists(folder):
         return
     if not folder.is_dir():
-        raise FolderError(f"{folder} exists and is not a folder")
+        raise BundleError(f"{folder} exists and is not a folder")
     if not any(folder.iterdir()):
         return
     if not overwrite:
-        raise FolderError(f"{folder} exists; choose another folder, or overwrite it (overwrite=True)")
-    if not (folder / MARKER).is_file():
-        raise FolderError(f"{folder} is not a bundle (it has no {MARKER}); it is not overwritten")
+        raise BundleError(f"{folder} exists; choose another folder, or overwrite it (overwrite=True)")
+    if not (folder / MANIFEST).is_file():
+        raise BundleError(f"{folder} is not a bundle (it has no {MANIFEST}); it is not overwritten")
 
 
 @contextmanager

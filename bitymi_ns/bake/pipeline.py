@@ -65,7 +65,7 @@ class BakeOptions:
     cap_by_views: bool = True
     """Give no tile more texels than pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = False
-    """Leave out surfels that no training view sees; off: they get the smallest tile."""
+    """Leave out surfels that no training view sees (where views are given); off: they get the smallest tile."""
     range: RangeRule = "sigma6"
     """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
     range_samples: int = 1 << 18

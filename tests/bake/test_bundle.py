@@ -105,7 +105,7 @@ def test_an_existing_folder_is_refused_unless_it_is_a_bundle_to_overwrite(surfel
         make(surfels, home, overwrite=True)
     with pytest.raises(BundleError, match="not a folder"):
         make(surfels, home / "thesis.tex", overwrite=True)
-    with pytest.raises(ValueError, match="not a bundle"):
+    with pytest.raises(BundleError, match="not a bundle"):
         check_target(home, overwrite=True)
     assert (home / "thesis.tex").read_text() == "years of work"
 

@@ -1,4 +1,4 @@
-"""The training objective: photometric loss and falloff reduction."""
+"""The training objective, L = L_photo + lambda L_beta: photometric loss and falloff reduction."""
 
 from __future__ import annotations
 
@@ -9,12 +9,36 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput
 
 SSIM_WINDOW = 11
 """Side of the SSIM window in pixels; images narrower than this have no valid window."""
+
+
+def objective(
+    output: RenderOutput, target: Tensor, beta_raw: Tensor, config: LossConfig, mask: Tensor | None = None
+) -> dict[str, Tensor]:
+    """The terms of the objective, weighted: their sum is what training minimises.
+
+    Args:
+        output: the rendered view, [H, W].
+        target: [H, W, 3] the photograph at the same size, over the same background.
+        beta_raw: [N] the surfels' parameter.
+        config: weights and variants.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+
+    Returns:
+        `photometric`, and `falloff` unless its weight is 0.
+    """
+    terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
+    if config.falloff_weight > 0.0:
+        beta = beta_only_map(output, beta_raw) if config.falloff_gradient == "beta_only" else output.beta
+        loss = falloff(output.rgb, target, beta, config.falloff_gamma, config.falloff_error, mask)
+        terms["falloff"] = config.falloff_weight * loss
+    return terms
 
 
 def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None = None) -> Tensor:

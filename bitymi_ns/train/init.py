@@ -1,0 +1,223 @@
+"""The first surfels of a scene, from the sparse points of the capture."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.rotations import facing
+
+log = logging.getLogger(__name__)
+
+SH_C0 = 0.28209479177387814
+"""The constant real spherical harmonic."""
+BETA_RAW = 2.0
+"""Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
+MAX_SCALE = 0.25
+"""Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
+MIN_SCALE = 1e-6
+"""Smallest first scale, as a share of the scene extent."""
+SB_LOBE_MEAN = 0.1 * 0.1
+"""What one fresh Spherical Beta lobe adds on average over all directions: softplus(0) = 0.1 times the mean of
+max(0, cos)^4 over the sphere, 0.1."""
+
+
+@dataclass
+class PointReport:
+    """What became of the sparse points."""
+
+    given: int
+    not_finite: int = 0
+    duplicates: int = 0
+    over_cap: int = 0
+    random: int = 0
+    """Surfels placed at random because no point was usable."""
+
+
+def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
+    """1.1 times the largest distance of the training cameras from their mean, in world units.
+
+    Args:
+        camera_centers: [C, 3].
+        points: [M, 3], used when the cameras do not span anything (one camera, or all at one place): then the extent
+            is the median distance of the finite points from the cameras. Without points: 1.
+    """
+    centers = camera_centers.detach().reshape(-1, 3).double().cpu()
+    centers = centers[centers.isfinite().all(-1)]
+    middle = centers.mean(0) if len(centers) else torch.zeros(3, dtype=torch.float64)
+    reach = float((centers - middle).norm(dim=-1).max()) if len(centers) else 0.0
+    if reach > 1e-6 * max(1.0, float(middle.norm())):
+        return 1.1 * reach
+    if points is not None:
+        points = points.detach().reshape(-1, 3).double().cpu()
+        points = points[points.isfinite().all(-1)]
+        if len(points):
+            median = float((points - middle).norm(dim=-1).median())
+            if median > 0.0:
+                return median
+    return 1.0
+
+
+def surfels_from_points(
+    xyz: Tensor,
+    rgb: Tensor,
+    camera_centers: Tensor,
+    config: TrainConfig,
+    scene_config: SceneConfig,
+    box: Tensor | None = None,
+) -> tuple[dict[str, Tensor], PointReport]:
+    """Surfel parameters from sparse points.
+
+    A point gives one surfel: scale = root mean square distance to its 3 nearest neighbours, the disc faces the nearest
+    camera with a random turn in its plane, the colour is the point's from every direction. Points that are not finite
+    and repeated positions are dropped and counted. With no usable point, `config.random_points` surfels are placed at
+    random in `box`. `config.densify.max_surfels` holds from the start: more points than that are thinned at random.
+
+    Args:
+        xyz: [M, 3] world positions; M may be 0.
+        rgb: [M, 3] colours in [0, 1]; values that are not finite become grey.
+        camera_centers: [C, 3] world positions of the training cameras; C may be 0: then the discs lie at random.
+        config: training options (opacity, seed, cap).
+        scene_config: decides the parameters of the view colour.
+        box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
+
+    Returns:
+        The parameters by name, float32, on the CPU (table in docs/architecture.md), and what became of the points.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    centers = camera_centers.detach().reshape(-1, 3).float().cpu()
+    centers = centers[centers.isfinite().all(-1)]
+    xyz = xyz.detach().reshape(-1, 3).float().cpu()
+    rgb = rgb.detach().reshape(-1, 3).float().cpu()
+    if len(xyz) != len(rgb):
+        raise ValueError(f"{len(xyz)} points came with {len(rgb)} colours")
+    xyz, rgb, report = _usable(xyz, rgb)
+    if len(xyz) == 0:
+        xyz, rgb = _random_points(config.random_points, centers, box, generator)
+        report.random = len(xyz)
+        log.warning("no usable sparse points: %d surfels are placed at random", len(xyz))
+    cap = config.densify.max_surfels
+    if 0 < cap < len(xyz):
+        report.over_cap = len(xyz) - cap
+        keep = torch.randperm(len(xyz), generator=generator)[:cap].sort().values
+        xyz, rgb = xyz[keep], rgb[keep]
+    n = len(xyz)
+    extent = scene_extent(centers, xyz)
+    to_camera, camera_distance = _nearest_camera(xyz, centers)
+    largest = MAX_SCALE * torch.clamp(camera_distance, min=extent)
+    scales = torch.minimum(neighbour_distance(xyz, extent), largest).clamp(min=MIN_SCALE * extent)
+    logit = math.log(config.init_opacity / (1.0 - config.init_opacity))
+    surfels = {
+        "means": xyz.clone(),
+        "quats": _orientation(to_camera, generator),
+        "log_scales": scales.log()[:, None].repeat(1, 2),
+        "opacity_logits": torch.full((n,), logit),
+        "beta_raw": torch.full((n,), BETA_RAW),
+        **_view_color(rgb, scene_config, generator),
+    }
+    return surfels, report
+
+
+def neighbour_distance(xyz: Tensor, extent: float, neighbours: int = 3) -> Tensor:
+    """[M] root mean square distance of every point to its nearest neighbours (as many as there are, up to 3).
+
+    A point on its own gets a hundredth of the extent.
+    """
+    from scipy.spatial import cKDTree  # slow to import and needed once a run
+
+    k = min(neighbours, len(xyz) - 1)
+    if k < 1:
+        return torch.full((len(xyz),), 0.01 * extent)
+    points = xyz.double().numpy()
+    distances, _ = cKDTree(points).query(points, k=k + 1)  # the nearest is the point itself
+    return torch.from_numpy(np.sqrt(np.mean(np.square(distances[:, 1:]), axis=1))).float()
+
+
+def fibonacci_sphere(n: int) -> Tensor:
+    """[n, 3] unit vectors spread evenly over the sphere."""
+    i = torch.arange(n, dtype=torch.float64)
+    z = 1.0 - (2.0 * i + 1.0) / n
+    phi = i * math.pi * (3.0 - math.sqrt(5.0))
+    r = torch.sqrt(1.0 - z * z)
+    return torch.stack([r * torch.cos(phi), r * torch.sin(phi), z], -1).float()
+
+
+def _usable(xyz: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, PointReport]:
+    report = PointReport(given=len(xyz))
+    finite = xyz.isfinite().all(-1)
+    report.not_finite = int((~finite).sum())
+    xyz, rgb = xyz[finite], rgb[finite].nan_to_num(0.5, 0.5, 0.5).clamp(0.0, 1.0)
+    if len(xyz) == 0:
+        return xyz, rgb, report
+    _, first = np.unique(xyz.numpy() + 0.0, axis=0, return_index=True)  # + 0.0: -0 is the same place as 0
+    report.duplicates = len(xyz) - len(first)
+    keep = torch.from_numpy(np.sort(first))
+    return xyz[keep], rgb[keep], report
+
+
+def _random_points(n: int, centers: Tensor, box: Tensor | None, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    if n < 1:
+        raise ValueError("the capture has no usable sparse points and random_points is 0: nothing to start from")
+    if box is None:
+        middle = centers.mean(0) if len(centers) else torch.zeros(3)
+        extent = scene_extent(centers)
+        box = torch.stack([middle - extent, middle + extent])
+    low, high = box.detach().float().cpu()
+    xyz = low + (high - low) * torch.rand(n, 3, generator=generator)
+    return xyz, torch.rand(n, 3, generator=generator)
+
+
+def _nearest_camera(xyz: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
+    """[M, 3] vectors to the nearest camera centre and [M] their lengths; zeros without cameras."""
+    if len(centers) == 0:
+        return torch.zeros_like(xyz), torch.zeros(len(xyz))
+    nearest = torch.cat([torch.cdist(chunk, centers).argmin(-1) for chunk in xyz.split(65_536)])
+    to_camera = centers[nearest] - xyz
+    return to_camera, to_camera.norm(dim=-1)
+
+
+def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
+    """[M, 4] discs facing along `to_camera` [M, 3]; at random where that vector vanishes."""
+    n = len(to_camera)
+    angles = 2.0 * math.pi * torch.rand(n, generator=generator)
+    fallback = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
+    distance = to_camera.norm(dim=-1, keepdim=True)
+    normals = torch.where(distance > 1e-12, to_camera / distance.clamp(min=1e-12), fallback)
+    return facing(normals, angles)
+
+
+def _view_color(rgb: Tensor, config: SceneConfig, generator: torch.Generator) -> dict[str, Tensor]:
+    """View colour parameters that show `rgb` [N, 3] from every direction (Spherical Beta: on average over them)."""
+    n, kind, lobes = len(rgb), config.view_color, config.lobes
+    color = rgb - 0.5
+    if kind == "sv":
+        k = config.sv_sites
+        return {
+            "sv_sites": fibonacci_sphere(k).expand(n, k, 3).clone(),
+            "sv_log_tau": torch.zeros(n, k),
+            "sv_rgb": color[:, None, :].repeat(1, k, 1),
+        }
+    if kind == "sh":
+        rest = (config.sh_degree + 1) ** 2 - 1
+        return {"sh_dc": color / SH_C0, "sh_rest": torch.zeros(n, rest, 3)}
+    if kind == "sb":
+        # raw colour 0 passes softplus as 0.1, which keeps the gradient alive; the base makes up for it
+        shape = torch.zeros(n, lobes, 6)
+        shape[..., 3] = math.pi * torch.rand(n, lobes, generator=generator)
+        shape[..., 4] = 2.0 * math.pi * torch.rand(n, lobes, generator=generator)
+        return {"sb_base": color - SB_LOBE_MEAN * lobes, "sb_lobes": shape}
+    if kind == "sg":
+        axes = torch.nn.functional.normalize(torch.randn(n, lobes, 3, generator=generator), dim=-1)
+        # log sharpness 1, and no colour of its own yet
+        return {
+            "sg_base": color.clone(),
+            "sg_lobes": torch.cat([axes, torch.ones(n, lobes, 1), torch.zeros(n, lobes, 3)], -1),
+        }
+    raise ValueError(f"view_color must be sv, sh, sb or sg, not {kind!r}")

@@ -1,0 +1,292 @@
+"""FastGS densification and pruning: multi-view scores decide which surfels multiply and which go.
+
+At each densification, in this order: surfels that can never be seen again go (a value that is not finite; an opacity
+of 1/255 or less), surfels with many bad pixels and a large gradient are cloned or split, half of the candidates for
+pruning are drawn by lot, opacities are clamped. Between 60 and 90 % of the run, four final prunes remove what is
+transparent or in the way. See the published rules in docs/architecture.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
+from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.score import Scores, multi_view_scores
+from bitymi_ns.train.views import View
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import RenderOutput, Scene
+
+DrawViews = Callable[[int, torch.Generator], list[View]]
+"""(k, CPU generator) -> k different training views, or all when there are fewer."""
+
+INVISIBLE = 1.0 / 255.0
+"""A surfel of this opacity or less has no fragment anywhere, hence no gradient: it stays invisible for good."""
+SPLIT_SHRINK = 1.6
+"""The two halves of a split surfel are smaller by this factor."""
+STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
+
+
+class Strategy:
+    """Keeps the statistics of the projected centres and changes the number of surfels.
+
+    Attributes:
+        grad_sum: [N] sum over the views of |gradient of the projected centre|, normalised device coordinates.
+        abs_grad_sum: [N] the same of the gradient whose absolute values were summed over the pixels.
+        visible_count: [N] number of views that saw the surfel since the last densification.
+        max_radius: [N] largest half extent on screen since then, pixels.
+        generator: source of every random choice, on the CPU.
+    """
+
+    grad_sum: Tensor
+    abs_grad_sum: Tensor
+    visible_count: Tensor
+    max_radius: Tensor
+
+    def __init__(
+        self, config: TrainConfig, schedule: Schedule, extent: float, on_resize: ResizeHook | None = None
+    ) -> None:
+        """
+        Args:
+            config: training options.
+            schedule: says at which steps what takes place.
+            extent: scene extent in world units.
+            on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
+        """
+        self.config = config
+        self.schedule = schedule
+        self.extent = extent
+        self.on_resize = on_resize
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self._clear(0, torch.device("cpu"))
+
+    def _clear(self, n: int, device: torch.device) -> None:
+        for name in STATISTICS:
+            setattr(self, name, torch.zeros(n, device=device))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything an exact resume needs: statistics and the state of the generator."""
+        state = {name: getattr(self, name).clone() for name in STATISTICS}
+        return {**state, "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """The inverse of `state_dict`."""
+        sizes = {len(state[name]) for name in STATISTICS}
+        if len(sizes) != 1:
+            raise ValueError(f"the statistics of the strategy differ in length: {sorted(sizes)}")
+        for name in STATISTICS:
+            setattr(self, name, state[name].detach().clone().float())
+        self.generator.set_state(state["generator"].cpu().to(torch.uint8))
+
+    @torch.no_grad()
+    def accumulate(self, output: RenderOutput) -> None:
+        """Note the statistics of one training view; call it after the backward pass.
+
+        Reads `projection.mean2d_grad` and `mean2d_absgrad` ([N, 2], pixels), `visible` [N] and `radii` [N, 2].
+        """
+        projection = output.projection
+        visible = projection.visible
+        n, device = len(visible), visible.device
+        if len(self.grad_sum) == 0:
+            self._clear(n, device)
+        if len(self.grad_sum) != n:
+            raise ValueError(f"the strategy follows {len(self.grad_sum)} surfels, but {n} were rendered")
+        if self.grad_sum.device != device:
+            for name in STATISTICS:
+                setattr(self, name, getattr(self, name).to(device))
+        height, width = output.rgb.shape[:2]
+        to_ndc = torch.tensor([0.5 * width, 0.5 * height], device=device)
+        for total, gradient in (
+            (self.grad_sum, projection.mean2d_grad),
+            (self.abs_grad_sum, projection.mean2d_absgrad),
+        ):
+            if gradient is not None:  # no fragment at all, nothing to differentiate
+                size = (gradient * to_ndc).norm(dim=-1).nan_to_num(0.0, 0.0, 0.0)
+                total += torch.where(visible, size, 0.0)
+        self.visible_count += visible
+        radius = projection.radii.reshape(n, -1).amax(-1).float()
+        self.max_radius = torch.where(visible, torch.maximum(self.max_radius, radius), self.max_radius)
+
+    def step(self, step: int, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
+        """Do what the schedule asks for after the optimiser update of `step`.
+
+        Args:
+            step: index of the step that just ended.
+            scene: its surfel parameters are replaced when their number changes.
+            optimizers: by surfel parameter name.
+            views: draws the views for the score.
+
+        Returns:
+            What was done, by name; empty when nothing was due.
+        """
+        report: dict[str, float] = {}
+        if self.schedule.is_densify_step(step):
+            report |= self._densify(step, scene, optimizers, views)
+        if self.schedule.is_reset_step(step):
+            report["opacity_reset"] = cap_opacity(
+                scene.surfels, optimizers, self.config.densify.reset_opacity, forget_all=True
+            )
+        if self.schedule.is_final_prune_step(step):
+            report |= self._final_prune(scene, optimizers, views)
+        if report:
+            report["surfels"] = len(scene)
+        return report
+
+    # ---- densification
+
+    @torch.no_grad()
+    def _densify(
+        self, step: int, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews
+    ) -> dict[str, float]:
+        config = self.config.densify
+        report = self._drop_dead(scene, optimizers)
+        scores = self._scores(scene, views)
+        surfels = scene.surfels
+        n, device = len(scene), surfels["means"].device
+        if len(self.grad_sum) != n:  # nothing was rendered since the last event
+            self._clear(n, device)
+
+        seen = self.visible_count.clamp(min=1)
+        size = surfels["log_scales"].amax(-1).exp()
+        large = size > config.dense * self.extent
+        wanted = scores.importance > config.importance
+        clone = wanted & ~large & (self.grad_sum / seen >= config.grad_threshold)
+        split = wanted & large & (self.abs_grad_sum / seen >= config.abs_grad_threshold)
+        if config.max_surfels > 0:
+            room = max(0, config.max_surfels - n)
+            chosen = _strongest(clone | split, scores.importance, self.abs_grad_sum / seen, room)
+            clone, split = clone & chosen, split & chosen
+        clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()
+        stay = (~split).nonzero().flatten()
+        children = self._halves(surfels, splits)
+        new = {name: torch.cat([p.detach()[clones], children[name]]) for name, p in surfels.items()}
+
+        # candidates for pruning are counted among all surfels there are now; only old ones can be drawn
+        radius = self.max_radius if self.schedule.after_first_reset(step) else torch.zeros_like(self.max_radius)
+        old_candidate = self._prunable(surfels["opacity_logits"], surfels["log_scales"], radius)
+        new_candidate = self._prunable(new["opacity_logits"], new["log_scales"], None)
+        budget = math.floor(config.prune_budget * int(old_candidate[stay].sum() + new_candidate.sum()))
+        drawn = self._draw(1.0 / (1e-6 + 1.0 - scores.prune[stay].double()), budget)
+        pruned = torch.zeros(n, dtype=torch.bool, device=device)
+        pruned[stay[drawn]] = True
+        pruned &= old_candidate
+        pruned = self._spare(pruned, surfels["opacity_logits"], n + len(clones) + len(splits), among=~split)
+        keep = (~pruned & ~split).nonzero().flatten()
+
+        if len(keep) != n or len(clones) + len(splits) > 0:
+            replace_rows(surfels, optimizers, keep, new, self.on_resize)
+        self._clear(len(scene), device)
+        cap_opacity(surfels, optimizers, config.opacity_clamp)
+        return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
+
+    def _halves(self, surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+        """Two smaller surfels for each of `rows`, their centres drawn from the parent's disc as a Gaussian."""
+        halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
+        scales = halves["log_scales"].exp()  # [2S, 2]
+        offset = torch.randn(scales.shape, generator=self.generator).to(scales) * scales
+        u, v = tangents(halves["quats"])
+        halves["means"] = halves["means"] + offset[:, :1] * u + offset[:, 1:] * v
+        halves["log_scales"] = halves["log_scales"] - math.log(SPLIT_SHRINK)
+        return halves
+
+    # ---- pruning
+
+    def _prunable(self, opacity_logits: Tensor, log_scales: Tensor, radius: Tensor | None) -> Tensor:
+        config = self.config.densify
+        candidate = opacity_logits.sigmoid() < config.prune_opacity
+        candidate |= log_scales.amax(-1).exp() > config.prune_world * self.extent
+        return candidate if radius is None else candidate | (radius > config.prune_screen)
+
+    @torch.no_grad()
+    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
+        config = self.config.densify
+        report = self._drop_dead(scene, optimizers)
+        scores = self._scores(scene, views)
+        logits = scene.surfels["opacity_logits"]
+        pruned = (logits.sigmoid() < config.final_prune_opacity) | (scores.prune > config.final_prune_score)
+        pruned = self._spare(pruned, logits, len(scene))
+        self._remove(pruned, scene, optimizers)
+        return report | {"pruned": int(pruned.sum())}
+
+    def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
+        """Remove surfels that are broken or can never be seen again, and those beyond the cap."""
+        surfels = scene.surfels
+        finite = torch.ones(len(scene), dtype=torch.bool, device=surfels["means"].device)
+        for p in surfels.values():
+            finite &= p.detach().reshape(len(p), -1).isfinite().all(-1)
+        if not bool(finite.any()):
+            raise TrainingDiverged(f"no surfel is left whose parameters are all finite: {describe_broken(scene)}")
+        logits = surfels["opacity_logits"]
+        invisible = finite & (logits.sigmoid() <= INVISIBLE)
+        over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
+        if self.config.densify.max_surfels > 0 and over > 0:
+            # only a scene loaded from elsewhere is over the cap: the faintest go
+            lots = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
+            invisible[lots[:over]] = True
+        pruned = ~finite | self._spare(invisible, logits, int(finite.sum()), among=finite)
+        self._remove(pruned, scene, optimizers)
+        return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
+
+    def _spare(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
+        """Take back as much of `pruned` [N] as `min_surfels` asks for, the most opaque first.
+
+        Args:
+            pruned: [N] bool.
+            opacity_logits: [N].
+            count: number of surfels there would be without this prune.
+            among: [N] bool, rows that may be pruned at all.
+        """
+        if among is not None:
+            pruned = pruned & among
+        lowest = max(1, self.config.densify.min_surfels)
+        if self.config.densify.max_surfels > 0:
+            lowest = min(lowest, self.config.densify.max_surfels)
+        missing = min(lowest - (count - int(pruned.sum())), int(pruned.sum()))
+        if missing > 0:
+            order = torch.where(pruned, opacity_logits.detach(), -math.inf).argsort(descending=True, stable=True)
+            pruned = pruned.clone()
+            pruned[order[:missing]] = False
+        return pruned
+
+    def _draw(self, weights: Tensor, k: int) -> Tensor:
+        """[min(k, number of positive weights)] different rows, drawn one after the other in proportion to `weights`.
+
+        Exponential races: the k rows with the smallest Exp(1) / weight are such a sample (and, unlike
+        torch.multinomial, there may be more than 2^24 rows).
+        """
+        k = min(k, int((weights > 0).sum()))
+        race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
+        return (race / weights).topk(k, largest=False).indices
+
+    def _scores(self, scene: Scene, views: DrawViews) -> Scores:
+        return multi_view_scores(scene, views(self.config.densify.views, self.generator), self.config)
+
+    def _remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
+        if not bool(pruned.any()):
+            return
+        keep = (~pruned).nonzero().flatten()
+        replace_rows(scene.surfels, optimizers, keep, on_resize=self.on_resize)
+        if len(self.grad_sum) == len(pruned):
+            for name in STATISTICS:
+                setattr(self, name, getattr(self, name)[keep.to(self.grad_sum.device)])
+
+
+def _strongest(wanted: Tensor, importance: Tensor, gradient: Tensor, k: int) -> Tensor:
+    """[N] bool: at most `k` of the `wanted` rows, by importance first and gradient second."""
+    rows = wanted.nonzero().flatten()
+    by_gradient = gradient[rows].argsort(descending=True, stable=True)
+    rows = rows[by_gradient]
+    rows = rows[importance[rows].argsort(descending=True, stable=True)]
+    chosen = torch.zeros_like(wanted)
+    chosen[rows[:k]] = True
+    return chosen

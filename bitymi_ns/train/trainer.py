@@ -1,0 +1,267 @@
+"""A small trainer with torch alone, for benchmarks and tests; nerfstudio's loop calls the same parts."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.optim import Adam
+
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.losses import objective
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.strategy import Strategy
+from bitymi_ns.train.views import (
+    ReducedViews,
+    View,
+    as_float,
+    at_size,
+    background_color,
+    over_background,
+    training_order,
+)
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import RenderOutput, Scene
+
+ADAM_EPS = 1e-15
+FIELD_BETAS = (0.9, 0.99)
+"""The texture field forgets faster: its gradients are sparse and large early on."""
+
+
+@dataclass
+class LogEntry:
+    """The state of a run after `step` steps."""
+
+    step: int
+    seconds: float
+    """Wall-clock time of training, without evaluation."""
+    cpu_seconds: float
+    """Processor time of training over all threads, without evaluation."""
+    surfels: int
+    fragments: float
+    """Blended fragments a view, mean over the evaluation views."""
+    loss: float
+    """Of the last training step."""
+    psnr: float
+    """dB, mean over the evaluation views at full size; NaN without such views."""
+
+
+@dataclass
+class TrainLog:
+    """What happened in a run."""
+
+    entries: list[LogEntry] = field(default_factory=list)
+    events: list[dict[str, float]] = field(default_factory=list)
+    """Reports of the strategy, each with its `step`."""
+
+
+def training_step(
+    scene: Scene,
+    camera: Camera,
+    image: Tensor,
+    mask: Tensor | None,
+    schedule: Schedule,
+    step: int,
+    config: TrainConfig,
+) -> tuple[dict[str, Tensor], RenderOutput]:
+    """Render a training view as the schedule asks for and compare it with its photograph.
+
+    Args:
+        scene: what is learned.
+        camera: of the full-size image.
+        image: [H, W, 3] or [H, W, 4] (straight alpha), at full size or at that of the step's resolution already.
+        mask: [H, W] or [H, W, 1] bool at either size, True where the pixel counts; None = everywhere.
+        schedule, step: resolution and freezing.
+        config: training options.
+
+    Returns:
+        The weighted terms of the loss (their sum is the objective), and the rendered view.
+
+    Raises:
+        TrainingDiverged: the loss is not finite.
+    """
+    factor = schedule.resolution_factor(step)
+    device = scene.surfels["means"].device
+    camera = camera.to(device)
+    view = at_size(View(camera, image, mask), camera.scaled(factor) if factor < 1.0 else camera, device)
+    background = background_color(config.background, config.seed, step, device)
+    mode = "train" if schedule.field_trains(step) else "frozen"
+    output = scene.render(view.camera, background=background, field_mode=mode)
+    target = over_background(view.image, background)
+    terms = objective(output, target, scene.surfels["beta_raw"], config.loss, view.mask)
+    for name, term in terms.items():
+        if not math.isfinite(term.item()):
+            cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
+            raise TrainingDiverged(f"the {name} loss is {term.item()} at step {step}: {cause}")
+    return terms, output
+
+
+def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = (0.9, 0.999)) -> Adam:
+    """Adam with the method's epsilon, fused where torch can do that on the parameters' device."""
+    try:
+        return Adam(parameters, lr=0.0, betas=betas, eps=ADAM_EPS, fused=True)
+    except RuntimeError:
+        return Adam(parameters, lr=0.0, betas=betas, eps=ADAM_EPS)
+
+
+def make_optimizers(scene: Scene) -> dict[str, Adam]:
+    """One optimiser a surfel parameter, under its name, and `field_table` and `field_mlp`."""
+    optimizers = {name: adam([p]) for name, p in scene.surfels.items()}
+    if scene.field is not None:
+        table, *mlp = scene.field.weights
+        optimizers["field_table"] = adam([table], FIELD_BETAS)
+        optimizers["field_mlp"] = adam(mlp, FIELD_BETAS)
+    return optimizers
+
+
+class Trainer:
+    """One training run, step by step.
+
+    Attributes:
+        step: number of steps done.
+        seconds, cpu_seconds: time that training took, without evaluation.
+        loss: objective of the last step.
+    """
+
+    def __init__(
+        self, scene: Scene, views: Sequence[View], config: TrainConfig, max_steps: int, extent: float | None = None
+    ) -> None:
+        """
+        Args:
+            scene: changed in place.
+            views: training views at full size.
+            config: training options.
+            max_steps: length of the run; the schedules depend on it.
+            extent: scene extent in world units; default: from the cameras.
+        """
+        if not views:
+            raise ValueError("there is nothing to train on: no views")
+        device = scene.surfels["means"].device
+        if extent is None:
+            centers = torch.stack([view.camera.center for view in views])
+            extent = scene_extent(centers, scene.surfels["means"])
+        self.scene = scene
+        self.config = config
+        self.views = ReducedViews(views, device)
+        self.schedule = Schedule(config, max_steps, extent)
+        self.strategy = Strategy(config, self.schedule, extent)
+        self.optimizers = make_optimizers(scene)
+        self.step = 0
+        self.seconds = 0.0
+        self.cpu_seconds = 0.0
+        self.loss = math.nan
+
+    def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
+        """Do one step: the terms of its loss, the rendered view, and what the strategy did after it."""
+        start, cpu_start = time.perf_counter(), time.process_time()
+        step, factor = self.step, self.schedule.resolution_factor(self.step)
+        index = training_order(len(self.views), self.config.seed, step)
+        camera, (_, image, mask) = self.views.camera(index), self.views.at(index, factor)
+        for name, optimizer in self.optimizers.items():
+            optimizer.param_groups[0]["lr"] = self.schedule.lr(name, step)
+            optimizer.zero_grad(set_to_none=True)
+        terms, output = training_step(self.scene, camera, image, mask, self.schedule, step, self.config)
+        total = torch.stack(list(terms.values())).sum()
+        if total.requires_grad:
+            total.backward()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+        if not self.schedule.densification_over(step):
+            self.strategy.accumulate(output)
+        report = self.strategy.step(
+            step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
+        )
+        self.loss = total.item()
+        self.step += 1
+        self.seconds += time.perf_counter() - start
+        self.cpu_seconds += time.process_time() - cpu_start
+        return terms, output, report
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that an exact resume needs: tensors, numbers and text only."""
+        return {
+            "step": self.step,
+            "max_steps": self.schedule.max_steps,
+            "seconds": self.seconds,
+            "cpu_seconds": self.cpu_seconds,
+            "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "strategy": self.strategy.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was taken; the run has the same options, views and length."""
+        if state["max_steps"] != self.schedule.max_steps:
+            raise ValueError(f"the run was one of {state['max_steps']} steps, this is one of {self.schedule.max_steps}")
+        self.scene.resize(len(state["scene"]["surfels.means"]))
+        self.scene.load_state_dict(state["scene"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.strategy.load_state_dict(state["strategy"])
+        self.step = state["step"]
+        self.seconds, self.cpu_seconds = state["seconds"], state["cpu_seconds"]
+
+
+@torch.no_grad()
+def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> tuple[float, float]:
+    """Mean PSNR in dB of the views at full size, and mean number of fragments a view; NaN without views."""
+    device = scene.surfels["means"].device
+    # evaluation has one background, also when training draws a new one each step
+    background = background_color("white" if config.background == "white" else "black", config.seed, 0, device)
+    psnr, fragments = [], []
+    for camera, image, mask in views:
+        output = scene.render(camera.to(device), background=background, field_mode="frozen")
+        target = over_background(as_float(image.to(device)), background)
+        error = (output.rgb.clamp(0.0, 1.0) - target).square()
+        if mask is not None:
+            error = error[mask.to(device).reshape(error.shape[:2])]
+        psnr.append(-10.0 * math.log10(max(error.mean().item(), 1e-10)))
+        fragments.append(len(output.fragments.weight))
+    return (sum(psnr) / len(psnr), sum(fragments) / len(fragments)) if psnr else (math.nan, math.nan)
+
+
+def fit(
+    scene: Scene,
+    views: Sequence[View],
+    eval_views: Sequence[View],
+    config: TrainConfig,
+    max_steps: int,
+    callback: Callable[[Trainer, dict[str, Tensor], RenderOutput, dict[str, float]], None] | None = None,
+    eval_steps: Sequence[int] = (),
+    extent: float | None = None,
+) -> TrainLog:
+    """Train a scene in place.
+
+    Args:
+        scene: what is learned.
+        views: training views at full size.
+        eval_views: held-out views for the log.
+        config: training options.
+        max_steps: length of the run.
+        callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
+        eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.
+        extent: scene extent in world units; default: from the cameras.
+    """
+    trainer = Trainer(scene, views, config, max_steps, extent)
+    log = TrainLog()
+    due = {*eval_steps, max_steps}
+    while trainer.step < max_steps:
+        terms, output, report = trainer.advance()
+        if report:
+            log.events.append({"step": trainer.step - 1, **report})
+        if trainer.step in due:
+            psnr, fragments = evaluate(scene, eval_views, config)
+            times = (trainer.seconds, trainer.cpu_seconds)
+            log.entries.append(LogEntry(trainer.step, *times, len(scene), fragments, trainer.loss, psnr))
+        if callback is not None:
+            callback(trainer, terms, output, report)
+    return log

@@ -1,0 +1,149 @@
+"""Training views: a camera, its photograph, and which pixels of it count."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from bitymi_ns.scene.camera import Camera
+
+
+class View(NamedTuple):
+    """One photograph.
+
+    Attributes:
+        camera: the camera of the full-size image.
+        image: [H, W, 3] or, with straight (not premultiplied) alpha, [H, W, 4]; float in [0, 1] or uint8.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+    """
+
+    camera: Camera
+    image: Tensor
+    mask: Tensor | None = None
+
+
+def as_float(image: Tensor) -> Tensor:
+    """The image as float32 in [0, 1]."""
+    return image.float() / 255.0 if image.dtype == torch.uint8 else image.float()
+
+
+def reduce_image(image: Tensor, width: int, height: int) -> Tensor:
+    """Area average of an image.
+
+    Args:
+        image: [H, W, C]; with C = 4 the colours are weighted by their alpha, so that what is hidden does not bleed in.
+        width, height: new size in pixels.
+
+    Returns:
+        [height, width, C].
+    """
+    if image.shape[:2] == (height, width):
+        return image
+    alpha = image[..., 3:]
+    if image.shape[-1] == 4:
+        image = torch.cat([image[..., :3] * alpha, alpha], -1)
+    small = interpolate(image.permute(2, 0, 1)[None], size=(height, width), mode="area")[0].permute(1, 2, 0)
+    if image.shape[-1] == 4:
+        small = torch.cat([small[..., :3] / small[..., 3:].clamp(min=1e-6), small[..., 3:]], -1)
+    return small.contiguous()
+
+
+def reduce_mask(mask: Tensor, width: int, height: int) -> Tensor:
+    """[height, width, 1] bool: True where every covered pixel of `mask` ([H, W] or [H, W, 1] bool) counts."""
+    mask = mask.reshape(*mask.shape[:2], 1)
+    if mask.shape[:2] == (height, width):
+        return mask
+    return reduce_image(mask.float(), width, height) > 0.999
+
+
+def background_color(
+    kind: Literal["black", "white", "random"], seed: int, step: int, device: torch.device | str = "cpu"
+) -> Tensor | None:
+    """[3] the colour behind the scene in this training step; None = black. Depends on `seed` and `step` alone."""
+    if kind == "black":
+        return None
+    if kind == "white":
+        return torch.ones(3, device=device)
+    if kind == "random":
+        generator = torch.Generator().manual_seed((seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
+        return torch.rand(3, generator=generator).to(device)
+    raise ValueError(f"background must be black, white or random, not {kind!r}")
+
+
+def over_background(image: Tensor, background: Tensor | None) -> Tensor:
+    """[H, W, 3]: an image with alpha composed over a colour [3] (None = black); one without is returned as it is."""
+    if image.shape[-1] == 3:
+        return image
+    color = image[..., :3] * image[..., 3:]
+    return color if background is None else color + (1.0 - image[..., 3:]) * background
+
+
+def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
+    """The view on a device, its picture reduced to the size of `camera` (the view's own, scaled).
+
+    The picture may be of that size already.
+    """
+    image = as_float(view.image.to(device))
+    for given, what in ((view.image, "image"), (view.mask, "mask")):
+        sizes = ((view.camera.height, view.camera.width), (camera.height, camera.width))
+        if given is not None and tuple(given.shape[:2]) not in sizes:
+            h, w = given.shape[:2]
+            raise ValueError(
+                f"the {what} is {w} x {h} pixels, but its camera {view.camera.width} x {view.camera.height}"
+            )
+    mask = None if view.mask is None else reduce_mask(view.mask.to(device), camera.width, camera.height)
+    return View(camera, reduce_image(image, camera.width, camera.height), mask)
+
+
+class ReducedViews:
+    """Training views at the resolution of the moment; reduced pictures are kept until the resolution changes.
+
+    Args:
+        views: at full size.
+        device: where the pictures are wanted.
+    """
+
+    def __init__(self, views: Sequence[View], device: torch.device | str = "cpu") -> None:
+        self._views = views
+        self._device = device
+        self._factor = 1.0
+        self._kept: dict[int, View] = {}
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def camera(self, index: int) -> Camera:
+        """The camera of the full-size image of view number `index`."""
+        return self._views[index].camera
+
+    def at(self, index: int, factor: float) -> View:
+        """View number `index`, its image resized by `factor`."""
+        if factor != self._factor:
+            self._factor, self._kept = factor, {}
+        if index not in self._kept:
+            view = self._views[index]
+            camera = view.camera.to(self._device)
+            view = at_size(view, camera.scaled(factor) if factor < 1.0 else camera, self._device)
+            if factor == 1.0:
+                return view
+            self._kept[index] = view
+        return self._kept[index]
+
+    def draw(self, k: int, generator: torch.Generator, factor: float) -> list[View]:
+        """`k` different views, or all of them when there are fewer; `generator` lives on the CPU."""
+        order = torch.randperm(len(self), generator=generator).tolist()
+        return [self.at(i, factor) for i in order[:k]]
+
+
+def training_order(n: int, seed: int, step: int) -> int:
+    """Which of `n` views step number `step` trains on: every view once an epoch, in an order that is new each time.
+
+    Depends on the arguments alone, so that a resumed run sees the same views.
+    """
+    epoch, position = divmod(step, n)
+    generator = torch.Generator().manual_seed((seed * 1_000_003 + 7_919 + epoch) & 0x7FFF_FFFF_FFFF_FFFF)
+    return int(torch.randperm(n, generator=generator)[position])

@@ -43,6 +43,15 @@ def test_baked_or_neural(method: str, checkpoint: str, atlas_bytes: int, baked: 
     assert row.method == "bitymi"
 
 
+def test_export_without_texture_is_known_by_its_folder(tmp_path: Path):
+    checkpoint = str(tmp_path / "export" / "nerfstudio_models" / "step-0.ckpt")
+    assert not make(method="bitymi-notexture", checkpoint=checkpoint).baked
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export" / "bundle.json").write_text("{}")
+    assert make(method="bitymi-notexture", checkpoint=checkpoint, atlas_bytes=0).baked
+    assert not make(checkpoint="nul\0/a/b").baked
+
+
 def test_label_of_a_bundle_names_its_format():
     row = make(checkpoint="/e/fox-bc7/nerfstudio_models/step-0.ckpt", atlas_bytes=10)
     assert row.label == "bitymi, bc7"

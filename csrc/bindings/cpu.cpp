@@ -190,7 +190,8 @@ void bind(nb::module_& m, const char* suffix) {
           "baked",
           [](const Trace<S>& t, In geom, In radii, int width, int height, double near, bool maps, In base,
              Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> atlas_shape,
-             double offset, double scale, Array<const int32_t> tiles, Out image, Maybe<int32_t> overdraw) {
+             double offset, double scale, double extent, Array<const int32_t> tiles, Out image,
+             Maybe<int32_t> overdraw) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
             const auto [layers, rows, columns] = atlas_shape;
             const int64_t texels = int64_t(layers) * rows * columns * 4;
@@ -201,6 +202,7 @@ void bind(nb::module_& m, const char* suffix) {
                                  data_or_null(floats, texels, "atlas floats"),
                                  float(offset),
                                  float(scale),
+                                 float(extent),
                                  data(tiles, 5 * n, "tiles")};
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data(), *b = data(base, 3 * n, "base");
             S* out = data(image, pixels * (maps ? kMapChannels : kImageChannels), "image");
@@ -210,7 +212,7 @@ void bind(nb::module_& m, const char* suffix) {
           },
           "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "maps"_a, "base"_a.noconvert(),
           "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "atlas_shape"_a, "offset"_a, "scale"_a,
-          "tiles"_a.noconvert(), "image"_a.noconvert(), "overdraw"_a.noconvert().none());
+          "extent"_a, "tiles"_a.noconvert(), "image"_a.noconvert(), "overdraw"_a.noconvert().none());
 
   m.def(
       name("trace_backward").c_str(),

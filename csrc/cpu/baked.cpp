@@ -22,7 +22,7 @@ inline Quad<S> texel(const Atlas& a, int64_t at) {
 // Residual colour at (u, v) of a tile, bilinear.
 template <class S>
 inline Quad<S> residual(const Atlas& a, const int32_t* tile, S u, S v) {
-  const TexelPair<S> x = texel_pair(u, tile[3]), y = texel_pair(v, tile[4]);
+  const TexelPair<S> x = texel_pair(u, tile[3], S(a.extent)), y = texel_pair(v, tile[4], S(a.extent));
   const int64_t row0 = (int64_t(tile[2]) * a.height + tile[1] + y.i0) * a.width + tile[0];
   const int64_t row1 = row0 + int64_t(y.i1 - y.i0) * a.width;
   const Quad<S> top = texel<S>(a, row0 + x.i0), right = texel<S>(a, row0 + x.i1);

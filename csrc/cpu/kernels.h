@@ -146,7 +146,8 @@ struct Atlas {
   int layers, height, width;
   const uint8_t* bytes;  // RGBA [layers, height, width, 4], or null
   const float* floats;   // RGBA likewise, or null
-  float offset, scale;
+  float offset, scale;   // residual = offset + scale * stored
+  float extent;          // half side of a tile, scale units
   const int32_t* tiles;  // [n, 5]: x, y, layer, r_u, r_v; r_u = 0: no tile
 };
 // image [pixels, channels] as composite_forward; overdraw [pixels] int32 or null

@@ -230,21 +230,12 @@ template <class S>
 BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
   return (typename IndexOf<Pack<S>>::type) __builtin_convertvector(a.v, typename Pack<S>::M);
 }
-BT_HD float sum(Pack<float> a) {
-#if defined(__AVX512F__)
-  return _mm512_reduce_add_ps((__m512)a.v);
-#else
-  float lanes[kLanes];
-  store(lanes, a);
-  for (int half = kLanes / 2; half > 0; half /= 2)
-    for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
-  return lanes[0];
-#endif
-}
-BT_HD double sum(Pack<double> a) {
-  double total = 0;
-  for (int i = 0; i < kLanes; ++i) total += a.v[i];
-  return total;
+template <class S>
+BT_HD S sum(Pack<S> a) {
+  const auto h = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 4, 5, 6, 7) +
+                 __builtin_shufflevector(a.v, a.v, 8, 9, 10, 11, 12, 13, 14, 15);
+  const auto q = __builtin_shufflevector(h, h, 0, 1, 2, 3) + __builtin_shufflevector(h, h, 4, 5, 6, 7);
+  return (q[0] + q[2]) + (q[1] + q[3]);
 }
 
 }  // namespace bt

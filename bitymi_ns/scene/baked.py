@@ -1,0 +1,118 @@
+"""A baked scene: surfels and an atlas, no network. Forward only, nothing here learns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops import project, view_color
+from bitymi_ns.ops.trace import tracers
+
+from .camera import Camera
+
+if TYPE_CHECKING:
+    from bitymi_ns.bake.bundle import Bundle
+
+
+@dataclass
+class BakedOutput:
+    """A view of a baked scene; the fields mean what they mean in `scene.RenderOutput`."""
+
+    rgb: Tensor
+    alpha: Tensor
+    beta: Tensor
+    depth: Tensor | None
+    normal: Tensor | None
+    overdraw: Tensor | None
+
+
+@dataclass
+class BakedScene:
+    """Renders a bundle.
+
+    Attributes:
+        surfels: per-surfel parameters by name (docs/architecture.md), float32.
+        view_color: sv, sh, sb or sg.
+        tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
+        atlas: [layers, height, width, 4] uint8 or float32, None = no residual.
+        offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
+        extent: half side of a tile in scale units.
+        near: nearest depth that is drawn, camera z.
+    """
+
+    surfels: Mapping[str, Tensor]
+    view_color: str
+    tiles: Tensor
+    atlas: Tensor | None
+    offset: float = 0.0
+    scale: float = 1.0
+    extent: float = 3.0
+    near: float = 0.2
+
+    @classmethod
+    def from_bundle(cls, bundle: Bundle) -> BakedScene:
+        """The scene of a loaded bundle."""
+        info = bundle.info
+        return cls(
+            surfels=bundle.surfels,
+            view_color=bundle.view_color,
+            tiles=bundle.tiles.contiguous(),
+            atlas=None if bundle.atlas is None else bundle.atlas.contiguous(),
+            offset=bundle.offset,
+            scale=bundle.scale,
+            extent=info["atlas"]["extent"] if info["atlas"] else 3.0,
+            near=info["render"]["near"],
+        )
+
+    def __len__(self) -> int:
+        return len(self.tiles)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
+        """Renders a view: texels are fetched bilinearly, clamped to the tile's outer texel centres.
+
+        Args:
+            camera: the view.
+            background: [3] colour behind the scene; None = black.
+            maps: also depth, normals and overdraw.
+        """
+        p = self.surfels
+        means = p["means"]
+        projection = project(
+            means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"], camera, self.near
+        )
+        base = view_color(self.view_color, p, means, camera.center.to(means), projection.visible)
+        size = (camera.width, camera.height)
+        image = means.new_empty(camera.height, camera.width, 9 if maps else 5)
+        overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
+        atlas = self.atlas
+        is_bytes = atlas is not None and atlas.dtype == torch.uint8
+        tracer = tracers.take(means)
+        tracer.run(projection.geom, projection.radii, *size, self.near, fragments=False)
+        tracer.baked(
+            projection.geom,
+            projection.radii,
+            *size,
+            self.near,
+            maps,
+            base,
+            atlas if is_bytes else None,
+            None if is_bytes else atlas,
+            (0, 0, 0) if atlas is None else tuple(atlas.shape[:3]),
+            self.offset,
+            self.scale / 255 if is_bytes else self.scale,
+            self.extent,
+            self.tiles,
+            image,
+            overdraw,
+        )
+        tracers.give(tracer)
+        rgb, alpha = image[..., :3], image[..., 3:4]
+        if background is not None:
+            rgb = rgb + (1 - alpha) * background
+        depth, normal = (image[..., 5:6], image[..., 6:9]) if maps else (None, None)
+        return BakedOutput(rgb, alpha, image[..., 4:5], depth, normal, overdraw)

@@ -117,10 +117,12 @@ class BitymiAdamConfig(OptimizerConfig):
 
 def optimizers(options: OptimizerOptions) -> dict[str, Any]:
     """nerfstudio's optimiser dictionary: one Adam a parameter group, no scheduler (the model sets the rates)."""
-    return {
-        group: {"optimizer": BitymiAdamConfig(lr=1e-3, eps=options.eps, betas=options.betas), "scheduler": None}
-        for group in PARAMETER_GROUPS
-    }
+
+    def adam(group: str) -> BitymiAdamConfig:
+        betas = options.field_betas if group.startswith("field") else options.betas
+        return BitymiAdamConfig(lr=1e-3, eps=options.eps, betas=betas)
+
+    return {group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS}
 
 
 def trainer_config(preset: Preset) -> BitymiTrainerConfig:

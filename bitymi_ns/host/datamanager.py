@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from bitymi_ns.host.capture import check_capture, reporting_input_errors
 from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
 from bitymi_ns.host.errors import fail
+from bitymi_ns.train.views import training_order
 
 FEW_VIEWS = 10
 """With fewer training views than this the multi-view scores rest on little."""
@@ -53,7 +53,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         check_capture(config)
         with reporting_input_errors(config):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
-        self._epoch: tuple[int, list[int]] = (-1, [])
         self._check_images(test_mode)
         outputs = self.train_dataparser_outputs
         color = outputs.alpha_color
@@ -116,13 +115,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     def train_index(self, step: int) -> int:
         """The training view of a step."""
-        count = len(self.train_dataset)
-        epoch = step // count
-        if self._epoch[0] != epoch:
-            order = list(range(count))
-            random.Random(self.config.train_cameras_sampling_seed * 1_000_003 + epoch).shuffle(order)
-            self._epoch = (epoch, order)
-        return self._epoch[1][step % count]
+        return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, step)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         return self.train_view(self.train_index(step))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.abc
 import importlib.machinery
 import sys
+import warnings
 from collections.abc import Callable
 from types import ModuleType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -47,9 +48,10 @@ def extended(commands: Any) -> Any:
         return Annotated[(extended(inner), *markers)]  # type: ignore[return-value]
     import tyro
 
-    from bitymi_ns.host.export import ExportAtlas
+    from bitymi_ns.host.export import ExportAtlas, default_export
 
-    ours = Annotated[ExportAtlas, tyro.conf.subcommand(name=COMMAND, description=DESCRIPTION)]
+    subcommand = tyro.conf.subcommand(name=COMMAND, description=DESCRIPTION, default=default_export())
+    ours = Annotated[ExportAtlas, subcommand]
     members = get_args(commands) if get_origin(commands) in (Union, UnionType) else (commands,)
     return Union[(*members, ours)]  # noqa: UP007 - built at run time
 
@@ -65,7 +67,13 @@ class _Forwarding:
         return getattr(self._target, name)
 
     def _with_ours(self, f: Any) -> Any:
-        return extended(f) if f is getattr(self._module, "Commands", None) else f
+        if f is not getattr(self._module, "Commands", None):
+            return f
+        try:
+            return extended(f)
+        except Exception as error:  # noqa: BLE001 - nerfstudio's own commands have to go on working
+            warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {error}", stacklevel=3)
+            return f
 
 
 class _TyroProxy(_Forwarding):

@@ -111,7 +111,7 @@ class BitymiModel(SurfelModel):
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
         if self.training and self._run:
-            return self._run[0].render(ray_bundle)
+            return {"cameras": ray_bundle}  # rendered together with its photograph, in get_loss_dict
         return super().get_outputs(ray_bundle)
 
     # training
@@ -138,7 +138,7 @@ class BitymiModel(SurfelModel):
     ) -> dict[str, Tensor]:
         if not self._run:
             raise RuntimeError("losses exist in training only")
-        return self._run[0].losses(outputs, batch)
+        return self._run[0].losses(outputs["cameras"], batch)
 
     # checkpoints
 

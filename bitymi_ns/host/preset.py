@@ -54,6 +54,8 @@ class OptimizerOptions:
 
     eps: float = 1e-15
     betas: tuple[float, float] = (0.9, 0.999)
+    field_betas: tuple[float, float] = (0.9, 0.99)
+    """Of the texture field, whose gradients are sparse and large early on."""
 
 
 @dataclass
@@ -80,7 +82,7 @@ def load_preset(name: str, folder: Path | None = None) -> Preset:
     folder = preset_dir() if folder is None else folder
     path = folder / f"{name}.yaml"
     values = _read_with_base(path, folder, ())
-    return _build(Preset, {**values, "name": name}, path.name, "")
+    return build(Preset, {**values, "name": name}, path.name, "")
 
 
 def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[str, Any]:
@@ -113,7 +115,7 @@ def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _build(cls: type, values: dict[str, Any], file: str, prefix: str) -> Any:
+def build(cls: type, values: dict[str, Any], file: str, prefix: str) -> Any:
     """An instance of the dataclass `cls` from a mapping; unknown keys and wrong types are errors."""
     hints = typing.get_type_hints(cls)
     known = [f.name for f in dataclasses.fields(cls)]
@@ -133,7 +135,7 @@ def _converted(value: Any, hint: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, dict):
             raise PresetError(f"{file}: {key}: expected a group of options, found {value!r}")
-        return _build(typing.cast(type, hint), value, file, key + ".")
+        return build(typing.cast(type, hint), value, file, key + ".")
     if origin is Literal:
         if value not in args:
             raise PresetError(f"{file}: {key}: expected one of {', '.join(map(str, args))}, found {value!r}")

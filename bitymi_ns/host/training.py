@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -16,20 +17,22 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.metrics import psnr
+from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import beta_only_map, falloff, photometric
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
-from bitymi_ns.train.views import View, as_float, background_color, over_background, reduce_image, reduce_mask
+from bitymi_ns.train.trainer import training_step
+from bitymi_ns.train.views import ReducedViews, View, as_float, over_background
 
 if TYPE_CHECKING:
+    from bitymi_ns.host.datamanager import BitymiDataManager
     from bitymi_ns.host.model import BitymiModel
 
 
 class TrainingRun:
     """What a training step needs beside the scene. Order of a step, by nerfstudio:
 
-    `before` -> `render` -> `losses` -> backward -> optimisers -> `after`.
+    `before` -> `losses` -> backward -> optimisers -> `after`.
     """
 
     def __init__(self, model: BitymiModel, attributes: TrainingCallbackAttributes) -> None:
@@ -61,8 +64,8 @@ class TrainingRun:
             "method_name": trainer.config.method_name,
         }
         self._output: Any = None
-        self._background: Tensor | None = None
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
+        self.views = ReducedViews(_TrainViews(self.datamanager), model.device)
 
     def callbacks(self) -> list[TrainingCallback]:
         return [
@@ -102,99 +105,68 @@ class TrainingRun:
             for group in optimizer.param_groups:
                 group["lr"] = rate
 
-    def render(self, cameras: Cameras) -> dict[str, Any]:
-        """Render the step's view at the resolution of the schedule."""
+    def losses(self, cameras: Cameras, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Render the step's view at the resolution of the schedule and compare it with its photograph."""
+        step, factor = self.step, self.schedule.resolution_factor(self.step)
         camera = to_camera(cameras, self.model.device)
-        factor = self.schedule.resolution_factor(self.step)
-        if factor < 1.0:
-            camera = camera.scaled(factor)
-        self._background = background_color(self.config.background, self.config.seed, self.step, self.model.device)
-        mode = "train" if self.schedule.field_trains(self.step) else "frozen"
-        self._output = self.model.scene.render(camera, background=self._background, field_mode=mode)
-        return {"rgb": self._output.rgb, "accumulation": self._output.alpha}
-
-    def losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The photometric loss and, when it is on, the falloff loss."""
-        output, loss = self._output, self.config.loss
-        height, width = output.rgb.shape[:2]
-        target, mask = self._target(batch, width, height)
-        result = {"photometric": photometric(output.rgb, target, loss.ssim_weight, mask)}
-        if loss.falloff_weight > 0.0:
-            beta = output.beta
-            if loss.falloff_gradient == "beta_only":
-                beta = beta_only_map(output, self.model.scene.surfels["beta_raw"])
-            value = falloff(output.rgb, target, beta, loss.falloff_gamma, loss.falloff_error, mask)
-            result["falloff"] = loss.falloff_weight * value
-        return result
-
-    def _target(self, batch: dict[str, Any], width: int, height: int) -> tuple[Tensor, Tensor | None]:
-        image = reduce_image(as_float(batch["image"].to(self.model.device)), width, height)
-        mask = batch.get("mask")
-        if mask is not None:
-            mask = reduce_mask(mask.to(self.model.device), width, height)
-        return over_background(image, self._background), mask
+        _, image, mask = self.views.at(int(batch["image_idx"]), factor)
+        try:
+            terms, self._output = training_step(self.model.scene, camera, image, mask, self.schedule, step, self.config)
+        except TrainingDiverged as error:
+            self._diverged(step, error)
+        return terms
 
     def after(self, step: int) -> None:
         """Densify and prune; then, with the clock stopped, note how far the run has come."""
-        fragments = int(self._output.fragments.weight.shape[0])
+        scene, factor = self.model.scene, self.schedule.resolution_factor(step)
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(self._output)
         self._output = None
+        optimizers = {name: self.optimizers.optimizers[name] for name in scene.surfels.keys()}
         try:
-            report = self.strategy.step(step, self.model.scene, self._surfel_optimizers(), self._draw_views)
+            report = self.strategy.step(step, scene, optimizers, lambda k, g: self.views.draw(k, g, factor))
         except ValueError as error:
-            fail(f"training cannot go on after step {step}: {error}. Lower learning rates may help.", error)
+            self._diverged(step, error)
         self.clock.stop()
         if report:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
         if step in self.curve_steps:
-            self._add_point(step, fragments)
+            self._add_point(step)
 
-    def _surfel_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        return {name: self.optimizers.optimizers[name] for name in self.model.scene.surfels.keys()}
+    def _diverged(self, step: int, error: ValueError) -> NoReturn:
+        fail(
+            f"training cannot go on at step {step}: {error}. Earlier checkpoints are kept; lower learning rates "
+            "(--pipeline.model.train.lr.*) may help.",
+            error,
+        )
 
     def _on_resize(self, name: str, parameter: Parameter) -> None:
         self.optimizers.parameters[name] = [parameter]  # used by gradient clipping
 
-    def _draw_views(self, count: int, generator: torch.Generator) -> list[View]:
-        """Different training views at the current resolution; the order of training is not touched."""
-        factor = self.schedule.resolution_factor(self.step)
-        chosen = torch.randperm(len(self.datamanager.train_dataset), generator=generator)[:count].tolist()
-        views = []
-        for index in chosen:
-            cameras, batch = self.datamanager.train_view(index)
-            camera = to_camera(cameras, self.model.device).scaled(factor)
-            image = reduce_image(as_float(batch["image"].to(self.model.device)), camera.width, camera.height)
-            mask = batch.get("mask")
-            if mask is not None:
-                mask = reduce_mask(mask.to(self.model.device), camera.width, camera.height)
-            views.append(View(camera, image, mask))
-        return views
-
     # the curve
 
-    def _add_point(self, step: int, fragments: int) -> None:
+    def _add_point(self, step: int) -> None:
+        quality = self._held_out(all_views=step + 1 >= self.total)
         point = {
             "step": step + 1,
             "seconds": round(self.clock.seconds, 4),
             "cpu_seconds": round(self.clock.cpu_seconds, 4),
             "surfels": len(self.model.scene),
-            "fragments": fragments,
         }
-        score = self._held_out_psnr(all_views=step + 1 >= self.total)
-        if score is not None:
-            point["psnr"] = round(score, 4)
-            writer.put_scalar("Held-out PSNR", torch.tensor(score), step)
+        shown = ""
+        if quality is not None:
+            point["psnr"], point["fragments"] = (round(value, 4) for value in quality)
+            shown = f"{quality[0]:6.2f} dB held out, "
+            writer.put_scalar("Held-out PSNR", torch.tensor(quality[0]), step)
         self.curve.add({**point, **self.names})
-        shown = "" if score is None else f"{score:6.2f} dB held out, "
         CONSOLE.print(
             f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
             f"{self.clock.seconds:.0f} s of training"
         )
 
     @torch.no_grad()
-    def _held_out_psnr(self, all_views: bool) -> float | None:
-        """Mean PSNR over held-out views at full size."""
+    def _held_out(self, all_views: bool) -> tuple[float, float] | None:
+        """Mean PSNR and mean number of fragments over held-out views at full size."""
         count = len(self.datamanager.eval_dataset)
         if count == 0:
             return None
@@ -204,9 +176,27 @@ class TrainingRun:
         values = []
         for index in sorted({round(i * (count - 1) / max(1, used - 1)) for i in range(used)}):
             cameras, batch = self.datamanager.eval_view(index)
-            camera = to_camera(cameras, self.model.device)
-            rgb = self.model.render(camera, background, maps=False).rgb.clamp(0.0, 1.0)
+            output = self.model.render(to_camera(cameras, self.model.device), background, maps=False)
+            rgb = output.rgb.clamp(0.0, 1.0)
             target = over_background(as_float(batch["image"].to(rgb.device)), background)
             mask = batch.get("mask")
-            values.append(psnr(rgb * mask, target * mask, mask) if mask is not None else psnr(rgb, target))
-        return sum(values) / len(values)
+            if mask is not None:
+                mask = mask.to(rgb.device)
+                rgb, target = rgb * mask, target * mask
+            values.append((psnr(rgb, target, mask), float(len(output.fragments.weight))))
+        first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
+        return first, second
+
+
+class _TrainViews(Sequence):
+    """The data manager's training views in the form that the training code takes, read when they are asked for."""
+
+    def __init__(self, datamanager: BitymiDataManager) -> None:
+        self._datamanager = datamanager
+
+    def __len__(self) -> int:
+        return len(self._datamanager.train_dataset)
+
+    def __getitem__(self, index: Any) -> View:
+        cameras, batch = self._datamanager.train_view(int(index))
+        return View(to_camera(cameras), batch["image"], batch.get("mask"))

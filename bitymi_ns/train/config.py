@@ -60,7 +60,7 @@ class DensifyConfig:
     reset_interval: int = 3000
     """Steps between opacity resets (until `stop`)."""
     reset_opacity: float = 0.01
-    """Opacity after a reset, at most."""
+    """Opacity after a reset, at most. Runs of fewer than about 3,700 steps reset to a higher one (`Schedule`)."""
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
     """Steps of the final multi-view prunes."""
     final_prune_opacity: float = 0.1

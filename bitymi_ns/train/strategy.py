@@ -134,7 +134,7 @@ class Strategy:
             report |= self._densify(step, scene, optimizers, views)
         if self.schedule.is_reset_step(step):
             report["opacity_reset"] = cap_opacity(
-                scene.surfels, optimizers, self.config.densify.reset_opacity, forget_all=True
+                scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
             )
         if self.schedule.is_final_prune_step(step):
             report |= self._final_prune(scene, optimizers, views)
@@ -221,6 +221,8 @@ class Strategy:
     def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         """Remove surfels that are broken or can never be seen again, and those beyond the cap."""
         surfels = scene.surfels
+        if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
+            raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
         finite = torch.ones(len(scene), dtype=torch.bool, device=surfels["means"].device)
         for p in surfels.values():
             finite &= p.detach().reshape(len(p), -1).isfinite().all(-1)

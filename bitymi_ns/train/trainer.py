@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -194,7 +195,7 @@ class Trainer:
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
             "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "optimizers": {name: copy.deepcopy(optimizer.state_dict()) for name, optimizer in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),
         }
 
@@ -205,7 +206,7 @@ class Trainer:
         self.scene.resize(len(state["scene"]["surfels.means"]))
         self.scene.load_state_dict(state["scene"])
         for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
+            optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.strategy.load_state_dict(state["strategy"])
         self.step = state["step"]
         self.seconds, self.cpu_seconds = state["seconds"], state["cpu_seconds"]

@@ -88,3 +88,8 @@ def test_learning_rates():
 def test_unusable_extent_is_refused(extent):
     with pytest.raises(ValueError, match="extent"):
         Schedule(TrainConfig(), 100, extent)
+
+
+@pytest.mark.parametrize(("max_steps", "opacity"), [(30_000, 0.01), (3700, 0.01), (2000, 0.0759), (200, 0.4378)])
+def test_resets_leave_time_to_recover(max_steps, opacity):
+    assert Schedule(TrainConfig(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bitymi_ns import ops
+from bitymi_ns.train.config import LossConfig
+from bitymi_ns.train.losses import beta_only_map, error_weight, falloff, objective, photometric
+
+
+@pytest.fixture
+def pair():
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(20, 24, 3, generator=generator), torch.rand(20, 24, 3, generator=generator)
+
+
+def test_photometric_is_the_weighted_sum(pair):
+    rgb, target = pair
+    expected = 0.8 * (rgb - target).abs().mean() + 0.2 * (1 - ops.ssim(rgb, target))
+    torch.testing.assert_close(photometric(rgb, target, 0.2), expected)
+    assert photometric(rgb, rgb, 0.2) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (10, 10)])
+def test_images_without_an_ssim_window_are_judged_by_l1(size):
+    rgb, target = torch.full((*size, 3), 0.25), torch.full((*size, 3), 0.5)
+    assert photometric(rgb, target, 0.2) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("shape", [(20, 24), (20, 24, 1)])
+def test_excluded_pixels_have_no_say(pair, shape):
+    rgb, target = pair
+    mask = torch.ones(20, 24, dtype=torch.bool)
+    mask[3:9, 5:20] = False
+    poisoned = target.clone()
+    poisoned[~mask] = math.nan
+    a = rgb.clone().requires_grad_()
+    loss = photometric(a, poisoned, 0.2, mask.reshape(shape))
+    loss.backward()
+    assert torch.isfinite(loss) and torch.isfinite(a.grad).all()
+    assert (a.grad[~mask] == 0).all() and (a.grad[mask] != 0).any()
+    other = rgb.clone()
+    other[~mask] = 0.7
+    assert photometric(other, target, 0.2, mask) == pytest.approx(loss.item())
+    l1 = (rgb - target).abs()[mask].mean()
+    assert photometric(rgb, target, 0.0, mask) == pytest.approx(l1.item())
+
+
+def test_nothing_counts():
+    mask = torch.zeros(16, 16, dtype=torch.bool)
+    rgb = torch.rand(16, 16, 3, requires_grad=True)
+    loss = photometric(rgb, torch.zeros(16, 16, 3), 0.2, mask) + falloff(
+        rgb, torch.zeros(16, 16, 3), torch.ones(16, 16, 1), 25.0, mask=mask
+    )
+    loss.backward()
+    assert loss == 0 and (rgb.grad == 0).all()
+
+
+def test_error_weight_follows_the_paper(pair):
+    rgb, target = pair
+    l1 = (rgb - target).abs().sum(-1, keepdim=True)
+    torch.testing.assert_close(error_weight(rgb, target, 25.0), torch.exp(-25 * l1))
+    mse = ((rgb - target) ** 2).mean(-1, keepdim=True)
+    torch.testing.assert_close(error_weight(rgb, target, 25.0, "mse"), torch.exp(-25 * mse))
+    with pytest.raises(ValueError, match="falloff_error"):
+        error_weight(rgb, target, 25.0, "l2")
+
+
+def test_falloff_gives_no_gradient_to_the_colours(pair):
+    rgb, target = pair
+    a, beta = rgb.clone().requires_grad_(), torch.rand(20, 24, 1).requires_grad_()
+    falloff(a, target, beta, 25.0).backward()
+    assert a.grad is None
+    torch.testing.assert_close(beta.grad, error_weight(rgb, target, 25.0) / (20 * 24))
+
+
+def test_beta_only_moves_beta_alone(make_scene, views):
+    scene = make_scene(texture=False)
+    output = scene.render(views[0].camera)
+    beta = beta_only_map(output, scene.surfels["beta_raw"])
+    torch.testing.assert_close(beta, output.beta)
+    falloff(output.rgb, views[0].image, beta, 25.0).backward()
+    moved = [name for name, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()]
+    assert moved == ["beta_raw"]
+    output = scene.render(views[0].camera)
+    falloff(output.rgb, views[0].image, output.beta, 25.0).backward()
+    assert (scene.surfels["opacity_logits"].grad != 0).any()
+
+
+def test_objective_has_the_terms_that_are_on(make_scene, views):
+    scene = make_scene(texture=False)
+    output, target = scene.render(views[0].camera), views[0].image
+    beta_raw = scene.surfels["beta_raw"]
+    terms = objective(output, target, beta_raw, LossConfig())
+    assert set(terms) == {"photometric", "falloff"}
+    torch.testing.assert_close(terms["falloff"], 0.005 * falloff(output.rgb, target, output.beta, 25.0))
+    same = objective(output, target, beta_raw, LossConfig(falloff_gradient="beta_only"))
+    torch.testing.assert_close(same["falloff"], terms["falloff"])
+    assert set(objective(output, target, beta_raw, LossConfig(falloff_weight=0.0))) == {"photometric"}

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.score import bad_pixels, multi_view_scores, normalise
+from bitymi_ns.train.views import View
+
+
+def test_normalise():
+    torch.testing.assert_close(normalise(torch.tensor([2.0, 4, 3])), torch.tensor([0.0, 1, 0.5]))
+    assert normalise(torch.full((3,), 7.0)).tolist() == [0, 0, 0]
+    assert normalise(torch.tensor([0.0, math.inf])).tolist() == [0, 0]
+    assert normalise(torch.zeros(0)).shape == (0,)
+
+
+def test_bad_pixels_are_relative_to_the_worst_pixel_that_counts():
+    rgb, target = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
+    target[0, 0], target[0, 1], target[1, 0] = 0.8, 0.05, 0.2
+    assert bad_pixels(rgb, target, 0.1).tolist() == [[True, False], [True, False]]
+    mask = torch.tensor([[False, True], [True, True]])
+    assert bad_pixels(rgb, target, 0.1, mask).tolist() == [[False, True], [True, False]]
+    assert not bad_pixels(rgb, rgb, 0.1).any()
+    assert not bad_pixels(rgb, target, 0.1, torch.zeros(2, 2, dtype=torch.bool)).any()
+
+
+def test_scores_count_fragments_on_bad_pixels(make_scene, views):
+    scene, config = make_scene(), TrainConfig()
+    masked = views[2]._replace(mask=torch.arange(48)[:, None].expand(48, 48) > 20)
+    chosen = [views[0], views[1], masked]
+    scores = multi_view_scores(scene, chosen, config)
+    counts = torch.zeros(3, len(scene), dtype=torch.int64)
+    losses = []
+    for j, (camera, image, mask) in enumerate(chosen):
+        with torch.no_grad():
+            output = scene.render(camera)
+        bad = bad_pixels(output.rgb, image, 0.1, mask).flatten()
+        for surfel, pixel in zip(output.fragments.surfel.tolist(), output.fragments.pixel.tolist(), strict=True):
+            counts[j, surfel] += bool(bad[pixel])
+        losses.append(photometric(output.rgb, image, 0.2, mask).item())
+    assert counts.sum() > 100
+    assert scores.importance.tolist() == (counts.sum(0) // 3).tolist()
+    expected = normalise((torch.tensor(losses).double()[:, None] * counts).sum(0))
+    torch.testing.assert_close(scores.prune.double(), expected, atol=1e-6, rtol=1e-5)
+    assert all(p.grad is None for p in scene.parameters())
+
+
+def test_scores_do_not_depend_on_a_random_background(make_scene, views):
+    scene = make_scene(texture=False)
+    random = multi_view_scores(scene, views[:2], TrainConfig(background="random"))
+    black = multi_view_scores(scene, views[:2], TrainConfig())
+    assert random.importance.tolist() == black.importance.tolist()
+
+
+def test_no_views_and_perfect_views_give_zero_scores(make_scene, views):
+    scene = make_scene(texture=False)
+    with torch.no_grad():
+        perfect = View(views[0].camera, scene.render(views[0].camera).rgb)
+    for chosen in ([], [perfect]):
+        scores = multi_view_scores(scene, chosen, TrainConfig())
+        assert scores.importance.sum() == 0 and scores.prune.sum() == pytest.approx(0)

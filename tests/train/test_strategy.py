@@ -1,0 +1,341 @@
+"""Rules of densification and pruning, with the multi-view scores given."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train import strategy as module
+from bitymi_ns.train.config import DensifyConfig, TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.init import surfels_from_points
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.score import Scores
+from bitymi_ns.train.strategy import Strategy
+from bitymi_ns.train.trainer import make_optimizers
+
+DENSIFY, RESET, FINAL, LATE_DENSIFY = 1000, 3000, 18_000, 4000
+LARGE, SMALL = math.log(0.01), math.log(0.0001)  # against dense * extent = 0.001
+
+
+class Bench:
+    """A scene of n opaque surfels in a row, its optimisers with some momentum, and scores that a test sets."""
+
+    def __init__(self, monkeypatch, n=40, **densify):
+        xyz = torch.stack([torch.arange(float(n)), torch.zeros(n), torch.zeros(n)], -1)
+        surfels, _ = surfels_from_points(xyz, torch.rand(n, 3), torch.zeros(0, 3), TrainConfig(), SceneConfig())
+        surfels["opacity_logits"].fill_(1.0)
+        surfels["log_scales"].fill_(SMALL)
+        self.scene = Scene(SceneConfig(), surfels, None)
+        self.optimizers = make_optimizers(self.scene)
+        for name, optimizer in self.optimizers.items():
+            self.scene.surfels[name].grad = torch.ones_like(self.scene.surfels[name])
+            optimizer.step()  # with rate 0: moments only
+        densify = {"min_surfels": 1, **densify}
+        self.config = TrainConfig(densify=DensifyConfig(**densify))
+        self.strategy = Strategy(self.config, Schedule(self.config, 30_000), extent=1.0)
+        self.importance = torch.zeros(n, dtype=torch.int64)
+        self.prune = torch.zeros(n)
+        self.asked = []
+        monkeypatch.setattr(module, "multi_view_scores", self._scores)
+
+    def _scores(self, scene, views, config):
+        # rows are known by their x: scores stay with their surfels when rows were dropped before
+        rows = scene.surfels["means"][:, 0].detach().nan_to_num(0).round().long()
+        return Scores(self.importance[rows], self.prune[rows])
+
+    def views(self, k, generator):
+        self.asked.append(k)
+        return []
+
+    def see(self, grad=0.0, absgrad=0.0, radius=5.0, visible=None):
+        """One accumulated view of 200 x 100 pixels; gradients [n] or numbers in NDC along x."""
+        n = len(self.scene)
+        ndc = [torch.as_tensor(g, dtype=torch.float32).expand(n) for g in (grad, absgrad)]
+        pixels = [torch.stack([g / 100.0, torch.zeros(n)], -1) for g in ndc]
+        projection = SimpleNamespace(
+            visible=torch.ones(n, dtype=torch.bool) if visible is None else visible,
+            mean2d_grad=pixels[0],
+            mean2d_absgrad=pixels[1],
+            radii=torch.as_tensor(radius, dtype=torch.float32).expand(n)[:, None].expand(n, 2),
+        )
+        self.strategy.accumulate(SimpleNamespace(projection=projection, rgb=torch.zeros(100, 200, 3)))
+
+    def step(self, at):
+        return self.strategy.step(at, self.scene, self.optimizers, self.views)
+
+    def set(self, name, rows, value):
+        with torch.no_grad():
+            self.scene.surfels[name][rows] = value
+
+    @property
+    def x(self):
+        return [round(x) for x in self.scene.surfels["means"][:, 0].tolist()]
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    return lambda n=40, **densify: Bench(monkeypatch, n, **densify)
+
+
+def check(bench):
+    n = len(bench.scene)
+    for name, p in bench.scene.surfels.items():
+        assert len(p) == n and torch.isfinite(p).all()
+        assert bench.optimizers[name].param_groups[0]["params"] == [p]
+        assert bench.optimizers[name].state[p]["exp_avg"].shape == p.shape
+    assert len(bench.strategy.grad_sum) == n
+
+
+def test_nothing_happens_between_events(bench):
+    b = bench()
+    b.see(1.0, 1.0)
+    for step in (0, 1, 500, 999, 1001, 15_000, 29_999):
+        assert b.step(step) == {}
+    assert len(b.scene) == 40 and b.asked == []
+
+
+def test_statistics_are_means_over_the_views_that_saw_a_surfel(bench):
+    b = bench(4)
+    b.see(torch.tensor([1e-4, 2e-4, 3e-4, math.nan]), 1.0, radius=3.0)
+    b.see(1e-4, 0.0, radius=torch.tensor([9.0, 1, 9, 1]), visible=torch.tensor([True, False, True, True]))
+    torch.testing.assert_close(b.strategy.grad_sum, torch.tensor([2e-4, 2e-4, 4e-4, 1e-4]))
+    assert b.strategy.visible_count.tolist() == [2, 1, 2, 2]
+    assert b.strategy.max_radius.tolist() == [9, 3, 9, 3]
+
+
+def test_pixels_become_ndc_with_the_size_of_the_image(bench):
+    b = bench(1)
+    projection = SimpleNamespace(
+        visible=torch.tensor([True]),
+        mean2d_grad=torch.tensor([[3.0, 4.0]]),
+        mean2d_absgrad=torch.tensor([[6.0, 8.0]]),
+        radii=torch.ones(1, 2),
+    )
+    b.strategy.accumulate(SimpleNamespace(projection=projection, rgb=torch.zeros(10, 20, 3)))
+    assert b.strategy.grad_sum.item() == pytest.approx(math.hypot(30, 20))
+    assert b.strategy.abs_grad_sum.item() == pytest.approx(math.hypot(60, 40))
+
+
+def test_clone_and_split_need_score_gradient_and_size(bench):
+    b = bench(8)
+    #              0     1     2     3     4     5     6     7
+    b.importance = torch.tensor([6, 5, 6, 6, 6, 5, 6, 6])
+    b.set("log_scales", [4, 5, 6, 7], LARGE)
+    grad = torch.tensor([2.1e-4, 1.0, 1.9e-4, 1.9e-4, 1.0, 1.0, 1.0, 0.0])
+    absgrad = torch.tensor([0.0, 1.0, 0.0, 1.0, 7.1e-4, 1.0, 6.9e-4, 6.9e-4])
+    b.see(grad, absgrad)
+    report = b.step(DENSIFY)
+    assert (report["cloned"], report["split"], report["pruned"], report["surfels"]) == (1, 1, 0, 10)
+    assert b.x[:8] == [0, 1, 2, 3, 5, 6, 7, 0]
+    assert b.asked == [10]
+    check(b)
+
+
+def test_children_lie_in_the_disc_of_their_parent(bench):
+    b = bench(1, max_surfels=0)
+    b.importance[:] = 9
+    b.set("log_scales", 0, torch.tensor([math.log(0.2), math.log(0.05)]))
+    b.set("quats", 0, torch.tensor([0.5, -1.0, 2.0, 0.3]))
+    parent = {name: p.detach().clone() for name, p in b.scene.surfels.items()}
+    offsets = []
+    for seed in range(300):
+        b.strategy.generator.manual_seed(seed)
+        halves = b.strategy._halves(b.scene.surfels, torch.tensor([0]))
+        offsets.append(halves["means"] - parent["means"])
+    offsets = torch.cat(offsets)
+    u, v = module.tangents(parent["quats"])
+    assert (offsets @ torch.linalg.cross(u, v).T).abs().max() < 1e-5
+    assert (offsets @ u.T).std().item() == pytest.approx(0.2, rel=0.1)
+    assert (offsets @ v.T).std().item() == pytest.approx(0.05, rel=0.1)
+    torch.testing.assert_close(halves["log_scales"].exp(), parent["log_scales"].exp().expand(2, 2) / 1.6)
+    for name in set(parent) - {"means", "log_scales"}:
+        torch.testing.assert_close(halves[name], parent[name].repeat_interleave(2, 0))
+
+
+def test_clones_equal_their_parents_and_start_without_momentum(bench):
+    b = bench(5)
+    b.importance[2] = 9
+    b.set("opacity_logits", 2, 0.5)
+    b.see(1.0)
+    b.step(DENSIFY)
+    for name, p in b.scene.surfels.items():
+        torch.testing.assert_close(p[5], p[2])
+        assert (b.optimizers[name].state[p]["exp_avg"][5:] == 0).all()
+    assert (b.strategy.grad_sum == 0).all() and (b.strategy.visible_count == 0).all()
+
+
+def test_half_of_the_candidates_are_drawn_from_all(bench):
+    b = bench(1000)
+    b.set("opacity_logits", slice(0, 500), -5.3)  # 0.00497: candidate, but visible
+    b.step(DENSIFY)
+    removed = 1000 - len(b.scene)
+    # 250 draws out of 1000 rows of equal weight: about 125 of them hit a candidate
+    assert 95 <= removed <= 155
+    assert set(range(500, 1000)) <= set(b.x)
+
+
+def test_a_high_score_draws_the_lot(bench):
+    b = bench(400)
+    b.set("opacity_logits", slice(0, 20), -5.3)
+    b.prune[:10] = 1.0  # weight 1e6 against 1: the budget of 10 falls on these
+    b.step(DENSIFY)
+    assert sorted(set(range(400)) - set(b.x)) == list(range(10))
+
+
+def test_scores_stay_aligned_when_others_are_split_or_dropped(bench):
+    b = bench(100)
+    b.set("log_scales", slice(0, 30), LARGE)
+    b.importance[:30] = 9
+    b.set("means", 30, math.nan)
+    b.set("opacity_logits", slice(40, 60), -5.3)
+    b.prune[40:50] = 1.0
+    b.see(0.0, 1.0)
+    report = b.step(DENSIFY)
+    assert report["split"] == 30 and report["not_finite"] == 1
+    gone = set(range(100)) - set(b.x)
+    # children stay within a few hundredths of their parents, so they round to them
+    assert gone == set(range(40, 50)) | {30}
+    check(b)
+
+
+@pytest.mark.parametrize(("step", "gone"), [(DENSIFY, set()), (LATE_DENSIFY, {3})])
+def test_size_on_screen_counts_after_the_first_reset(bench, step, gone):
+    b = bench(8, prune_budget=1.0)
+    b.prune[3] = 1.0
+    radius = torch.full((8,), 20.0)
+    radius[3] = 20.5
+    b.see(radius=radius)
+    b.step(step)
+    assert set(range(8)) - set(b.x) == gone
+
+
+def test_size_in_the_world_makes_a_candidate(bench):
+    b = bench(8, prune_budget=1.0)
+    b.set("log_scales", 5, torch.tensor([math.log(0.11), SMALL]))
+    b.prune[5] = 1.0
+    b.step(DENSIFY)
+    assert set(range(8)) - set(b.x) == {5}
+
+
+def test_opacities_are_clamped_at_densification_and_reset_on_time(bench):
+    b = bench(6)
+    b.set("opacity_logits", slice(0, 3), 4.0)
+    b.step(DENSIFY)
+    opacity = b.scene.surfels["opacity_logits"].sigmoid()
+    torch.testing.assert_close(opacity[:3], torch.full((3,), 0.8))
+    assert opacity[3:].min() > 0.7
+    report = b.step(RESET)
+    assert report["opacity_reset"] == 6
+    logits = b.scene.surfels["opacity_logits"]
+    torch.testing.assert_close(logits.sigmoid(), torch.full((6,), 0.01))
+    assert (b.optimizers["opacity_logits"].state[logits]["exp_avg"] == 0).all()
+
+
+@pytest.mark.parametrize("cap", [40, 41, 47, 60])
+def test_the_cap_is_met_exactly_and_the_most_important_grow(bench, cap):
+    b = bench(40, max_surfels=cap)
+    b.importance = torch.arange(40) + 10
+    b.set("log_scales", slice(0, 40, 2), LARGE)
+    b.see(1.0, 1.0)
+    b.step(DENSIFY)
+    assert len(b.scene) == cap
+    grown = {x for x in b.x if b.x.count(x) == 2}
+    assert grown == set(range(40 - (cap - 40), 40))
+    check(b)
+
+
+def test_a_scene_over_the_cap_loses_its_faintest(bench):
+    b = bench(20, max_surfels=12)
+    b.set("opacity_logits", slice(0, 20), torch.linspace(-2, 2, 20))
+    b.step(DENSIFY)
+    assert b.x == list(range(8, 20))
+
+
+def test_broken_rows_go_and_invisible_ones_too(bench):
+    b = bench(10)
+    b.set("means", 1, math.nan)
+    b.set("sv_rgb", 2, math.inf)
+    b.set("opacity_logits", 3, -6.0)
+    b.set("opacity_logits", 4, -5.5)  # 0.00407, above 1/255
+    report = b.step(DENSIFY)
+    assert (report["not_finite"], report["invisible"]) == (2, 1)
+    assert set(range(10)) - set(b.x) <= {1, 2, 3, 4} and {1, 2, 3}.isdisjoint(b.x)
+    check(b)
+
+
+def test_a_scene_without_a_finite_row_is_an_error(bench):
+    b = bench(3)
+    b.set("quats", slice(0, 3), math.nan)
+    with pytest.raises(TrainingDiverged, match=r"quats.*row 0"):
+        b.step(DENSIFY)
+
+
+def test_final_prune_removes_the_transparent_and_the_bad(bench):
+    b = bench(10)
+    b.set("opacity_logits", 0, -2.3)
+    b.prune[7] = 0.91
+    b.prune[8] = 0.9
+    report = b.step(FINAL)
+    assert b.x == [1, 2, 3, 4, 5, 6, 8, 9]
+    assert (report["pruned"], report["surfels"]) == (2, 8)
+    check_optimizers = b.optimizers["means"].state[b.scene.surfels["means"]]
+    assert len(check_optimizers["exp_avg"]) == 8
+
+
+@pytest.mark.parametrize(("n", "least", "left"), [(10, 4, 4), (10, 100, 10), (10, 0, 1)])
+def test_a_prune_never_empties_the_scene(bench, n, least, left):
+    for logit in (-3.0, -9.0):
+        b = bench(n, min_surfels=least)
+        b.set("opacity_logits", slice(0, n), torch.linspace(logit, logit + 0.1, n))
+        for step in (FINAL, FINAL + 3000, DENSIFY):
+            b.step(step)
+            assert len(b.scene) == left
+        assert b.x == list(range(n - left, n))  # the most opaque ones
+
+
+def test_minimum_holds_in_densification(bench):
+    b = bench(30, min_surfels=25, prune_budget=1.0)
+    b.set("opacity_logits", slice(0, 30), -5.3)
+    b.step(DENSIFY)
+    assert len(b.scene) == 25
+
+
+def test_state_survives_a_round_trip_and_the_lots_are_the_same(bench):
+    first, second = bench(200), bench(200)
+    for b in (first, second):
+        b.set("opacity_logits", slice(0, 200, 2), -5.3)
+        b.see(1e-4, 2e-4)
+    first.strategy._draw(torch.ones(10, dtype=torch.float64), 3)  # move the generator on
+    state = first.strategy.state_dict()
+    second.strategy.load_state_dict(state)
+    for b in (first, second):
+        b.step(DENSIFY)
+    assert first.x == second.x and len(first.x) < 200
+    for name in module.STATISTICS:
+        assert isinstance(state[name], torch.Tensor)
+    with pytest.raises(ValueError, match="differ in length"):
+        second.strategy.load_state_dict({**state, "grad_sum": torch.zeros(3)})
+
+
+def test_a_view_of_another_scene_is_refused(bench):
+    b = bench(4)
+    b.see()
+    b.scene.resize(7)
+    with pytest.raises(ValueError, match="4 surfels, but 7"):
+        b.see()
+
+
+def test_lots_follow_their_weights(bench):
+    strategy = bench(1).strategy
+    weights = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64)
+    first = [int(strategy._draw(weights, 1)[0]) for _ in range(2000)]
+    assert first.count(0) == 0 and first.count(2) / 2000 == pytest.approx(0.75, abs=0.04)
+    assert sorted(strategy._draw(weights, 3).tolist()) == [1, 2]
+    assert len(strategy._draw(weights, 0)) == 0
+    assert len(strategy._draw(weights[:0], 5)) == 0

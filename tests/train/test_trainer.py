@@ -1,0 +1,133 @@
+"""Training with the real renderer, small and short."""
+
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+import bitymi_ns.train
+from bitymi_ns.train.config import DensifyConfig, TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.trainer import Trainer, evaluate, fit, training_step
+from bitymi_ns.train.views import View
+
+
+def test_a_short_run_is_a_proper_run(make_scene, views):
+    scene, config = make_scene(), TrainConfig(densify=DensifyConfig(max_surfels=400))
+    before, _ = evaluate(scene, views[:1], config)
+    seen = []
+    log = fit(
+        scene, views[1:], views[:1], config, 200, callback=lambda t, *_: seen.append(len(t.scene)), eval_steps=[100]
+    )
+    assert [entry.step for entry in log.entries] == [100, 200]
+    assert log.entries[-1].psnr > before + 3.0
+    assert log.entries[-1].loss < 0.12
+    assert log.entries[1].seconds > log.entries[0].seconds > 0 and log.entries[1].cpu_seconds > 0
+    assert log.entries[-1].fragments > 0 and log.entries[-1].surfels == len(scene)
+    assert len(seen) == 200 and max(seen) <= 400
+    assert sum("split" in event for event in log.events) == 28
+    assert sum("opacity_reset" in event for event in log.events) == 4
+    assert all(torch.isfinite(p).all() for p in scene.parameters())
+
+
+@pytest.mark.parametrize("options", [{"background": "random"}, {"freeze_every": 1}])
+def test_a_resumed_run_is_the_same_run(make_scene, views, options):
+    config = TrainConfig(densify=DensifyConfig(max_surfels=250), **options)
+    straight = Trainer(make_scene(), views, config, 60)
+    for _ in range(14):
+        straight.advance()
+    state = straight.state_dict()
+    resumed = Trainer(make_scene(every=5), views, config, 60)
+    resumed.load_state_dict(state)
+    for _ in range(14, 40):  # over densifications, resets and a final prune
+        straight.advance()
+        resumed.advance()
+    assert len(resumed.scene) == len(straight.scene) != len(state["scene"]["surfels.means"])
+    for (name, a), (_, b) in zip(straight.scene.named_parameters(), resumed.scene.named_parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6, msg=name)
+    with pytest.raises(ValueError, match="60 steps"):
+        Trainer(make_scene(), views, config, 61).load_state_dict(state)
+
+
+def test_the_field_learns_on_its_steps_only(make_scene, views):
+    scene, config = make_scene(), TrainConfig(resolution_schedule=0)
+    schedule = Schedule(config, 600)
+    for step, learns in ((0, True), (99, True), (101, False), (110, True)):
+        scene.zero_grad(set_to_none=True)
+        terms, output = training_step(scene, *views[0], schedule, step, config)
+        sum(terms.values()).backward()
+        assert (scene.field.field_w3.grad is not None) == learns
+        assert scene.surfels["means"].grad is not None
+        assert output.rgb.shape == (48, 48, 3)
+
+
+def test_low_resolution_steps_take_either_picture(make_scene, views):
+    scene, config = make_scene(texture=False), TrainConfig()
+    schedule = Schedule(config, 3000)
+    camera, image, _ = views[0]
+    terms, output = training_step(scene, camera, image, None, schedule, 0, config)
+    assert output.rgb.shape == (12, 12, 3)
+    small = image.reshape(12, 4, 12, 4, 3).mean((1, 3))
+    again, _ = training_step(scene, camera, small, None, schedule, 0, config)
+    torch.testing.assert_close(again["photometric"], terms["photometric"])
+
+
+def test_images_with_alpha_and_bytes_and_masks(make_scene, views):
+    scene, config = make_scene(texture=False), TrainConfig(background="white", resolution_schedule=0)
+    schedule = Schedule(config, 100)
+    camera, image, _ = views[0]
+    rgba = torch.cat([image, torch.ones(48, 48, 1)], -1)
+    rgba[:, :10] = torch.tensor([0.3, 0.9, 0.1, 0.0])  # nothing there: the background shows
+    white = image.clone()
+    white[:, :10] = 1.0
+    mask = torch.zeros(48, 48, 1, dtype=torch.bool)
+    mask[10:] = True
+    results = []
+    for picture in (rgba, white, (rgba * 255).round().to(torch.uint8)):
+        terms, _ = training_step(scene, camera, picture, mask, schedule, 3, config)
+        results.append(terms["photometric"].item())
+    assert results[0] == pytest.approx(results[1], abs=1e-6)
+    assert results[0] == pytest.approx(results[2], abs=2e-3)
+    assert math.isfinite(evaluate(scene, [View(camera, rgba, mask)], config)[0])
+
+
+def test_divergence_names_step_field_and_row(make_scene, views):
+    scene, config = make_scene(texture=False), TrainConfig()
+    trainer = Trainer(scene, [View(views[0].camera, torch.full((48, 48, 3), math.nan))], config, 100)
+    with pytest.raises(TrainingDiverged, match="photometric loss is nan at step 0: all parameters are finite"):
+        trainer.advance()
+
+
+def test_a_broken_field_is_noticed(make_scene, views):
+    scene = make_scene()
+    trainer = Trainer(scene, views, TrainConfig(), 60)
+    with torch.no_grad():
+        scene.field.field_w3[4] = math.nan
+    with pytest.raises(TrainingDiverged, match="texture field is broken: field_.* is not finite"):
+        for _ in range(4):
+            trainer.advance()
+
+
+def test_views_that_see_nothing_and_runs_of_one_step(make_scene, views):
+    scene = make_scene()
+    away = views[0].camera.viewmat.clone()
+    away[2, 3] = -50.0
+    camera = type(views[0].camera)(away, views[0].camera.K, 48, 48)
+    log = fit(scene, [View(camera, views[0].image)], [], TrainConfig(), 3)
+    assert math.isnan(log.entries[-1].psnr) and math.isfinite(log.entries[-1].loss)
+    fit(make_scene(), views[:1], views[:1], TrainConfig(), 1)
+    with pytest.raises(ValueError, match="no views"):
+        fit(make_scene(), [], [], TrainConfig(), 1)
+
+
+def test_training_knows_nothing_of_nerfstudio():
+    for file in Path(bitymi_ns.train.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any(name.split(".")[0] == "nerfstudio" for name in names), file.name

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns.train.views import (
+    ReducedViews,
+    View,
+    as_float,
+    at_size,
+    background_color,
+    over_background,
+    reduce_image,
+    reduce_mask,
+    training_order,
+)
+
+
+def test_area_average():
+    image = torch.rand(8, 12, 3)
+    small = reduce_image(image, 6, 4)
+    torch.testing.assert_close(small, image.reshape(4, 2, 6, 2, 3).mean((1, 3)))
+    assert reduce_image(image, 12, 8) is image
+
+
+def test_hidden_colours_do_not_bleed_in():
+    image = torch.zeros(2, 2, 4)
+    image[0, 0] = torch.tensor([1.0, 0.5, 0.0, 1.0])
+    image[0, 1] = torch.tensor([0.0, 1.0, 1.0, 0.0])
+    torch.testing.assert_close(reduce_image(image, 1, 1)[0, 0], torch.tensor([1.0, 0.5, 0.0, 0.25]))
+
+
+def test_a_reduced_pixel_counts_when_all_of_it_does():
+    mask = torch.ones(4, 4, dtype=torch.bool)
+    mask[0, 3] = False
+    assert reduce_mask(mask, 2, 2)[..., 0].tolist() == [[True, False], [True, True]]
+
+
+def test_background():
+    assert background_color("black", 0, 0) is None
+    assert background_color("white", 0, 0).tolist() == [1, 1, 1]
+    a, b = background_color("random", 0, 5), background_color("random", 0, 6)
+    assert (a != b).all() and (a == background_color("random", 0, 5)).all()
+    image = torch.tensor([[[1.0, 1.0, 1.0, 0.25]]])
+    torch.testing.assert_close(over_background(image, a)[0, 0], 0.25 + 0.75 * a)
+    assert over_background(image, None)[0, 0].tolist() == [0.25] * 3
+    with pytest.raises(ValueError, match="background"):
+        background_color("grey", 0, 0)
+
+
+def test_bytes_become_unit_floats():
+    assert as_float(torch.tensor([0, 255], dtype=torch.uint8)).tolist() == [0, 1]
+
+
+def test_a_picture_of_another_size_is_refused(cameras):
+    with pytest.raises(ValueError, match="image is 10 x 9"):
+        at_size(View(cameras[0], torch.zeros(9, 10, 3)), cameras[0], "cpu")
+    with pytest.raises(ValueError, match="mask is 10 x 9"):
+        at_size(View(cameras[0], torch.zeros(48, 48, 3), torch.ones(9, 10) > 0), cameras[0], "cpu")
+
+
+def test_reduced_views_are_kept_until_the_resolution_changes(views):
+    reduced = ReducedViews(views)
+    half = reduced.at(1, 0.5)
+    assert half.image.shape == (24, 24, 3) and (half.camera.width, half.camera.height) == (24, 24)
+    assert reduced.at(1, 0.5) is half
+    assert reduced.at(1, 1.0).image.shape == (48, 48, 3)
+    assert reduced.camera(1).width == 48
+
+
+def test_views_are_drawn_without_replacement(views):
+    reduced = ReducedViews(views)
+    drawn = reduced.draw(4, torch.Generator().manual_seed(1), 1.0)
+    assert len({id(view.camera) for view in drawn}) == 4
+    assert len(reduced.draw(10, torch.Generator(), 1.0)) == len(views)
+
+
+def test_every_view_comes_once_an_epoch():
+    epochs = [[training_order(7, 0, step) for step in range(7 * e, 7 * e + 7)] for e in range(4)]
+    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+    assert [training_order(7, 1, step) for step in range(7)] != epochs[0]

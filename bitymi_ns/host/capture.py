@@ -46,6 +46,8 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig) -> Non
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames:
         fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE}")
+    if len(frames) == 1:
+        fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
             fail(f"{path}: frame {i} has no file_path or no transform_matrix")
@@ -74,7 +76,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
     """Errors of nerfstudio's loaders as one clear message."""
     try:
         yield
-    except (AssertionError, OSError, LookupError, ValueError, TypeError, RuntimeError) as error:
+    except (AssertionError, OSError, LookupError, ValueError, TypeError, ArithmeticError, RuntimeError) as error:
         data = config.data if config.data is not None else config.dataparser.data
         detail = " ".join(str(error).split()) or type(error).__name__
         if isinstance(error, KeyError):

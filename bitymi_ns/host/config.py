@@ -85,6 +85,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def _make_paths_absolute(self) -> None:
         """So that config.yml can be used from any folder."""
         datamanager = self.pipeline.datamanager
+        if datamanager.data is None:  # given to the dataparser; the experiment is named after this one
+            datamanager.data = getattr(datamanager.dataparser, "data", None)
         for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
             path = getattr(owner, "data", None)
             if path is not None:

@@ -60,6 +60,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self.train_dataset.metadata["has_alpha"] = bool(outputs.image_filenames) and file_has_transparency(
             outputs.image_filenames[0]
         )
+        cameras = outputs.cameras
+        self.train_dataset.metadata["train_pixels"] = int((cameras.width.long() * cameras.height.long()).sum())
         self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -55,8 +56,19 @@ def new_scene(
     contract = config.contraction == "on" or (config.contraction == "auto" and not metadata.get("has_alpha", False))
     mid, half = _domain(surfels["means"], centers, contract)
     generator = torch.Generator().manual_seed(train.seed)
-    log2_size = config.log2_table_size if config.log2_table_size is not None else 17
+    log2_size = config.log2_table_size
+    if log2_size is None:
+        log2_size = _table_size(metadata.get("train_pixels", 0))
     return Scene(config, surfels, HashField(config, mid, half, contract, log2_size, generator))
+
+
+def _table_size(pixels: int) -> int:
+    """Entries a hash level, as a power of two: what the photographs can tell apart, and what a cache can hold.
+
+    A level gets one entry of 4 features for 32 pixels of all photographs together; four levels of 2^17 entries are 8 MB
+    in float32.
+    """
+    return min(17, max(14, round(math.log2(max(1, pixels) / 32))))
 
 
 def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:

@@ -117,3 +117,11 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
 def test_errors_for_the_user_end_the_process_with_status_1_and_a_message() -> None:
     error = InputError("no such capture")
     assert isinstance(error, SystemExit) and error.code == "bitymi: no such capture"
+
+
+def test_a_capture_given_to_its_parser_names_the_experiment() -> None:
+    run = fresh()
+    run.pipeline.datamanager.dataparser.data = config.Path("captures/lego")
+    run.set_timestamp()
+    run.set_experiment_name()
+    assert run.experiment_name == "lego"

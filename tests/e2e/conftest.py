@@ -1,0 +1,59 @@
+"""One short training run on a small ray-traced room, in this process, shared by the tests of this folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from nerfstudio.scripts import train as ns_train
+
+from bitymi_ns.host.config import BitymiTrainerConfig, method_config
+from bitymi_ns.sample import generate
+
+STEPS = 60
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """12 views of 48 x 36 pixels with 200 points."""
+    folder = tmp_path_factory.mktemp("captures") / "room"
+    generate(folder, views=12, width=48, height=36, seed=0, points=200)
+    return folder
+
+
+def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi") -> BitymiTrainerConfig:
+    """The configuration of a run of a few seconds."""
+    config = method_config(method).config
+    config.output_dir, config.experiment_name, config.timestamp = output, "room", name
+    config.pipeline.datamanager.data = data
+    config.vis, config.max_num_iterations, config.steps_per_save = "none", STEPS, 20
+    config.logging.local_writer.enable = False
+    config.pipeline.model.curve_points = 3
+    scene, train = config.pipeline.model.scene, config.pipeline.model.train
+    scene.log2_table_size, scene.min_resolution = 10, 16
+    train.densify.importance, train.densify.reset_interval = 1, 100_000  # densifies, and does not fall back
+    return config
+
+
+@pytest.fixture
+def start(room: Path, tmp_path: Path) -> Callable[..., BitymiTrainerConfig]:
+    """Make the configuration of a small run; `ns_train.main` runs it."""
+
+    def make(**options: Any) -> BitymiTrainerConfig:
+        return small_run(options.pop("data", room), tmp_path / "outputs", **options)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
+    """A finished run that has kept all its checkpoints. Not to be changed."""
+    config = small_run(room, tmp_path_factory.mktemp("outputs"))
+    config.save_only_latest_checkpoint = False
+    ns_train.main(config)
+    return config

@@ -1,0 +1,202 @@
+"""From a trained scene to a bundle and back into nerfstudio's tools."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts import train as ns_train
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.utils.eval_utils import eval_setup
+
+from bitymi_ns.host import export as host_export
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.export import ExportAtlas, default_export
+
+
+def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> None:
+    ExportAtlas(load_config=config.get_base_dir() / "config.yml", output_dir=folder, **options).main()
+
+
+@pytest.fixture(scope="session")
+def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The trained room as a bundle. Not to be changed."""
+    folder = tmp_path_factory.mktemp("bundles") / "room-bc7"
+    run_export(trained, folder)
+    return folder
+
+
+@pytest.fixture
+def copied(bundle: Path, tmp_path: Path) -> Path:
+    """The bundle in another place."""
+    return Path(shutil.copytree(bundle, tmp_path / "elsewhere"))
+
+
+def evaluate(config: Path, output: Path) -> dict[str, float]:
+    ComputePSNR(load_config=config, output_path=output).main()
+    text = output.read_text()
+    assert "NaN" not in text
+    return json.loads(text)["results"]
+
+
+def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> None:
+    assert {p.name for p in bundle.iterdir()} == {
+        "bundle.json", "surfels.ply", "atlas.ktx2", "config.yml", "preview.png"
+    }  # fmt: skip
+    info = json.loads((bundle / "bundle.json").read_text())
+    held_out = info["statistics"]["held_out"]
+    assert held_out["views"] == 2
+    assert held_out["psnr_baked_against_neural"] > 35
+    assert held_out["psnr_baked_against_photos"] == pytest.approx(held_out["psnr_neural_against_photos"], abs=0.2)
+    assert info["statistics"]["options"]["format"] == "bc7"
+    assert torch.tensor(info["world"]["transform"]).shape == (3, 4)
+
+
+def test_stock_evaluation_of_checkpoint_and_bundle_agree(
+    trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path
+) -> None:
+    neural = evaluate(trained.get_base_dir() / "config.yml", tmp_path / "neural.json")
+    baked = evaluate(bundle / "config.yml", tmp_path / "baked.json")
+    for name in ("psnr", "ssim", "surfels", "render_ms", "fragments_per_pixel"):
+        assert math.isfinite(neural[name]) and math.isfinite(baked[name])
+    assert baked["psnr"] == pytest.approx(neural["psnr"], abs=0.2)
+    assert baked["atlas_bytes"] == (bundle / "atlas.ktx2").stat().st_size
+    assert "atlas_bytes" not in neural
+    assert ("lpips" in neural) == ("lpips" in baked)
+
+
+def test_a_bundle_needs_neither_checkpoint_nor_its_old_place(
+    bundle: Path, copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.model.bundle = Path("/no/longer/there")
+    (copied / "config.yml").write_text(yaml.dump(config))
+    monkeypatch.chdir(tmp_path)
+    _, pipeline, path, _ = eval_setup(Path("elsewhere") / "config.yml")
+    assert pipeline.model.config.bundle == copied
+    assert path.parts[-3] == "elsewhere"
+    camera, _ = pipeline.datamanager.eval_view(0)
+    outputs = pipeline.model.get_outputs_for_camera(camera)
+    assert outputs["rgb"].shape == (36, 48, 3) and {"depth", "normal", "overdraw"} <= outputs.keys()
+
+
+@pytest.mark.parametrize("format", ["uint8", "fp16"])
+def test_other_formats(trained: BitymiTrainerConfig, tmp_path: Path, format: str) -> None:
+    run_export(trained, tmp_path / format, format=format)
+    info = json.loads((tmp_path / format / "bundle.json").read_text())
+    assert info["atlas"]["format"] == format
+
+
+def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainerConfig], tmp_path: Path) -> None:
+    config = start(method="bitymi-notexture")
+    config.max_num_iterations = 3
+    ns_train.main(config)
+    run_export(config, tmp_path / "plain")
+    assert not (tmp_path / "plain" / "atlas.ktx2").exists()
+    assert evaluate(tmp_path / "plain" / "config.yml", tmp_path / "plain.json")["atlas_bytes"] == 0
+
+
+def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerConfig, copied: Path) -> None:
+    before = (copied / "bundle.json").read_bytes()
+    with pytest.raises(InputError, match="exists.*--overwrite True"):
+        run_export(trained, copied)
+    assert (copied / "bundle.json").read_bytes() == before
+    run_export(trained, copied, overwrite=True, r_max=8, compare=False)
+    info = json.loads((copied / "bundle.json").read_text())
+    assert info["statistics"]["options"]["r_max"] == 8 and "held_out" not in info["statistics"]
+
+
+def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("x")
+    with pytest.raises(InputError, match="is not a bundle"):
+        run_export(trained, tmp_path, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
+
+
+def test_ctrl_c_in_the_export_leaves_nothing(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(host_export, "bake", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        run_export(trained, tmp_path / "b")
+    assert stop.value.code == 130
+    assert "was not written" in " ".join(capsys.readouterr().out.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_that_make_no_sense(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be baked: .*power of two"):
+        run_export(trained, tmp_path / "b", r_min=5)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_that_is_not_there_or_not_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no .*config.yml"):
+        ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
+    (tmp_path / "config.yml").write_text("a: [")
+    with pytest.raises(InputError, match="is not the configuration"):
+        ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
+
+
+def test_a_damaged_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "outputs/room/bitymi/run"))
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir = tmp_path / "outputs"
+    (folder / "config.yml").write_text(yaml.dump(config))
+    path = folder / "nerfstudio_models" / "step-000000059.ckpt"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="cannot be loaded"):
+        ExportAtlas(load_config=folder / "config.yml", output_dir=tmp_path / "b").main()
+
+
+def test_a_bundle_cannot_be_baked_again(bundle: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not a scene that can be baked"):
+        ExportAtlas(load_config=bundle / "config.yml", output_dir=tmp_path / "b").main()
+
+
+@pytest.mark.parametrize("name", ["surfels.ply", "atlas.ktx2"])
+def test_damaged_bundles_are_refused(copied: Path, name: str) -> None:
+    path = copied / name
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=f"{name} is truncated.*Export the scene again"):
+        eval_setup(copied / "config.yml")
+    path.write_bytes(whole[:-9] + bytes(9))
+    with pytest.raises(InputError, match=f"{name} is altered"):
+        eval_setup(copied / "config.yml")
+    path.unlink()
+    with pytest.raises(InputError, match=f"{name} is missing"):
+        eval_setup(copied / "config.yml")
+
+
+def test_a_bundle_of_a_newer_version_is_refused(copied: Path) -> None:
+    info = json.loads((copied / "bundle.json").read_text())
+    (copied / "bundle.json").write_text(json.dumps({**info, "version": "2.0"}))
+    with pytest.raises(InputError, match="version 2.0.*update bitymi-ns"):
+        eval_setup(copied / "config.yml")
+
+
+def test_a_configuration_without_its_bundle(copied: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.model.bundle = tmp_path / "gone"
+    (alone / "config.yml").write_text(yaml.dump(config))
+    with pytest.raises(InputError, match="no bundle found"):
+        eval_setup(alone / "config.yml")
+
+
+def test_the_presets_bake_options_are_those_of_the_command() -> None:
+    options = default_export()
+    assert (options.format, options.r_max, options.cap_by_views) == ("bc7", 64, True)

@@ -1,0 +1,235 @@
+"""Training through nerfstudio's own entry point: what it leaves behind, resuming, interruption and bad checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import errno
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts import train as ns_train
+from nerfstudio.utils.eval_utils import eval_setup
+
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.curve import FILE
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.trainer import BitymiTrainer
+
+Start = Callable[..., BitymiTrainerConfig]
+
+
+def checkpoint(config: BitymiTrainerConfig, step: int) -> dict[str, Any]:
+    return torch.load(config.get_checkpoint_dir() / f"step-{step:09d}.ckpt", weights_only=True)
+
+
+def different(a: Any, b: Any, path: str = "") -> list[str]:
+    """Where two checkpoints differ, clocks left out."""
+    if path.endswith("seconds"):
+        return []
+    if isinstance(a, torch.Tensor):
+        return [] if torch.equal(a, b) else [path]
+    if isinstance(a, dict):
+        if a.keys() != b.keys():
+            return [path]
+        return [d for key in a for d in different(a[key], b[key], f"{path}/{key}")]
+    if isinstance(a, (list, tuple)):
+        return [d for i, pair in enumerate(zip(a, b, strict=True)) for d in different(*pair, f"{path}/{i}")]
+    return [] if a == b else [path]
+
+
+def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTrainerConfig) -> None:
+    folder = trained.get_base_dir()
+    assert yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader).max_num_iterations == 60
+    saved = sorted(p.name for p in trained.get_checkpoint_dir().iterdir())
+    assert saved == ["step-000000020.ckpt", "step-000000040.ckpt", "step-000000059.ckpt"]
+    points = [json.loads(line) for line in (folder / FILE).read_text().splitlines()]
+    assert [p["step"] for p in points] == [20, 40, 60]
+    assert {"seconds", "cpu_seconds", "surfels", "fragments", "psnr"} <= points[-1].keys()
+    assert points[-1]["seconds"] > points[0]["seconds"] > 0
+    assert points[-1]["psnr"] > 8
+
+
+def test_the_number_of_surfels_changes_in_the_run(trained: BitymiTrainerConfig) -> None:
+    counts = {len(checkpoint(trained, s)["pipeline"]["_model.scene.surfels.means"]) for s in (20, 40, 59)}
+    assert len(counts) > 1
+
+
+@pytest.mark.parametrize("by", ["load_checkpoint", "load_dir"])
+def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
+    trained: BitymiTrainerConfig, start: Start, by: str
+) -> None:
+    config = start(name="resumed")
+    config.max_num_iterations = None  # as long as the interrupted run was to be
+    if by == "load_checkpoint":
+        config.load_checkpoint = trained.get_checkpoint_dir() / "step-000000020.ckpt"
+    else:
+        config.load_dir, config.load_step = trained.get_checkpoint_dir(), 20
+    ns_train.main(config)
+    assert different(checkpoint(trained, 59), checkpoint(config, 59)) == []
+    steps = [json.loads(line)["step"] for line in (config.get_base_dir() / FILE).read_text().splitlines()]
+    assert steps == [20, 40, 60]  # the first point is that of the interrupted run
+
+
+def test_a_finished_run_is_not_touched_when_it_is_resumed(trained: BitymiTrainerConfig, start: Start) -> None:
+    config = start(name="again")
+    config.load_dir = trained.get_checkpoint_dir()
+    ns_train.main(config)
+    assert not config.get_checkpoint_dir().exists()
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    iterate = BitymiTrainer.train_iteration
+
+    def train_iteration(self: BitymiTrainer, current: int) -> Any:
+        if current == step:
+            os.kill(os.getpid(), signal.SIGINT)
+        return iterate(self, current)
+
+    monkeypatch.setattr(BitymiTrainer, "train_iteration", train_iteration)
+
+
+def test_ctrl_c_saves_what_was_learned_and_says_how_to_go_on(
+    trained: BitymiTrainerConfig, start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = start(name="interrupted")
+    handler = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 27)
+        with pytest.raises(SystemExit) as stop:
+            ns_train.main(config)
+    assert stop.value.code == 130
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert "--load-dir" in capsys.readouterr().out
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000027.ckpt"]
+    resumed = start(name="resumed")
+    resumed.load_dir = config.get_checkpoint_dir()
+    ns_train.main(resumed)
+    assert different(checkpoint(trained, 59), checkpoint(resumed, 59)) == []
+
+
+def test_a_full_disk_keeps_the_earlier_checkpoint(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = start(name="full")
+    save = torch.save
+
+    def full_after_the_first(state: Any, file: Any) -> None:
+        if isinstance(state, dict) and state.get("step", 0) > 20:
+            file.write(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(state, file)
+
+    monkeypatch.setattr(torch, "save", full_after_the_first)
+    with pytest.raises(InputError, match="could not be written: .*No space left(.|\n)*resume with --load-dir"):
+        ns_train.main(config)
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]
+    assert not [p for p in config.get_base_dir().iterdir() if "unfinished" in p.name]
+    assert checkpoint(config, 20)["step"] == 20
+
+
+def test_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, start: Start) -> None:
+    config = start(method="bitymi-sh")
+    config.load_dir = trained.get_checkpoint_dir()
+    with pytest.raises(InputError, match="another preset:\n.*view-color: sv there, sh here"):
+        ns_train.main(config)
+
+
+def test_a_checkpoint_of_another_method(start: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "other"
+    folder.mkdir()
+    state = {"step": 5, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "scalers": {}}
+    torch.save(state, folder / "step-000000005.ckpt")
+    config = start()
+    config.load_dir = folder
+    with pytest.raises(InputError, match="not one of this method"):
+        ns_train.main(config)
+
+
+def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
+    config = start()
+    config.load_dir = tmp_path / "nowhere"
+    with pytest.raises(InputError, match="there is no checkpoint folder"):
+        ns_train.main(copy.deepcopy(config))
+    config.load_dir.mkdir()
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        ns_train.main(copy.deepcopy(config))
+    whole = (trained.get_checkpoint_dir() / "step-000000059.ckpt").read_bytes()
+    (config.load_dir / "step-000000059.ckpt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="cannot be read; it is damaged"):
+        ns_train.main(copy.deepcopy(config))
+
+
+@pytest.mark.parametrize("method", ["bitymi-quality", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"])
+def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
+    config = start(method=method)
+    config.max_num_iterations = 3
+    ns_train.main(config)
+    _, pipeline, _, step = eval_setup(config.get_base_dir() / "config.yml")
+    assert step == 2
+    camera, batch = pipeline.datamanager.eval_view(0)
+    outputs = pipeline.model.get_outputs_for_camera(camera)
+    assert {"rgb", "accumulation", "depth", "normal", "beta", "overdraw"} <= outputs.keys()
+    assert all(value.shape[:2] == (36, 48) and value.isfinite().all() for value in outputs.values())
+    metrics, images = pipeline.model.get_image_metrics_and_images(outputs, batch)
+    assert {"psnr", "ssim", "surfels", "render_ms", "fragments_per_pixel"} <= metrics.keys()
+    assert images["img"].shape == (36, 96, 3)
+
+
+def spoiled_points(room: Path, folder: Path, rows: slice) -> Path:
+    """The room with NaN in some rows of its point cloud."""
+    import numpy as np
+    import open3d as o3d
+
+    capture = Path(shutil.copytree(room, folder / "spoiled"))
+    path = capture / json.loads((capture / "transforms.json").read_text())["ply_file_path"]
+    cloud = o3d.io.read_point_cloud(str(path))
+    points = np.asarray(cloud.points)
+    points[rows] = np.nan
+    cloud.points = o3d.utility.Vector3dVector(points)
+    o3d.io.write_point_cloud(str(path), cloud)
+    return capture
+
+
+def test_points_that_are_nan_are_left_out_and_counted(
+    room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = start(data=spoiled_points(room, tmp_path, slice(3, 8)))
+    config.max_num_iterations = 2
+    ns_train.main(config)
+    assert "5 of 200 points" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_cloud_of_nothing_but_nan(room: Path, start: Start, tmp_path: Path) -> None:
+    config = start(data=spoiled_points(room, tmp_path, slice(None)))
+    with pytest.raises(InputError, match="all 200 points .* are NaN"):
+        ns_train.main(config)
+
+
+def without_points(room: Path, folder: Path) -> Path:
+    capture = Path(shutil.copytree(room, folder / "pointless"))
+    meta = json.loads((capture / "transforms.json").read_text())
+    meta.pop("ply_file_path")
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    return capture
+
+
+def test_a_capture_without_points_starts_at_random(
+    room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = start(data=without_points(room, tmp_path))
+    config.max_num_iterations, config.pipeline.model.train.random_points = 2, 300
+    ns_train.main(config)
+    assert "starts from 300 random ones" in " ".join(capsys.readouterr().out.split())
+
+
+def test_no_points_and_an_empty_scene_box(room: Path, start: Start, tmp_path: Path) -> None:
+    config = start(data=without_points(room, tmp_path))
+    config.pipeline.datamanager.dataparser.scene_scale = 0.0
+    with pytest.raises(InputError, match="no points, and its scene box .* is empty"):
+        ns_train.main(config)

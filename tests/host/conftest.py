@@ -1,0 +1,41 @@
+"""Small captures in nerfstudio's format."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from bitymi_ns.sample import generate
+
+
+@pytest.fixture(scope="session")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ray-traced room: 12 views of 48 x 36 pixels with 200 points. Not to be changed."""
+    folder = tmp_path_factory.mktemp("captures") / "room"
+    generate(folder, views=12, width=48, height=36, seed=0, points=200)
+    return folder
+
+
+@pytest.fixture
+def capture(original: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return Path(shutil.copytree(original, tmp_path / "room"))
+
+
+def edit_transforms(capture: Path, change: Any) -> None:
+    """Apply `change` to the parsed transforms.json."""
+    path = capture / "transforms.json"
+    meta = json.loads(path.read_text("utf8"))
+    change(meta)
+    path.write_text(json.dumps(meta), "utf8")
+
+
+@pytest.fixture
+def edit() -> Any:
+    return edit_transforms

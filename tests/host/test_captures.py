@@ -1,0 +1,192 @@
+"""What the data manager makes of captures, good and bad."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+
+from bitymi_ns.host.datamanager import BitymiDataManager, BitymiDataManagerConfig
+from bitymi_ns.host.errors import InputError
+
+
+def load(data: Path, **dataparser: Any) -> BitymiDataManager:
+    options = {"eval_mode": "interval", "eval_interval": 8, "load_3D_points": True, **dataparser}
+    config = BitymiDataManagerConfig(data=data, dataparser=NerfstudioDataParserConfig(**options))
+    return config.setup(device="cpu", test_mode="val")
+
+
+def images_of(capture: Path) -> list[Path]:
+    return sorted(p for p in (capture / "images").iterdir() if p.is_file())
+
+
+def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
+    manager = load(capture)
+    assert (len(manager.train_dataset), len(manager.eval_dataset)) == (10, 2)
+    manager.config.cache_images = "cpu"
+    image = manager.cached_train[0]["image"]
+    assert image.shape == (36, 48, 3) and image.dtype == torch.uint8
+
+
+def test_the_order_of_views_depends_on_seed_and_step_alone(capture: Path) -> None:
+    manager, other = load(capture), load(capture)
+    order = [manager.train_index(step) for step in range(25)]
+    assert order[10:20] == [other.train_index(step) for step in range(10, 20)]  # as after a resume
+    assert sorted(order[:10]) == list(range(10)) == sorted(order[10:20])
+    assert order[:10] != order[10:20]
+    other.config.train_cameras_sampling_seed += 1
+    assert order != [other.train_index(step) for step in range(25)]
+
+
+def test_views_for_scoring_leave_the_order_alone(capture: Path) -> None:
+    manager = load(capture)
+    first = manager.next_train(3)[1]["image_idx"]
+    for index in range(5):
+        manager.train_view(index)
+    assert manager.next_train(3)[1]["image_idx"] == first
+
+
+def test_a_batch_does_not_share_its_dictionary_with_the_cache(capture: Path) -> None:
+    manager = load(capture)
+    manager.train_view(0)[1]["image"] = None
+    assert manager.cached_train[0]["image"] is not None
+
+
+def test_alpha_is_kept_for_the_model(capture: Path) -> None:
+    for path in images_of(capture):
+        Image.open(path).convert("RGBA").save(path.with_suffix(".png"))
+    manager = load(capture)
+    assert manager.train_dataset.metadata["has_alpha"] is True
+    assert manager.cached_train[0]["image"].shape[-1] == 4
+
+
+def test_masks_are_loaded(capture: Path, edit: Any) -> None:
+    (capture / "masks").mkdir()
+
+    def add_masks(meta: dict) -> None:
+        for frame in meta["frames"]:
+            name = "masks/" + Path(frame["file_path"]).stem + ".png"
+            Image.fromarray(np.tile(np.uint8([[0, 255]]), (36, 24))).save(capture / name)
+            frame["mask_path"] = name
+
+    edit(capture, add_masks)
+    mask = load(capture).cached_train[0]["mask"]
+    assert mask.dtype == torch.bool and mask.shape == (36, 48, 1) and 0.4 < mask.float().mean() < 0.6
+
+
+def test_undistorted_cameras_are_marked_as_such(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta.update(k1=0.05))
+    manager = load(capture)
+    assert float(manager.undistorted_train_cameras().distortion_params.abs().max()) == 0.0
+    assert manager.cached_train[0]["image"].shape[1] == int(manager.train_cameras.width[0])
+
+
+def expect(message: str) -> Any:
+    return pytest.raises(InputError, match=message)
+
+
+def test_a_missing_folder(tmp_path: Path) -> None:
+    with expect(r"capture .*nowhere does not exist"):
+        load(tmp_path / "nowhere")
+
+
+def test_an_empty_folder(tmp_path: Path) -> None:
+    with expect("is empty.*ns-process-data"):
+        load(tmp_path)
+
+
+def test_a_folder_without_transforms(capture: Path) -> None:
+    (capture / "transforms.json").unlink()
+    with expect("holds no transforms.json"):
+        load(capture)
+
+
+def test_broken_json(capture: Path) -> None:
+    (capture / "transforms.json").write_text("{")
+    with expect("cannot be read"):
+        load(capture)
+
+
+def test_no_frames(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta.update(frames=[]))
+    with expect("lists no frames"):
+        load(capture)
+
+
+def test_a_frame_without_pose(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta["frames"][2].pop("transform_matrix"))
+    with expect("frame 2 has no file_path or no transform_matrix"):
+        load(capture)
+
+
+def test_intrinsics_missing(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: [meta.pop(key, None) for key in ("fl_x", "fl_y")])
+    with expect("cannot be loaded: .*(fx|fl_x)"):
+        load(capture)
+
+
+def test_poses_without_images(capture: Path) -> None:
+    for path in images_of(capture)[3:6]:
+        path.unlink()
+    with expect("3 of 12 images of the capture are missing"):
+        load(capture)
+
+
+def test_no_images_at_all(capture: Path) -> None:
+    for path in images_of(capture):
+        path.unlink()
+    with expect("cannot be loaded|are missing"):
+        load(capture)
+
+
+def test_an_image_of_another_size_is_named(capture: Path) -> None:
+    path = images_of(capture)[4]
+    Image.open(path).resize((40, 30)).save(path)
+    with expect(f"{path.name} has 40 x 30 pixels, but its camera is for 48 x 36"):
+        _ = load(capture).cached_train
+
+
+def test_a_damaged_image_is_named(capture: Path) -> None:
+    path = images_of(capture)[4]
+    path.write_bytes(path.read_bytes()[:40])
+    with expect(f"{path.name} cannot be read"):
+        _ = load(capture).cached_train
+
+
+def test_one_view(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta.update(frames=meta["frames"][:2]))
+    with expect("only one training view"):
+        load(capture)  # the other is held out
+    edit(capture, lambda meta: meta.update(frames=meta["frames"][:1]))
+    with expect("has one image only"):
+        load(capture)
+
+
+def test_few_views_work_with_a_warning(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(capture, lambda meta: meta.update(frames=meta["frames"][:5]))
+    assert len(load(capture).train_dataset) == 4
+    assert "Only 4 training views" in capsys.readouterr().out
+
+
+def test_a_point_cloud_that_is_not_there(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta.update(ply_file_path="gone.ply"))
+    with expect("point cloud .*gone.ply, which does not exist"):
+        load(capture)
+
+
+def test_colmap_points_do_not_stop_a_run_without_terminal(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta.pop("ply_file_path"))
+    (capture / "colmap/sparse/0").mkdir(parents=True)
+    manager = load(capture)  # nerfstudio would wait for an answer
+    assert "points3D_xyz" not in manager.train_dataparser_outputs.metadata
+
+
+def test_the_transforms_file_may_be_named_itself(capture: Path) -> None:
+    assert json.loads((capture / "transforms.json").read_text())["frames"]
+    assert len(load(capture / "transforms.json").train_dataset) == 10

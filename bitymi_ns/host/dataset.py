@@ -13,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from bitymi_ns.host.errors import fail
+from bitymi_ns.train.views import over_background
 
 
 class BitymiDataset(InputDataset):
@@ -47,6 +48,13 @@ class BitymiDataset(InputDataset):
     def get_image_uint8(self, image_idx: int) -> Tensor:
         """[H, W, 3 or 4]; alpha is not composed."""
         return torch.from_numpy(self.get_numpy_image(image_idx))
+
+    def __getitem__(self, image_idx: int) -> dict[str, Any]:
+        """For viewer and ns-render, which show images as they get them: alpha is composed."""
+        data = self.get_data(image_idx)
+        color = self._dataparser_outputs.alpha_color
+        data["image"] = over_background(data["image"], None if color is None else torch.as_tensor(color).float())
+        return data
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         masks = self._dataparser_outputs.mask_filenames

@@ -18,6 +18,9 @@ from bitymi_ns.host.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import as_float, over_background, reduce_image, reduce_mask
 
+OVERDRAW_SCALE = 32.0
+"""Blended surfels at a pixel that the end of a colour map stands for."""
+
 
 class SurfelModel(Model):
     """Renders whole images from surfels."""
@@ -56,7 +59,8 @@ class SurfelModel(Model):
         """Outputs that the viewer and ns-render offer, each [H, W, C] float32:
 
         rgb, accumulation; depth = expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0
-        where nothing is seen), beta = blended kernel exponent (0 to 4), overdraw = surfels blended at the pixel.
+        where nothing is seen), beta = blended kernel exponent / 4, overdraw = surfels blended at the pixel /
+        OVERDRAW_SCALE (the tools' colour maps span 0 to 1).
         """
         if not isinstance(ray_bundle, Cameras):
             raise TypeError("this model renders cameras, not bundles of rays")
@@ -68,8 +72,8 @@ class SurfelModel(Model):
         if output.normal is not None:
             outputs["normal"] = normal_image(output.normal, camera)
         if getattr(output, "beta", None) is not None:
-            outputs["beta"] = output.beta
-        outputs["overdraw"] = output.overdraw.float()
+            outputs["beta"] = output.beta / 4.0
+        outputs["overdraw"] = output.overdraw.float() / OVERDRAW_SCALE
         return outputs
 
     @torch.no_grad()
@@ -90,7 +94,7 @@ class SurfelModel(Model):
         mask = batch.get("mask")
         mask = None if mask is None else reduce_mask(mask.to(rgb.device), width, height)
         metrics = image_metrics(rgb, target, mask)
-        metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean())
+        metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
         metrics.update(self.size_metrics())
         camera = getattr(self, "_last_camera", None)
         if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):

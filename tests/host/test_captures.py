@@ -64,6 +64,7 @@ def test_alpha_is_kept_for_the_model(capture: Path) -> None:
     manager = load(capture)
     assert manager.train_dataset.metadata["has_alpha"] is True
     assert manager.cached_train[0]["image"].shape[-1] == 4
+    assert manager.train_dataset[0]["image"].shape[-1] == 3  # what viewer and ns-render show
 
 
 def test_masks_are_loaded(capture: Path, edit: Any) -> None:

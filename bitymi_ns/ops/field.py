@@ -72,8 +72,8 @@ class _Field(torch.autograd.Function):
 
 
 def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
-    """Residual colour at world positions, eq. (color): four levels are interpolated trilinearly, concatenated and decoded
-    by an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
+    """Residual colour at world positions, eq. (color): four levels are interpolated trilinearly, concatenated and
+    decoded by an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
 
     Args:
         x: [M, 3] world positions.

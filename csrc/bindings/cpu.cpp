@@ -8,6 +8,7 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 
 #include "cpu/kernels.h"
 
@@ -32,7 +33,10 @@ T* data(const Array<T>& a, int64_t size, const char* name) {
 }
 template <class T>
 T* data_or_null(const std::optional<Array<T>>& a, int64_t size, const char* name) {
-  return a ? data(*a, size, name) : nullptr;
+  static std::remove_const_t<T> nothing;  // an empty array has no address, but it was given
+  if (!a) return nullptr;
+  T* p = data(*a, size, name);
+  return p ? p : &nothing;
 }
 
 template <class S>

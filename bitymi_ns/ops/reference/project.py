@@ -18,7 +18,8 @@ def unit(x: Tensor) -> Tensor:
 
 def rotation(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any length."""
-    w, x, y, z = unit(quats).unbind(-1)
+    largest = quats.detach().abs().amax(-1, keepdim=True)  # first to about 1, so that no length is too short
+    w, x, y, z = unit(quats / torch.where(largest > 0, largest, torch.ones_like(largest))).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
         torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),

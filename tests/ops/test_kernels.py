@@ -1,0 +1,350 @@
+"""The compiled kernels against the golden renders, the float64 references and finite differences."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.reference import field as reference_field
+from bitymi_ns.ops.reference import render as reference_render
+from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
+from bitymi_ns.scene.baked import BakedScene
+from tests.ops.golden import GOLDEN_NAMES, SV_KEYS, SceneCase, load_golden, random_scene
+
+EXACT_RIM = 1e-12  # the references bound nothing
+OUTPUTS = {"rgb": "rgb", "alpha": "alpha", "depth": "depth", "beta_map": "beta"}
+
+
+def scene_of(case: SceneCase, dtype: torch.dtype, rim: float = EXACT_RIM) -> tuple[Scene, Camera]:
+    params = {key: value.to(dtype) for key, value in case.params.items()}
+    scene = Scene(SceneConfig(texture="none", rim=rim), params, None)
+    return scene, Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+
+
+def images(output) -> dict[str, Tensor]:
+    return {name: getattr(output, attribute).squeeze(-1) for name, attribute in OUTPUTS.items()}
+
+
+def relative(a: Tensor, b: Tensor) -> float:
+    """Largest error over the largest value; absolute where all values are 0."""
+    scale = b.abs().max().item() if b.numel() else 0.0
+    error = (a.double() - b.double()).abs().max().item() if b.numel() else 0.0
+    return error / scale if scale > 0 else error
+
+
+def check_gradient(got: Tensor, want: Tensor, name: str) -> None:
+    """Double agrees everywhere, single in 97 % of the numbers to 1e-4: where a rim passes within rounding of a pixel
+    centre the kernel's derivative amplifies that rounding by up to 1 / rim."""
+    if got.dtype == torch.float64:
+        assert relative(got, want) < 1e-10, name
+        return
+    scale = want.abs().max().clamp(min=1e-30)
+    error = (got.double() - want).abs() / scale
+    assert (error < 1e-4).double().mean() >= 0.97, name
+    assert error.max() < 5e-3, name
+
+
+UNTEXTURED = [name for name in GOLDEN_NAMES if name != "textured"]
+
+
+@pytest.mark.parametrize("name", UNTEXTURED)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_golden_images_and_gradients(name: str, dtype: torch.dtype) -> None:
+    golden = load_golden(name)
+
+    def run(dtype: torch.dtype, rim: float):
+        scene, camera = scene_of(golden, dtype, rim)
+        output = scene.render(camera, golden.background.to(dtype), maps=True)
+        got = images(output)
+        sum((got[key] * golden.loss_weights[key].to(dtype)).sum() for key in got).backward()
+        return output, got, {key: parameter.grad for key, parameter in scene.surfels.items()}
+
+    single = dtype == torch.float32
+    output, got, grads = run(dtype, 1e-3 if single else EXACT_RIM)
+    for key, image in got.items():
+        want = golden.outputs[key]
+        error = (image.detach().double() - want).abs() / want.abs().max()
+        if dtype == torch.float64:
+            assert error.max() < 1e-12, key
+        else:  # the thresholds of alpha and transmittance may flip in single precision
+            assert (error < 1e-4).double().mean() > 0.999, key
+    assert torch.equal(output.overdraw[..., 0].double(), golden.outputs["overdraw"].double())
+    # single precision is held against double with the same bound at the rim
+    wanted = run(torch.float64, 1e-3)[2] if single else golden.grads
+    for key, want in wanted.items():
+        check_gradient(grads[key], want, key)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_golden_textured_scene_through_the_baked_renderer(dtype: torch.dtype) -> None:
+    golden = load_golden("textured")
+    atlas, tiles, x = torch.zeros(1, 64, 1024, 4), [], 0
+    for tile in golden.tiles:
+        rows, columns = tile.shape[:2]
+        atlas[0, :rows, x : x + columns, :3] = tile.float()
+        tiles.append((x, 0, 0, columns, rows))
+        x += columns
+    params = {key: value.to(dtype) for key, value in golden.params.items()}
+    scene = BakedScene(params, "sv", torch.tensor(tiles, dtype=torch.int32), atlas)
+    camera = Camera(golden.viewmat.to(dtype), golden.K.to(dtype), golden.width, golden.height)
+    output = scene.render(camera, golden.background.to(dtype), maps=True)
+    for key, image in images(output).items():
+        # texels are single precision in either case
+        assert relative(image, golden.outputs[key]) < (3e-8 if dtype == torch.float64 else 1e-4), key
+    assert torch.equal(output.overdraw[..., 0].double(), golden.outputs["overdraw"].double())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_scenes_in_single_precision(seed: int) -> None:
+    case = random_scene(80, seed, width=70, height=50)
+    scene, camera = scene_of(case, torch.float32)
+    output = scene.render(camera, case.background.float(), maps=True)
+    directions = reference_render.view_directions(case.params["means"], case.viewmat)
+    leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
+    directions = reference_render.view_directions(leaves["means"], case.viewmat)
+    colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
+    geometry = [leaves[key] for key in ("means", "quats", "log_scales", "opacity_logits", "beta_raw")]
+    want = reference_render.render(*geometry, colors, case.viewmat, case.K, case.width, case.height, case.background)
+    generator = torch.Generator().manual_seed(seed)
+    loss, reference_loss = 0.0, 0.0
+    for key, attribute in {**OUTPUTS, "normal": "normal"}.items():
+        got, expected = getattr(output, attribute), getattr(want, key)
+        expected = expected.reshape(got.shape)
+        error = (got.detach().double() - expected.detach()).abs() / expected.detach().abs().max()
+        assert (error < 1e-5).double().mean() > 0.999, key
+        weight = torch.rand(got.shape, generator=generator, dtype=torch.float64)
+        loss = loss + (got * weight.float()).sum()
+        reference_loss = reference_loss + (expected * weight).sum()
+    loss.backward()
+    reference_loss.backward()
+    for key, leaf in leaves.items():
+        check_gradient(scene.surfels[key].grad, leaf.grad, key)
+
+
+def test_depth_and_uv_gradients_of_the_trace_by_finite_differences() -> None:
+    case = random_scene(6, 3, width=9, height=7, scale=0.5)
+    camera = Camera(case.viewmat, case.K, case.width, case.height)
+    names = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
+    values = [case.params[name].clone().requires_grad_() for name in names]
+    g = torch.Generator().manual_seed(0)
+    count = len(ops.trace(ops.project(*values, camera)))
+    weights = [torch.rand(k, count, generator=g, dtype=torch.float64) for k in (1, 2, 1)]
+
+    def function(*parameters: Tensor) -> Tensor:
+        fragments = ops.trace(ops.project(*parameters, camera), rim=EXACT_RIM)
+        parts = (fragments.weight[None], fragments.uv, fragments.depth[None])
+        return sum((part * weight).sum() for part, weight in zip(parts, weights, strict=True))
+
+    assert torch.autograd.gradcheck(function, values, eps=1e-7, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+def test_view_colors_against_the_reference_and_gradcheck(kind: str) -> None:
+    g = torch.Generator().manual_seed(5)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    n = 7
+    params = {
+        "sv": {"sv_sites": normal(n, 7, 3), "sv_log_tau": normal(n, 7), "sv_rgb": normal(n, 7, 3)},
+        "sh": {"sh_dc": normal(n, 3), "sh_rest": normal(n, 15, 3)},
+        "sb": {"sb_base": normal(n, 3), "sb_lobes": normal(n, 2, 6)},
+        "sg": {"sg_base": normal(n, 3), "sg_lobes": normal(n, 2, 7)},
+    }[kind]
+    means, center = normal(n, 3), normal(3)
+    directions = torch.nn.functional.normalize(means - center, dim=-1)
+    want = getattr(reference_view_color, kind)(*params.values(), directions)
+    torch.testing.assert_close(ops.view_color(kind, params, means, center), want, rtol=1e-10, atol=1e-12)
+    single = {name: value.float() for name, value in params.items()}
+    got = ops.view_color(kind, single, means.float(), center.float())
+    torch.testing.assert_close(got.double(), want, rtol=2e-5, atol=2e-5)
+
+    leaves = [value.clone().requires_grad_() for value in (means, *params.values())]
+
+    def function(x: Tensor, *values: Tensor) -> Tensor:
+        return ops.view_color(kind, dict(zip(params, values, strict=True)), x, center)
+
+    assert torch.autograd.gradcheck(function, leaves, eps=1e-6, atol=1e-6, rtol=1e-4)
+
+
+def test_view_colors_of_inactive_surfels_are_zero() -> None:
+    params = {"sh_dc": torch.ones(3, 3, requires_grad=True), "sh_rest": torch.ones(3, 15, 3)}
+    active = torch.tensor([True, False, True])
+    color = ops.view_color("sh", params, torch.rand(3, 3), torch.tensor([0.0, 0.0, -2.0]), active)
+    color.sum().backward()
+    assert not color[1].any() and not params["sh_dc"].grad[1].any() and params["sh_dc"].grad[0].all()
+
+
+def make_field(contract: bool, dtype: torch.dtype, seed: int = 0, log2: int = 8) -> HashField:
+    g = torch.Generator().manual_seed(seed)
+    field = HashField(SceneConfig(min_resolution=8), (0.1, -0.2, 0.3), 1.5, contract, log2, g)
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=g) * 0.5)
+    return field.to(dtype)
+
+
+def field_reference(field: HashField, x: Tensor) -> Tensor:
+    geometry = field.geometry
+    weights = [w.detach().double() for w in field.weights]
+    mid = torch.tensor(geometry.mid, dtype=torch.float64)
+    return reference_field.field(
+        x.double(), *weights, mid, geometry.half, geometry.min_resolution, contraction=geometry.contract
+    )
+
+
+@pytest.mark.parametrize("contract", [True, False])
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 5000])
+def test_field_against_the_reference(contract: bool, count: int) -> None:
+    g = torch.Generator().manual_seed(count)
+    x = torch.randn(count, 3, generator=g, dtype=torch.float64) * 4
+    torch.testing.assert_close(
+        make_field(contract, torch.float64)(x),
+        field_reference(make_field(contract, torch.float64), x),
+        rtol=1e-10,
+        atol=1e-11,
+    )
+    single = make_field(contract, torch.float32)
+    # a position within rounding of a cell's face may fall in the neighbouring cell, where the value is the same
+    torch.testing.assert_close(single(x.float()).double(), field_reference(single, x.float()), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("contract", [True, False])
+def test_field_gradients_by_finite_differences(contract: bool) -> None:
+    field = make_field(contract, torch.float64, log2=5)
+    x = (torch.randn(9, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 2).requires_grad_()
+    weights = [w.detach().clone().requires_grad_() for w in field.weights]
+
+    def function(points: Tensor, *values: Tensor) -> Tensor:
+        return ops.field(points, field.geometry, *values)
+
+    assert torch.autograd.gradcheck(function, (x, *weights), eps=1e-7, atol=1e-5, rtol=1e-3)
+
+
+def test_field_at_cell_boundaries_and_far_away_is_finite() -> None:
+    field = make_field(True, torch.float32)
+    grid = torch.arange(-8, 9).float() * 1.5 / 8
+    x = torch.cartesian_prod(grid, grid, grid) + torch.tensor([0.1, -0.2, 0.3])
+    far = torch.tensor([[1e30, -1e30, 1e30], [3e38, 0, 0], [1e6, 1e6, 1e6]])
+    assert field(torch.cat([x, far])).isfinite().all()
+
+
+@pytest.mark.parametrize("move", [False, True])
+def test_shading_equals_the_field_module_fragment_by_fragment(move: bool) -> None:
+    case = random_scene(25, 11, width=20, height=18, scale=0.4)
+    camera = Camera(case.viewmat, case.K, case.width, case.height)
+    names = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
+    field = make_field(True, torch.float64, log2=6)
+
+    def render(fused: bool) -> list[Tensor]:
+        leaves = [case.params[name].clone().requires_grad_() for name in names]
+        base = (torch.linspace(-0.8, 0.8, 75, dtype=torch.float64).view(25, 3)).requires_grad_()
+        field.zero_grad()
+        projection = ops.project(*leaves, camera)
+        fragments = ops.trace(projection)
+        if fused:
+            colors = ops.shade(
+                fragments, base, projection.frames, field.geometry, field.weights, 0.05, move_surfels=move
+            )
+        else:
+            rows = fragments.surfel.long()
+            frames, uv = projection.frames[rows], fragments.uv
+            x = frames[:, :3] + uv[0][:, None] * frames[:, 3:6] + uv[1][:, None] * frames[:, 6:9]
+            rho = field(x if move else x.detach()) * (fragments.weight.detach()[:, None] >= 0.05)
+            colors = ((base[rows] + 0.5).clamp(min=0) + rho).clamp(min=0)
+        image = ops.composite_image(fragments, projection, colors, maps=True)
+        (image * torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image)).sum().backward()
+        return [image.detach(), base.grad, *(leaf.grad for leaf in leaves), *(w.grad.clone() for w in field.weights)]
+
+    for fused, plain in zip(render(True), render(False), strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-11)
+
+
+def test_compositing_equals_index_add() -> None:
+    case = random_scene(40, 2, width=33, height=21)
+    scene, camera = scene_of(case, torch.float64)
+    output = scene.render(camera, maps=True)
+    fragments, geom = output.fragments, output.projection.geom
+    values = torch.cat([torch.ones(len(fragments), 1), geom[fragments.surfel.long(), 11:12]], dim=1)
+    values = torch.cat([values, fragments.depth[:, None], geom[fragments.surfel.long(), 12:15]], dim=1)
+    want = ops.composite(fragments, values)
+    got = torch.cat([output.alpha, output.beta, output.depth, output.normal], dim=-1).view(-1, 6)
+    torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-13)
+
+
+def test_masked_counts_count_blended_fragments_on_masked_pixels() -> None:
+    case = random_scene(30, 4)
+    scene, camera = scene_of(case, torch.float32)
+    fragments = scene.render(camera).fragments
+    mask = torch.rand(case.width * case.height, generator=torch.Generator().manual_seed(0)) > 0.5
+    counts = ops.masked_counts(fragments, mask, 30)
+    on_mask = fragments.surfel[mask[fragments.pixel.long()]].long()
+    assert torch.equal(counts.long(), torch.bincount(on_mask, minlength=30))
+
+
+@pytest.mark.parametrize("size", [(11, 11, 3), (20, 31, 3), (40, 17, 1), (10, 30, 3)])
+def test_ssim_and_its_gradient(size: tuple[int, int, int]) -> None:
+    from bitymi_ns.ops.reference.ssim import ssim as reference
+
+    g = torch.Generator().manual_seed(1)
+    a, b = (torch.rand(size, generator=g, dtype=torch.float64) for _ in range(2))
+    if size[0] < 11:
+        assert ops.ssim(a, b) == 1.0
+        return
+    p, q = a.clone().requires_grad_(), a.clone().requires_grad_()
+    got, want = ops.ssim(p, b), reference(q, b)
+    got.backward()
+    want.backward()
+    torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(p.grad, q.grad, rtol=1e-9, atol=1e-14)
+    assert abs(float(ops.ssim(a.float(), b.float())) - float(want)) < 1e-5
+
+
+def test_absolute_gradient_bounds_the_gradient_and_adds_over_fragments() -> None:
+    case = random_scene(30, 8)
+    scene, camera = scene_of(case, torch.float64)
+    output = scene.render(camera)
+    output.rgb.square().sum().backward()
+    projection = output.projection
+    assert (projection.mean2d_absgrad >= projection.mean2d_grad.abs() - 1e-12).all()
+    assert (projection.mean2d_absgrad > projection.mean2d_grad.abs() + 1e-9).any()
+
+
+def test_results_do_not_depend_on_the_number_of_threads_beyond_rounding() -> None:
+    from bitymi_ns import _cpu
+
+    case = random_scene(300, 9, width=150, height=90)
+    results = []
+    for threads in (1, 2, 3):
+        _cpu.set_num_threads(threads)
+        scene, camera = scene_of(case, torch.float32)
+        output = scene.render(camera)
+        output.rgb.square().sum().backward()
+        results.append((output.rgb.detach(), scene.surfels["means"].grad))
+    _cpu.set_num_threads(0)
+    for rgb, grad in results[1:]:
+        assert torch.equal(rgb, results[0][0])
+        torch.testing.assert_close(grad, results[0][1], rtol=1e-4, atol=1e-4)
+
+
+def test_wrong_inputs_are_refused() -> None:
+    case = random_scene(4, 0)
+    scene, camera = scene_of(case, torch.float32)
+    p = {key: scene.surfels[key].detach() for key in ("means", "quats", "log_scales", "opacity_logits", "beta_raw")}
+    with pytest.raises(ValueError, match="quats must have shape"):
+        ops.project(**{**p, "quats": p["quats"][:, :3]}, camera=camera)
+    with pytest.raises(TypeError, match="float32 or float64"):
+        ops.project(**{key: value.half() for key, value in p.items()}, camera=camera)
+    skewed = Camera(camera.viewmat, camera.K + torch.tensor([[0, 1.0, 0], [0, 0, 0], [0, 0, 0]]), 4, 4)
+    with pytest.raises(ValueError, match="skew"):
+        ops.project(**p, camera=skewed)
+    with pytest.raises(ValueError, match="unknown view colour"):
+        ops.view_color("fancy", scene.surfels, p["means"], torch.zeros(3))
+    with pytest.raises(ValueError, match="one size"):
+        ops.ssim(torch.rand(20, 20, 3), torch.rand(20, 21, 3))
+    with pytest.raises(ValueError, match="pixels"):
+        ops.masked_counts(scene.render(camera).fragments, torch.ones(3, dtype=torch.bool), 4)

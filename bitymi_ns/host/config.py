@@ -12,7 +12,6 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, stub_checkpoint_dir
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
@@ -66,21 +65,23 @@ class BitymiTrainerConfig(TrainerConfig):
         Args:
             trained_for: the length of the run that is resumed.
         """
-        on_cpu = self.machine.device_type == "cpu"
         if self.max_num_iterations is None:
-            self.max_num_iterations = trained_for or (
-                self.default_iterations_cpu if on_cpu else self.default_iterations
-            )
-            if on_cpu and trained_for is None:
-                why = "no kernels for the GPU in this installation" if torch.cuda.is_available() else "no GPU"
-                CONSOLE.print(
-                    f"[bold yellow]Training on the CPU ({why}): a short schedule of {self.max_num_iterations:,} steps. "
-                    f"For the full one: --max-num-iterations {self.default_iterations}"
-                )
+            default = self.default_iterations_cpu if self.machine.device_type == "cpu" else self.default_iterations
+            self.max_num_iterations = trained_for or default
         if self.max_num_iterations < 1:
             raise SystemExit(f"bitymi: --max-num-iterations must be at least 1, not {self.max_num_iterations}")
         if self.steps_per_save is None:
             self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
+
+    def announcement(self) -> str:
+        """What to tell the user about the length of the run."""
+        text = f"Training for {self.max_num_iterations:,} steps on {self.machine.device_type}."
+        short = self.max_num_iterations == self.default_iterations_cpu != self.default_iterations
+        if self.machine.device_type == "cpu" and short:
+            why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"
+            text += f" This is the short schedule ({why}); for the full one: --max-num-iterations "
+            text += str(self.default_iterations)
+        return text
 
     def _make_paths_absolute(self) -> None:
         """So that config.yml can be used from any folder."""

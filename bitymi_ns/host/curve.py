@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,12 @@ class TrainingCurve:
         os.replace(unfinished, path)
 
     def add(self, point: dict[str, Any]) -> None:
-        """Write one point, whole and at once."""
-        with open(self.path, "a", encoding="utf8") as file:
-            file.write(json.dumps(point) + "\n")
+        """Write one point, whole and at once. A full disk costs the point, not the run."""
+        try:
+            with open(self.path, "a", encoding="utf8") as file:
+                file.write(json.dumps(point) + "\n")
+        except OSError as error:
+            warnings.warn(f"a point of the training curve {self.path} could not be written: {error}", stacklevel=2)
 
 
 def _points_until(path: Path, last_step: int) -> list[str]:

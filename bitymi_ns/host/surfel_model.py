@@ -103,6 +103,12 @@ class SurfelModel(Model):
             )
         return metrics, {"img": torch.cat([target, rgb], dim=1)}
 
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """[H, W, 4] with straight alpha, for `ns-render --rendered-output-names rgba`."""
+        alpha = outputs["accumulation"]
+        rgb = (outputs[output_name] - (1.0 - alpha) * self.background.to(alpha)) / alpha.clamp(min=1e-6)
+        return torch.cat([torch.where(alpha > 0, rgb, 0.0).clamp(0.0, 1.0), alpha], dim=-1)
+
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         return {"surfels": torch.tensor(float(self.surfel_count()))}
 

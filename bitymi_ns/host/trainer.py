@@ -65,7 +65,7 @@ class BitymiTrainer(Trainer):
                 "For a longer run give a larger --max-num-iterations."
             )
             return
-        self._stop_requested = False
+        CONSOLE.print(f"[bold yellow]{self.config.announcement()}", soft_wrap=True)
         restore_handler = self._catch_interrupt()
         self.config.max_num_iterations = total - self._start_step
         try:

@@ -1,0 +1,109 @@
+"""Image metrics, the training curve and honest clocks."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import urllib.error
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from bitymi_ns.host import metrics
+from bitymi_ns.host.curve import Stopwatch, TrainingCurve, points
+
+
+def pair() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(40, 50, 3, generator=generator)
+    return (reference + 0.1).clamp(0, 1), reference
+
+
+def test_psnr_of_a_known_error() -> None:
+    a = torch.full((8, 8, 3), 0.5)
+    assert metrics.psnr(a + 0.1, a) == pytest.approx(20.0, abs=1e-4)
+    assert metrics.psnr(a, a) == 100.0
+    mask = torch.zeros(8, 8, 1, dtype=torch.bool)
+    mask[:2] = True
+    b = a.clone()
+    b[2:] = 0.0  # where it does not count
+    assert metrics.psnr(b * mask, a * mask, mask) == 100.0
+
+
+def test_equal_images_are_perfect(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_lpips", [None])
+    image = pair()[1]
+    result = metrics.image_metrics(image, image)
+    assert result["ssim"] == pytest.approx(1.0) and result["flip"] == pytest.approx(0.0, abs=1e-6)
+    assert "lpips" not in result
+
+
+def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    flip_evaluator = pytest.importorskip("flip_evaluator")
+    monkeypatch.setattr(metrics, "_lpips", [None])
+    image, reference = pair()
+    result = metrics.image_metrics(image, reference)
+    _, flip, _ = flip_evaluator.evaluate(reference.numpy(), image.numpy(), "LDR")
+    assert result["flip"] == pytest.approx(flip, abs=1e-6)
+    assert 0 < result["ssim"] < 1 and all(isinstance(v, float) and math.isfinite(v) for v in result.values())
+
+
+def test_lpips_that_cannot_be_had_is_left_out_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(*args: object, **kwargs: object) -> None:
+        raise urllib.error.URLError("offline")
+
+    monkeypatch.setattr(metrics, "_lpips", [])
+    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", offline)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert metrics.lpips(*pair()) is None
+        assert metrics.lpips(*pair()) is None
+    assert sum("LPIPS is left out" in str(w.message) for w in caught) == 1
+
+
+def test_rendering_is_timed_alone() -> None:
+    calls = []
+
+    def render() -> None:
+        calls.append(1)
+        time.sleep(0.05 if len(calls) == 1 else 0.01)  # the first run is slow
+
+    assert 8 < metrics.render_milliseconds(render, torch.device("cpu")) < 40
+    assert len(calls) == 4
+
+
+def test_the_clock_counts_between_start_and_stop_only() -> None:
+    clock = Stopwatch(1.0, 2.0)
+    clock.start()
+    clock.stop()
+    time.sleep(0.02)
+    clock.stop()
+    assert 1.0 <= clock.seconds < 1.015 and clock.cpu_seconds >= 2.0
+
+
+def test_curve_points_end_with_the_run() -> None:
+    assert sorted(points(100, 4)) == [24, 49, 74, 99]
+    assert max(points(7, 20)) == 6 and min(points(7, 20)) == 0
+    assert points(10, 0) == frozenset()
+
+
+def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
+    first = TrainingCurve(tmp_path / "a.jsonl")
+    for step in (10, 20, 30):
+        first.add({"step": step})
+    with open(tmp_path / "a.jsonl", "a") as file:
+        file.write('{"step": 4')  # the run was killed here
+    TrainingCurve(tmp_path / "b.jsonl", tmp_path / "a.jsonl", last_step=19).add({"step": 40})
+    assert [json.loads(line)["step"] for line in (tmp_path / "b.jsonl").read_text().splitlines()] == [10, 40]
+    TrainingCurve(tmp_path / "a.jsonl")
+    assert (tmp_path / "a.jsonl").read_text() == ""
+
+
+def test_a_full_disk_costs_a_point_and_not_the_run(tmp_path: Path) -> None:
+    curve = TrainingCurve(tmp_path / "a.jsonl")
+    curve.path = tmp_path / "missing" / "a.jsonl"
+    with pytest.warns(UserWarning, match="could not be written"):
+        curve.add({"step": 1})

@@ -48,7 +48,9 @@ class TrainingRun:
         self.step = self.first_step
         extent = scene_extent(model.metadata["camera_centers"], model.scene.surfels["means"])
         self.schedule = Schedule(self.config, self.total, extent)
-        self.strategy = Strategy(self.config, self.schedule, extent, self._on_resize)
+        cameras = self.datamanager.train_dataset.cameras
+        pixels = float((cameras.width * cameras.height).double().mean())
+        self.strategy = Strategy(self.config, self.schedule, extent, self._on_resize, pixels)
         self.clock = Stopwatch()
         self._random_state: Tensor | None = None
         self._load(model.resume_state)

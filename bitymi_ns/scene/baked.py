@@ -82,9 +82,7 @@ class BakedScene:
         """
         p = self.surfels
         means = p["means"]
-        projection = project(
-            means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"], camera, self.near
-        )
+        projection = project(means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"], camera, self.near)
         base = view_color(self.view_color, p, means, camera.center.to(means), projection.visible)
         size = (camera.width, camera.height)
         image = means.new_empty(camera.height, camera.width, 9 if maps else 5)

@@ -109,7 +109,7 @@ class Scene(nn.Module):
             background: [3] colour behind the scene; None = black.
             field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
             maps: also depth and normals.
-            weight_bound: fragments of smaller weight keep the surfel's colour without the residual; None = as configured.
+            weight_bound: fragments of smaller weight keep the surfel's colour, without residual; None = as configured.
         """
         p = self.surfels
         projection = project(

@@ -59,6 +59,8 @@ class DensifyConfig:
     """Opacities are clamped to this at each densification."""
     reset_interval: int = 3000
     """Steps between opacity resets (until `stop`)."""
+    min_reset_interval: int = 1500
+    """Fewest steps between opacity resets, however short the run."""
     reset_opacity: float = 0.01
     """Opacity after a reset, at most. Runs of fewer than about 3,700 steps reset to a higher one (`Schedule`)."""
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
@@ -67,6 +69,10 @@ class DensifyConfig:
     """Final prunes remove surfels below this opacity."""
     final_prune_score: float = 0.9
     """Final prunes remove surfels whose multi-view error score (0 to 1) is above this."""
+    min_interval: int = 100
+    """Fewest steps between densifications, however short the run: surfels need time to settle first."""
+    max_per_pixel: float = 0.15
+    """Densification stops at this many surfels a pixel of a training view; 0 = no such bound."""
     max_surfels: int = 0
     """Hard cap on the number of surfels; 0 = none."""
     min_surfels: int = 100

@@ -18,7 +18,8 @@ class Schedule:
 
     The options give every step count for a run of 30,000 steps. A run of another length keeps the proportions: an
     event that fires n times in 30,000 steps fires n times in any run with room for it, at the same share of the run.
-    (A run too short for that, fewer than 60 steps with the default options, fires at every step it can.)
+    Densifications and opacity resets keep a least distance in steps (`min_interval`, `min_reset_interval`) and so fire
+    less often in short runs.
 
     `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
     """
@@ -40,8 +41,12 @@ class Schedule:
         densify = config.densify
         if densify.interval < 1 or densify.reset_interval < 1 or config.freeze_every < 1:
             raise ValueError("densify.interval, densify.reset_interval and freeze_every must be at least 1")
-        self.densify_steps = self._events(_multiples(densify.interval, densify.start, densify.stop))
-        self.reset_steps = self._events(_multiples(densify.reset_interval, 0, densify.stop))
+        # short runs leave events out, so that about the least number of steps lies between two
+        reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
+        interval = densify.interval * self._stride(densify.interval, densify.min_interval)
+        self.densify_steps = self._events(_multiples(interval, densify.start, densify.stop))
+        self.reset_steps = self._events(_multiples(reset, 0, densify.stop))
+        self.reset_every = self.scaled(reset)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
 
     def scaled(self, step_at_30k: float) -> int:
@@ -49,6 +54,9 @@ class Schedule:
         if step_at_30k <= 0:
             return 0
         return max(1, math.floor(step_at_30k * self.max_steps / REFERENCE_STEPS + 0.5))
+
+    def _stride(self, interval: int, least: int) -> int:
+        return max(1, round(least * REFERENCE_STEPS / (interval * self.max_steps)))
 
     def _events(self, steps_at_30k: list[int]) -> frozenset[int]:
         return frozenset(min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
@@ -71,7 +79,7 @@ class Schedule:
         densify = self.config.densify
         if not 0.0 < densify.reset_opacity < 1.0:
             raise ValueError(f"reset_opacity must be between 0 and 1, not {densify.reset_opacity}")
-        deepest = -0.5 * self.scaled(densify.reset_interval) * self.config.lr.opacity_logits
+        deepest = -0.5 * self.reset_every * self.config.lr.opacity_logits
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
 
     def is_final_prune_step(self, step: int) -> bool:
@@ -80,7 +88,7 @@ class Schedule:
 
     def after_first_reset(self, step: int) -> bool:
         """Whether the first opacity reset is over: from then on size on screen counts for pruning."""
-        return step > self.scaled(self.config.densify.reset_interval)
+        return step > self.reset_every
 
     def densification_over(self, step: int) -> bool:
         """Whether no densification can follow this step, so that its statistics are needed no more."""

@@ -54,7 +54,12 @@ class Strategy:
     max_radius: Tensor
 
     def __init__(
-        self, config: TrainConfig, schedule: Schedule, extent: float, on_resize: ResizeHook | None = None
+        self,
+        config: TrainConfig,
+        schedule: Schedule,
+        extent: float,
+        on_resize: ResizeHook | None = None,
+        view_pixels: float = 0.0,
     ) -> None:
         """
         Args:
@@ -62,11 +67,14 @@ class Strategy:
             schedule: says at which steps what takes place.
             extent: scene extent in world units.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
+            view_pixels: pixels of a training view at full size, for `densify.max_per_pixel`; 0 = that bound is off.
         """
         self.config = config
         self.schedule = schedule
         self.extent = extent
         self.on_resize = on_resize
+        bounds = (config.densify.max_surfels, int(config.densify.max_per_pixel * view_pixels))
+        self.most = min((bound for bound in bounds if bound > 0), default=0)  # 0: densification is not bounded
         self.generator = torch.Generator().manual_seed(config.seed)
         self._clear(0, torch.device("cpu"))
 
@@ -162,8 +170,8 @@ class Strategy:
         wanted = scores.importance > config.importance
         clone = wanted & ~large & (self.grad_sum / seen >= config.grad_threshold)
         split = wanted & large & (self.abs_grad_sum / seen >= config.abs_grad_threshold)
-        if config.max_surfels > 0:
-            room = max(0, config.max_surfels - n)
+        if self.most > 0:
+            room = max(0, self.most - n)
             chosen = _strongest(clone | split, scores.importance, self.abs_grad_sum / seen, room)
             clone, split = clone & chosen, split & chosen
         clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()

@@ -154,7 +154,8 @@ class Trainer:
         self.config = config
         self.views = ReducedViews(views, device)
         self.schedule = Schedule(config, max_steps, extent)
-        self.strategy = Strategy(config, self.schedule, extent)
+        pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+        self.strategy = Strategy(config, self.schedule, extent, view_pixels=pixels)
         self.optimizers = make_optimizers(scene)
         self.step = 0
         self.seconds = 0.0

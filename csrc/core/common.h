@@ -40,6 +40,11 @@ template <class T>
 BT_HD T min_(T a, T b) {
   return select(a < b, a, b);
 }
+// NaN stays NaN: a broken parameter must show, not turn black
+template <class T>
+BT_HD T relu(T x) {
+  return select(x < T(0.0f), T(0.0f), x);
+}
 template <class T>
 BT_HD T clamp_(T x, T low, T high) {
   return min_(max_(x, low), high);

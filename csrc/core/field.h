@@ -95,9 +95,9 @@ BT_HD Row product(const Row* w, const S* in, int n) {
 template <class S, class Row>
 BT_HD Vec3<S> mlp(const Mlp<S, Row>& m, const S* features, MlpState<S, Row>& state) {
   S h[kWidth];
-  state.h1 = max_(product(m.w1, features, m.inputs), Row(S(0)));
+  state.h1 = relu(product(m.w1, features, m.inputs));
   store(h, state.h1);
-  state.h2 = max_(product(m.w2, h, kWidth), Row(S(0)));
+  state.h2 = relu(product(m.w2, h, kWidth));
   return {sum(state.h2 * m.w3[0]), sum(state.h2 * m.w3[1]), sum(state.h2 * m.w3[2])};
 }
 // Adds the weights' gradients to g (w1, w2, w3 used) and returns those of the features.

@@ -53,8 +53,8 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
       const S* g = geom + id * kGeom;
       const int32_t* patch = atlas.tiles + 5 * id;
       const bool flat = !textured || patch[3] == 0;
-      const Quad<S> view = {max_(base[3 * id] + S(0.5), S(0)), max_(base[3 * id + 1] + S(0.5), S(0)),
-                            max_(base[3 * id + 2] + S(0.5), S(0)), S(0)};
+      const Quad<S> view = {relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)),
+                            relu(base[3 * id + 2] + S(0.5)), S(0)};
       state.blend(g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
         S u[kLanes], v[kLanes], w[kLanes], kept[kLanes] = {};
         store(u, f.u), store(v, f.v), store(w, weight);
@@ -64,7 +64,7 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
           Quad<S> c = view;
           if (!flat) {
             c += residual(atlas, patch, u[i], v[i]);
-            c = c > S(0) ? c : Quad<S>{};
+            c = c < S(0) ? Quad<S>{} : c;
           }
           c[3] = S(1);
           to[i] += w[i] * c;

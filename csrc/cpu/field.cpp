@@ -66,7 +66,7 @@ Vec3<S> world_point(const S* frame, S u, S v) {
 }
 template <class S>
 S view_base(S b) {
-  return max_(b + S(0.5), S(0));
+  return relu(b + S(0.5));
 }
 }  // namespace
 
@@ -92,8 +92,7 @@ void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const
         for (int p = 0; p < count; ++p) {
           S* to = colors + 3 * who[p];
           const Vec3<S> rho = mlp(m, enc.features[p], state);
-          to[0] = max_(to[0] + rho.x, S(0)), to[1] = max_(to[1] + rho.y, S(0));
-          to[2] = max_(to[2] + rho.z, S(0));
+          to[0] = relu(to[0] + rho.x), to[1] = relu(to[1] + rho.y), to[2] = relu(to[2] + rho.z);
         }
         count = 0;
       }

@@ -6,8 +6,13 @@ import math
 
 import pytest
 
-from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.schedules import Schedule
+
+
+def every_event() -> TrainConfig:
+    """Options of a run that leaves out no event, however short it is."""
+    return TrainConfig(densify=DensifyConfig(min_interval=1, min_reset_interval=1))
 
 
 def fired(schedule: Schedule, name: str) -> list[int]:
@@ -25,7 +30,7 @@ def test_reference_run_has_the_published_events():
 @pytest.mark.parametrize("event", ["is_densify_step", "is_reset_step", "is_final_prune_step"])
 def test_every_event_fires_as_often_as_in_the_reference_run(max_steps, event):
     reference = fired(Schedule(TrainConfig(), 30_000), event)
-    steps = fired(Schedule(TrainConfig(), max_steps), event)
+    steps = fired(Schedule(every_event(), max_steps), event)
     assert len(steps) == len(reference)
     for step, at_30k in zip(steps, reference, strict=True):
         assert abs(step - at_30k * max_steps / 30_000) <= 0.5
@@ -92,4 +97,12 @@ def test_unusable_extent_is_refused(extent):
 
 @pytest.mark.parametrize(("max_steps", "opacity"), [(30_000, 0.01), (3700, 0.01), (2000, 0.0759), (200, 0.4378)])
 def test_resets_leave_time_to_recover(max_steps, opacity):
-    assert Schedule(TrainConfig(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)
+    assert Schedule(every_event(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)
+
+
+def test_short_runs_leave_events_out() -> None:
+    steps = sorted(Schedule(TrainConfig(), 3000).densify_steps)
+    assert steps[0] >= 50 and steps[-1] < 1500
+    assert all(b - a == 100 for a, b in zip(steps, steps[1:], strict=False))
+    assert not Schedule(TrainConfig(), 3000).reset_steps
+    assert len(Schedule(TrainConfig(), 30_000).densify_steps) == 28

@@ -62,7 +62,7 @@ class DensifyConfig:
     min_reset_interval: int = 1500
     """Fewest steps between opacity resets, however short the run."""
     reset_opacity: float = 0.01
-    """Opacity after a reset, at most. Runs of fewer than about 3,700 steps reset to a higher one (`Schedule`)."""
+    """Opacity after a reset, at most. Very short runs reset to a higher one (`Schedule`)."""
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
     """Steps of the final multi-view prunes."""
     final_prune_opacity: float = 0.1

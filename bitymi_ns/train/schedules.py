@@ -9,6 +9,10 @@ from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 VIEW_COLOR = ("sv_rgb", "sh_dc", "sb_base", "sg_base")
 VIEW_SHAPE = ("sv_sites", "sv_log_tau", "sb_lobes", "sg_lobes")
 FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
+SHORT_RUN_POWER = 0.35
+"""Runs of fewer than 30,000 steps multiply the rates of the surfels (not of the field) by 30,000 / steps to this."""
+MAX_SHORT_RUN_GAIN = 4.0
+"""Short runs learn at most this much faster: at 7 times the rates the held-out error grows again."""
 SH_REST_SHARE = 1.0 / 20.0
 """The higher SH bands learn at this share of the rate of the constant one."""
 
@@ -49,6 +53,16 @@ class Schedule:
         self.reset_every = self.scaled(reset)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
 
+    @property
+    def short_run_gain(self) -> float:
+        """Factor of the surfels' learning rates: more than 1 in runs of fewer than 30,000 steps.
+
+        Adam moves a parameter by about its rate a step, so a run of 600 steps at the published rates ends long before
+        the surfels have found their places.
+        """
+        shortness = max(1.0, REFERENCE_STEPS / self.max_steps)
+        return min(MAX_SHORT_RUN_GAIN, shortness**SHORT_RUN_POWER)
+
     def scaled(self, step_at_30k: float) -> int:
         """The step count of this run that corresponds to one given for 30,000 steps: 0 stays 0, all else at least 1."""
         if step_at_30k <= 0:
@@ -74,12 +88,13 @@ class Schedule:
 
         Adam moves a logit by no more than its learning rate a step. A reset goes only as deep as can be made up for
         in half the time to the next one: else a short run would never see an opaque surfel, and its final prunes would
-        take nearly all. With the default options this matters for runs of fewer than about 3,700 steps.
+        take nearly all. It matters where resets are less than about 370 steps apart (fewer with the rates of a short
+        run).
         """
         densify = self.config.densify
         if not 0.0 < densify.reset_opacity < 1.0:
             raise ValueError(f"reset_opacity must be between 0 and 1, not {densify.reset_opacity}")
-        deepest = -0.5 * self.reset_every * self.config.lr.opacity_logits
+        deepest = -0.5 * self.reset_every * self.lr("opacity_logits", 0)
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
 
     def is_final_prune_step(self, step: int) -> bool:
@@ -118,17 +133,17 @@ class Schedule:
         Args:
             name: a surfel parameter, or field_table, field_w1 to field_w3 (or field_mlp for the three together).
         """
-        rates = self.config.lr
+        rates, gain = self.config.lr, self.short_run_gain
         if name == "means":
-            return self.extent * self._decay(rates.means, step)
+            return gain * self.extent * self._decay(rates.means, step)
         if name in ("quats", "log_scales", "opacity_logits", "beta_raw"):
-            return float(getattr(rates, name))
+            return gain * float(getattr(rates, name))
         if name in VIEW_COLOR:
-            return self._decay(rates.view_color, step)
+            return gain * self._decay(rates.view_color, step)
         if name == "sh_rest":
-            return SH_REST_SHARE * self._decay(rates.view_color, step)
+            return gain * SH_REST_SHARE * self._decay(rates.view_color, step)
         if name in VIEW_SHAPE:
-            return self._decay(rates.view_shape, step)
+            return gain * self._decay(rates.view_shape, step)
         if name == "field_table":
             return self.field_warmup(step) * self._decay(rates.field_table, step)
         if name in FIELD_MLP:

@@ -75,12 +75,12 @@ def test_resolution_doubles_up_to_full_size():
 
 
 def test_learning_rates():
-    schedule = Schedule(TrainConfig(), 3000, extent=4.0)
+    schedule = Schedule(TrainConfig(), 30_000, extent=4.0)
     assert schedule.lr("means", 0) == pytest.approx(4 * 1.6e-4)
-    assert schedule.lr("means", 2999) == pytest.approx(4 * 1.6e-6)
+    assert schedule.lr("means", 29_999) == pytest.approx(4 * 1.6e-6)
     assert schedule.lr("sh_rest", 0) == pytest.approx(schedule.lr("sh_dc", 0) / 20)
-    assert schedule.lr("field_table", 0) == pytest.approx(1e-2 / 50)
-    assert schedule.lr("field_w2", 2999) == pytest.approx(1e-4)
+    assert schedule.lr("field_table", 0) == pytest.approx(1e-2 / 500)
+    assert schedule.lr("field_w2", 29_999) == pytest.approx(1e-4)
     names = "means quats log_scales opacity_logits beta_raw sv_sites sv_log_tau sv_rgb sh_dc sh_rest sb_base sb_lobes"
     for name in (names + " sg_base sg_lobes field_table field_w1 field_w2 field_w3 field_mlp").split():
         assert type(schedule.lr(name, 1234)) is float  # checkpoints must hold no numpy scalars
@@ -95,7 +95,7 @@ def test_unusable_extent_is_refused(extent):
         Schedule(TrainConfig(), 100, extent)
 
 
-@pytest.mark.parametrize(("max_steps", "opacity"), [(30_000, 0.01), (3700, 0.01), (2000, 0.0759), (200, 0.4378)])
+@pytest.mark.parametrize(("max_steps", "opacity"), [(30_000, 0.01), (3700, 0.01), (1000, 0.01613), (200, 0.2689)])
 def test_resets_leave_time_to_recover(max_steps, opacity):
     assert Schedule(every_event(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)
 
@@ -106,3 +106,11 @@ def test_short_runs_leave_events_out() -> None:
     assert all(b - a == 100 for a, b in zip(steps, steps[1:], strict=False))
     assert not Schedule(TrainConfig(), 3000).reset_steps
     assert len(Schedule(TrainConfig(), 30_000).densify_steps) == 28
+
+
+def test_short_runs_learn_faster() -> None:
+    long, short, tiny = (Schedule(TrainConfig(), n) for n in (60_000, 3000, 50))
+    for name in ("means", "quats", "opacity_logits", "sv_rgb", "sh_rest", "sb_lobes"):
+        assert short.lr(name, 0) == pytest.approx(10**0.35 * long.lr(name, 0))
+        assert tiny.lr(name, 0) == pytest.approx(4 * long.lr(name, 0))
+    assert short.lr("field_mlp", 2999) == pytest.approx(long.lr("field_mlp", 59_999))

@@ -94,6 +94,7 @@ def write_bundle(
     extent: float = 3.0,
     mean_residual: Tensor | None = None,
     near: float = 0.2,
+    weight_bound: float = 0.0,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     world: World | None = None,
     statistics: Mapping[str, Any] | None = None,
@@ -110,6 +111,7 @@ def write_bundle(
         extent: half side of a tile in scale units.
         mean_residual: [N, 3] mean of each tile, for the colour that other viewers show.
         near: nearest drawn depth.
+        weight_bound: fragments of smaller blending weight get no residual.
         background: colour behind the surfels.
         world: place in the capture's own frame.
         statistics: anything worth knowing about the bake, for people and reports.
@@ -128,7 +130,7 @@ def write_bundle(
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS):
             raise BundleError(f"extra_files may not replace {name}")
-    info = _describe(surfels, atlas, extent, near, background, world or World(), statistics)
+    info = _describe(surfels, atlas, extent, near, weight_bound, background, world or World(), statistics)
     try:
         with complete_folder(folder, overwrite) as new:
             columns = to_columns(surfels, tiles, mean_residual)
@@ -187,6 +189,7 @@ def _describe(
     atlas: EncodedAtlas | None,
     extent: float,
     near: float,
+    weight_bound: float,
     background: Sequence[float],
     world: World,
     statistics: Mapping[str, Any] | None,
@@ -214,6 +217,7 @@ def _describe(
             "alpha_min": 1.0 / 255.0,
             "t_min": 1e-4,
             "near": near,
+            "weight_bound": weight_bound,
             "low_pass": 1.0,
             "background": list(background),
         },

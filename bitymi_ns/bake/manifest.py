@@ -103,7 +103,7 @@ def parse(data: bytes, source: str = MANIFEST) -> dict[str, Any]:
     fields.integer("surfels.count")
     fields.text("surfels.view_color", "sv", "sh", "sb", "sg")
     fields.number("color_bias")
-    for name in ("alpha_max", "alpha_min", "t_min", "near", "low_pass"):
+    for name in ("alpha_max", "alpha_min", "t_min", "near", "weight_bound", "low_pass"):
         fields.number(f"render.{name}")
     fields.numbers("render.background", 3)
     fields.numbers("world.transform", 3, 4)

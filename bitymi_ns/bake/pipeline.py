@@ -45,7 +45,7 @@ class BakeableScene(Protocol):
 
     surfels: Mapping[str, Tensor]
     field: Field | None
-    config: Any  # near
+    config: Any  # near, weight_bound
 
 
 @dataclass
@@ -101,6 +101,7 @@ class Baked:
         mean_residual: [N, 3] mean of every tile.
         atlas: the encoded atlas, None without texture.
         near: nearest drawn depth.
+        weight_bound: fragments of smaller blending weight get no residual.
         options: what it was baked with.
         statistics: what was left out, what it cost, and the error of the quantisation.
     """
@@ -112,6 +113,7 @@ class Baked:
     mean_residual: Tensor
     atlas: EncodedAtlas | None
     near: float
+    weight_bound: float
     options: BakeOptions
     statistics: dict[str, Any] = field(default_factory=dict)
 
@@ -152,6 +154,7 @@ def bake(
     started = time.perf_counter()
     kept, left_out = _drawable(scene.surfels)
     near = float(getattr(scene.config, "near", 0.2))
+    weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
     axes, scales = tangent_vectors(surfels["quats"]), surfels["log_scales"].exp()
 
@@ -193,7 +196,7 @@ def bake(
         }
     statistics["seconds"] = round(time.perf_counter() - started, 3)
     surfels = {name: value.cpu() for name, value in surfels.items()}
-    return Baked(surfels, kept.cpu(), packing, texels, mean_residual, atlas, near, options, statistics)
+    return Baked(surfels, kept.cpu(), packing, texels, mean_residual, atlas, near, weight_bound, options, statistics)
 
 
 def export(
@@ -218,6 +221,7 @@ def export(
         extent=baked.options.extent,
         mean_residual=baked.mean_residual,
         near=baked.near,
+        weight_bound=baked.weight_bound,
         background=background,
         world=world,
         statistics={**baked.statistics, **(statistics or {})},

@@ -42,6 +42,7 @@ class BakedScene:
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
         extent: half side of a tile in scale units.
         near: nearest depth that is drawn, camera z.
+        weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
     """
 
     surfels: Mapping[str, Tensor]
@@ -52,6 +53,7 @@ class BakedScene:
     scale: float = 1.0
     extent: float = 3.0
     near: float = 0.2
+    weight_bound: float = 0.0
 
     @classmethod
     def from_bundle(cls, bundle: Bundle) -> BakedScene:
@@ -66,6 +68,7 @@ class BakedScene:
             scale=bundle.scale,
             extent=info["atlas"]["extent"] if info["atlas"] else 3.0,
             near=info["render"]["near"],
+            weight_bound=info["render"]["weight_bound"],
         )
 
     def __len__(self) -> int:
@@ -96,6 +99,7 @@ class BakedScene:
             projection.radii,
             *size,
             self.near,
+            self.weight_bound,
             maps,
             base,
             atlas if is_bytes else None,

@@ -31,7 +31,7 @@ class SceneConfig:
     """mip-NeRF 360 contraction of space outside the unit ball of the cameras; auto: off for scenes with alpha."""
     near: float = 0.2
     """Nearest depth that is drawn, in scene units (camera z)."""
-    weight_bound: float = 0.0
+    weight_bound: float = 0.02
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field."""
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels."""

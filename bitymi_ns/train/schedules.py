@@ -9,10 +9,6 @@ from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 VIEW_COLOR = ("sv_rgb", "sh_dc", "sb_base", "sg_base")
 VIEW_SHAPE = ("sv_sites", "sv_log_tau", "sb_lobes", "sg_lobes")
 FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
-SHORT_RUN_POWER = 0.35
-"""Runs of fewer than 30,000 steps multiply the rates of the surfels (not of the field) by 30,000 / steps to this."""
-MAX_SHORT_RUN_GAIN = 4.0
-"""Short runs learn at most this much faster: at 7 times the rates the held-out error grows again."""
 SH_REST_SHARE = 1.0 / 20.0
 """The higher SH bands learn at this share of the rate of the constant one."""
 
@@ -61,7 +57,7 @@ class Schedule:
         the surfels have found their places.
         """
         shortness = max(1.0, REFERENCE_STEPS / self.max_steps)
-        return min(MAX_SHORT_RUN_GAIN, shortness**SHORT_RUN_POWER)
+        return min(self.config.lr.short_run_max, shortness**self.config.lr.short_run_power)
 
     def scaled(self, step_at_30k: float) -> int:
         """The step count of this run that corresponds to one given for 30,000 steps: 0 stays 0, all else at least 1."""

@@ -192,8 +192,8 @@ void bind(nb::module_& m, const char* suffix) {
           "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert())
       .def(
           "baked",
-          [](const Trace<S>& t, In geom, In radii, int width, int height, double near, bool maps, In base,
-             Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> atlas_shape,
+          [](const Trace<S>& t, In geom, In radii, int width, int height, double near, double weight_bound, bool maps,
+             In base, Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> atlas_shape,
              double offset, double scale, double extent, Array<const int32_t> tiles, Out image,
              Maybe<int32_t> overdraw) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
@@ -207,6 +207,7 @@ void bind(nb::module_& m, const char* suffix) {
                                  float(offset),
                                  float(scale),
                                  float(extent),
+                                 float(weight_bound),
                                  data(tiles, 5 * n, "tiles")};
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data(), *b = data(base, 3 * n, "base");
             S* out = data(image, pixels * (maps ? kMapChannels : kImageChannels), "image");
@@ -214,9 +215,10 @@ void bind(nb::module_& m, const char* suffix) {
             nb::gil_scoped_release release;
             baked_forward(g, r, S(near), t.bins, width, height, maps, b, atlas, out, o);
           },
-          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "maps"_a, "base"_a.noconvert(),
-          "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "atlas_shape"_a, "offset"_a, "scale"_a,
-          "extent"_a, "tiles"_a.noconvert(), "image"_a.noconvert(), "overdraw"_a.noconvert().none());
+          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "weight_bound"_a, "maps"_a,
+          "base"_a.noconvert(), "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "atlas_shape"_a,
+          "offset"_a, "scale"_a, "extent"_a, "tiles"_a.noconvert(), "image"_a.noconvert(),
+          "overdraw"_a.noconvert().none());
 
   m.def(
       name("trace_backward").c_str(),

@@ -62,7 +62,7 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
         for (uint32_t rest = lanes; rest; rest &= rest - 1) {
           const int i = __builtin_ctz(rest);
           Quad<S> c = view;
-          if (!flat) {
+          if (!flat && w[i] >= S(atlas.weight_bound)) {
             c += residual(atlas, patch, u[i], v[i]);
             c = c < S(0) ? Quad<S>{} : c;
           }

@@ -148,6 +148,7 @@ struct Atlas {
   const float* floats;   // RGBA likewise, or null
   float offset, scale;   // residual = offset + scale * stored
   float extent;          // half side of a tile, scale units
+  float weight_bound;    // fragments of smaller weight get no residual
   const int32_t* tiles;  // [n, 5]: x, y, layer, r_u, r_v; r_u = 0: no tile
 };
 // image [pixels, channels] as composite_forward; overdraw [pixels] int32 or null

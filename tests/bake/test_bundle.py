@@ -42,7 +42,9 @@ def names_beside(folder):
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
 @pytest.mark.parametrize("format", ["bc7", "uint8", "fp16", None])
 def test_what_is_written_is_read(surfels, tmp_path, kind, format):
-    params, tiles, texels, atlas = make(surfels, tmp_path / "b", kind, format, near=0.3, background=(1, 0.5, 0))
+    params, tiles, texels, atlas = make(
+        surfels, tmp_path / "b", kind, format, near=0.3, weight_bound=0.02, background=(1, 0.5, 0)
+    )
     loaded = read_bundle(tmp_path / "b")
     assert loaded.view_color == kind and len(loaded) == 6
     np.testing.assert_array_equal(loaded.tiles.numpy(), tiles)
@@ -53,6 +55,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         "alpha_min": 1 / 255,
         "t_min": 1e-4,
         "near": 0.3,
+        "weight_bound": 0.02,
         "low_pass": 1.0,
         "background": [1, 0.5, 0],
     }

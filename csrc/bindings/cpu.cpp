@@ -5,6 +5,10 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
+#if defined(__GLIBC__) || __has_include(<malloc.h>)
+#include <malloc.h>
+#endif
+
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -385,6 +389,13 @@ void bind(nb::module_& m, const char* suffix) {
 }  // namespace
 
 NB_MODULE(_cpu, m) {
+#if defined(__GLIBC__)
+  // Every view allocates and frees the same tens of megabytes. Given back to the system in between, they cost more in
+  // page faults than what is computed in them.
+  mallopt(M_MMAP_THRESHOLD, 32 << 20);
+  mallopt(M_TRIM_THRESHOLD, 1 << 30);
+  mallopt(M_TOP_PAD, 64 << 20);
+#endif
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
   bind<float>(m, "_f32");

@@ -14,8 +14,9 @@ struct Fragment {
   T low_pass;  // 1 in the low-pass branch, else 0
 };
 
-// S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected centre.
-template <class S, class T>
+// S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected centre. Without kBlur the low
+// pass is left out, for pixels so far from the centre that it cannot reach alpha 1/255.
+template <class S, class T, bool kBlur = true>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
@@ -27,14 +28,19 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T rest = one - (u * u + v * v) * T(S(1.0 / (kSupport * kSupport)));
   const auto inside = hit & (rest > zero);
   const T kernel = select(inside, exp_(T(g[kBeta]) * log_(select(inside, rest, one))), zero);
-  const T blur = exp_(-(dx * dx + dy * dy));
-  const auto low = blur > kernel;
-  const T r = T(S(kSupport));
   Fragment<T> f;
-  f.u = clamp_(u, -r, r), f.v = clamp_(v, -r, r);
-  f.depth = select(low, T(g[kZ]), T(q) * inv);
-  f.sigma = min_(T(S(kAlphaMax)), T(g[kOpacity]) * select(low, blur, kernel));
-  f.low_pass = select(low, one, zero);
+  f.u = u, f.v = v, f.depth = T(q) * inv, f.low_pass = zero;
+  T most = kernel;
+  if (kBlur) {
+    const T blur = exp_(-(dx * dx + dy * dy));
+    const auto low = blur > kernel;
+    const T r = T(S(kSupport));
+    f.u = clamp_(u, -r, r), f.v = clamp_(v, -r, r);
+    f.depth = select(low, T(g[kZ]), f.depth);
+    f.low_pass = select(low, one, zero);
+    most = select(low, blur, kernel);
+  }
+  f.sigma = min_(T(S(kAlphaMax)), T(g[kOpacity]) * most);
   return f;
 }
 

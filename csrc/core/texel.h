@@ -6,17 +6,12 @@
 
 namespace bt {
 
-// Bilinear neighbours along one axis; coordinates are clamped to the outer texel centres.
-template <class S>
-struct TexelPair {
-  int i0, i1;
-  S fraction;  // weight of i1
-};
-template <class S>
-BT_HD TexelPair<S> texel_pair(S u, int r, S extent) {
-  const S x = clamp_((u + extent) / (S(2) * extent) * S(r) - S(0.5), S(0), S(r - 1));
-  const int i = min_(int(x), r - 1);
-  return {i, min_(i + 1, r - 1), x - S(i)};
+// Position along one axis of a tile of r texels, clamped to the outer texel centres: texel floor(x), its neighbour
+// min(floor(x) + 1, r - 1), and the fraction is the neighbour's weight.
+template <class S, class T>
+BT_HD T texel_position(T u, int r, S extent) {
+  const T x = (u + T(extent)) * T(S(r) / (S(2) * extent)) - T(S(0.5));
+  return clamp_(x, T(S(0)), T(S(r - 1)));
 }
 
 }  // namespace bt

@@ -19,17 +19,22 @@ inline Quad<S> texel(const Atlas& a, int64_t at) {
   std::memcpy(&t, a.floats + 4 * at, sizeof t);
   return __builtin_convertvector(t, Quad<S>);
 }
-// Residual colour at (u, v) of a tile, bilinear.
+// Residual colour at position (x, y) of a tile, bilinear; `at` is the texel at the whole numbers below.
 template <class S>
-inline Quad<S> residual(const Atlas& a, const int32_t* tile, S u, S v) {
-  const TexelPair<S> x = texel_pair(u, tile[3], S(a.extent)), y = texel_pair(v, tile[4], S(a.extent));
-  const int64_t row0 = (int64_t(tile[2]) * a.height + tile[1] + y.i0) * a.width + tile[0];
-  const int64_t row1 = row0 + int64_t(y.i1 - y.i0) * a.width;
-  const Quad<S> top = texel<S>(a, row0 + x.i0), right = texel<S>(a, row0 + x.i1);
-  const Quad<S> low = texel<S>(a, row1 + x.i0), corner = texel<S>(a, row1 + x.i1);
-  const Quad<S> upper = top + x.fraction * (right - top), lower = low + x.fraction * (corner - low);
-  const S scale = S(a.scale), offset = S(a.offset);
-  return (upper + y.fraction * (lower - upper)) * scale + offset;
+inline Quad<S> residual(const Atlas& a, const int32_t* tile, int64_t at, S x, S y) {
+  const int x0 = int(x), y0 = int(y);
+  const int64_t right = x0 + 1 < tile[3] ? 1 : 0, down = y0 + 1 < tile[4] ? a.width : 0;
+  const S fx = x - S(x0), fy = y - S(y0);
+  const Quad<S> t00 = texel<S>(a, at), t10 = texel<S>(a, at + right);
+  const Quad<S> t01 = texel<S>(a, at + down), t11 = texel<S>(a, at + down + right);
+  const Quad<S> upper = t00 + fx * (t10 - t00), lower = t01 + fx * (t11 - t01);
+  return (upper + fy * (lower - upper)) * S(a.scale) + S(a.offset);
+}
+inline void prefetch(const Atlas& a, int64_t at) {
+  if (a.bytes)
+    __builtin_prefetch(a.bytes + 4 * at), __builtin_prefetch(a.bytes + 4 * (at + a.width));
+  else
+    __builtin_prefetch(a.floats + 4 * at), __builtin_prefetch(a.floats + 4 * (at + a.width));
 }
 }  // namespace
 
@@ -44,38 +49,47 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height);
-    Quad<S> rgba[kTile * kTile] = {};
-    P extra[5][kPacks];  // beta, depth, normal
-    for (auto& row : extra) std::fill(row, row + kPacks, P(S(0)));
-    int32_t drawn[kTile * kTile] = {};
+    // fragments with a residual sum into rgb, one by one; all the rest in packs
+    Quad<S> rgb[kTile * kTile] = {};
+    P sums[4 + kMapChannels][kPacks];  // rgb of the fragments without residual, alpha, beta, depth, normal, overdraw
+    for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
+    const int drawn = channels;
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
       const S* g = geom + id * kGeom;
       const int32_t* patch = atlas.tiles + 5 * id;
-      const bool flat = !textured || patch[3] == 0;
-      const Quad<S> view = {relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)),
-                            relu(base[3 * id + 2] + S(0.5)), S(0)};
+      const S bound = !textured || patch[3] == 0 ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
+      const S view[3] = {relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)), relu(base[3 * id + 2] + S(0.5))};
       state.blend(g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
-        S u[kLanes], v[kLanes], w[kLanes], kept[kLanes] = {};
-        store(u, f.u), store(v, f.v), store(w, weight);
-        Quad<S>* to = rgba + pack * kLanes;
-        for (uint32_t rest = lanes; rest; rest &= rest - 1) {
-          const int i = __builtin_ctz(rest);
-          Quad<S> c = view;
-          if (!flat && w[i] >= S(atlas.weight_bound)) {
-            c += residual(atlas, patch, u[i], v[i]);
-            c = c < S(0) ? Quad<S>{} : c;
-          }
-          c[3] = S(1);
-          to[i] += w[i] * c;
-          ++drawn[pack * kLanes + i];
-          kept[i] = w[i];
-        }
-        const P wk = load(kept);
-        extra[0][pack] += wk * P(g[kBeta]);
+        const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
+        const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
+        for (int c = 0; c < 3; ++c) sums[c][pack] += plain * P(view[c]);
+        sums[3][pack] += w;
+        sums[4][pack] += w * P(g[kBeta]);
         if (maps) {
-          extra[1][pack] += wk * f.depth;
-          for (int c = 0; c < 3; ++c) extra[2 + c][pack] += wk * P(g[kNx + c]);
+          sums[5][pack] += w * f.depth;
+          for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
+        }
+        if (overdraw) sums[drawn][pack] += select(taken, P(S(1)), P(S(0)));
+        const uint32_t rest = bits(textures);
+        if (!rest) return;
+        S x[kLanes], y[kLanes], wt[kLanes];
+        store(x, texel_position(f.u, patch[3], S(atlas.extent)));
+        store(y, texel_position(f.v, patch[4], S(atlas.extent)));
+        store(wt, weight);
+        const Quad<S> colour = {view[0], view[1], view[2], S(0)};
+        Quad<S>* to = rgb + pack * kLanes;
+        int64_t at[kLanes];
+        const int64_t corner = (int64_t(patch[2]) * atlas.height + patch[1]) * atlas.width + patch[0];
+        for (uint32_t r = rest; r; r &= r - 1) {
+          const int i = __builtin_ctz(r);
+          at[i] = corner + int64_t(int(y[i])) * atlas.width + int(x[i]);
+          prefetch(atlas, at[i]);
+        }
+        for (uint32_t r = rest; r; r &= r - 1) {
+          const int i = __builtin_ctz(r);
+          const Quad<S> c = colour + residual(atlas, patch, at[i], x[i], y[i]);
+          to[i] += wt[i] * (c < S(0) ? Quad<S>{} : c);
         }
       });
     }
@@ -85,9 +99,10 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
         const int y = ty * kTile + pack / kPacksAcross * kPackSide + lane / kPackSide;
         if (x >= width || y >= height) continue;
         const int64_t pixel = int64_t(y) * width + x;
-        for (int c = 0; c < 4; ++c) image[pixel * channels + c] = rgba[pack * kLanes + lane][c];
-        for (int c = 4; c < channels; ++c) image[pixel * channels + c] = extra[c - 4][pack][lane];
-        if (overdraw) overdraw[pixel] = drawn[pack * kLanes + lane];
+        S* to = image + pixel * channels;
+        for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
+        for (int c = 0; c < 3; ++c) to[c] += rgb[pack * kLanes + lane][c];
+        if (overdraw) overdraw[pixel] = int32_t(sums[drawn][pack][lane]);
       }
   }
 }

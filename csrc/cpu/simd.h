@@ -182,12 +182,13 @@ BT_HD uint32_t bits(Pack<double>::M m) {
   return r;
 }
 
-// The lanes' own numbers, 0 to 15.
-BT_HD Pack<float> lane_numbers_of(float) {
-  return Pack<float>(Pack<float>::V{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15});
-}
-BT_HD Pack<double> lane_numbers_of(double) {
-  return Pack<double>(Pack<double>::V{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15});
+// The lane mask of such bits.
+template <class S>
+BT_HD typename Pack<S>::M mask_of(uint32_t b) {
+  using M = typename Pack<S>::M;
+  M number;
+  for (int i = 0; i < kLanes; ++i) number[i] = 1 << i;
+  return (number & int(b)) != 0;
 }
 
 // The lanes named by `keep`, next to each other; `to` has room for a whole pack.

@@ -53,7 +53,8 @@ struct TileState {
         const P reach = P(S(kSupport * kSupport)) * W * W;
         const M near_centre = dx * dx + dy * dy < P(blur2);
         if (!bits(open[pack] & ((U * U + V * V < reach) | near_centre))) continue;
-        const Fragment<P> f = fragment<S, P>(g, near, dx, dy);
+        const Fragment<P> f =
+            bits(near_centre) ? fragment<S, P, true>(g, near, dx, dy) : fragment<S, P, false>(g, near, dx, dy);
         M take = open[pack] & (f.sigma >= P(S(kAlphaMin)));
         if (!bits(take)) continue;
         const P weight = f.sigma * transmittance[pack];

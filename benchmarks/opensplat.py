@@ -173,6 +173,8 @@ def main() -> int:
         say(str(error))
         return 1
     notes = [
+        "OpenSplat's curve was measured on 2 cores (AMD Zen 5); the line above names the machine that made this table, "
+        "not necessarily the one that trained.",
         "Our CPU seconds are those of the training steps alone: no loading, evaluation or saving. Points of our curve "
         "but the last are means over a sample of the held-out views where there are more than `curve_views`.",
     ]

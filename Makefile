@@ -1,6 +1,7 @@
 # make setup   virtual environment, pinned dependencies, compiled extension
 # make demo    train, bake and evaluate the sample scene (or DATA=folder) into demo/
 # make test    the test suite
+# make bench   quality, speed and size on your captures: make bench DATA="folder folder ..." (hours; it resumes)
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
@@ -17,7 +18,7 @@ CXX_FILES   := $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name '*.hpp')
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test lint format clean
+.PHONY: setup demo test bench lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -64,6 +65,10 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -q
+
+bench: setup
+	@test -n "$(DATA)" || { echo 'Name captures: make bench DATA="folder folder ..."' >&2; exit 1; }
+	$(BIN)/python benchmarks/captures.py --data $(DATA)
 
 lint: $(VENV)/.stamp-deps
 	$(BIN)/ruff check .

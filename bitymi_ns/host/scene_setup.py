@@ -1,8 +1,7 @@
-"""The scene that training starts from."""
+"""The scene that training starts from, out of what nerfstudio hands to a model."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -12,10 +11,9 @@ from torch import Tensor
 
 from bitymi_ns.host.errors import fail
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.init import scene_extent, surfels_from_points
+from bitymi_ns.train.domain import build_scene
 
 
 def new_scene(
@@ -34,13 +32,21 @@ def new_scene(
         train: training options.
         metadata: what the data manager says about the capture.
     """
-    centers = metadata.get("camera_centers", torch.zeros(0, 3))
     xyz, rgb = _points(points)
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
         box = _box(scene_box, len(xyz))
     try:
-        surfels, report = surfels_from_points(xyz, rgb, centers, train, config, box)
+        scene, report = build_scene(
+            xyz,
+            rgb,
+            metadata.get("camera_centers", torch.zeros(0, 3)),
+            config,
+            train,
+            bounded=metadata.get("has_alpha", False),
+            image_pixels=metadata.get("train_pixels", 0),
+            box=box,
+        )
     except ValueError as error:
         fail(str(error), error)
     if report.random:
@@ -51,24 +57,7 @@ def new_scene(
             f"[bold yellow]{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
             f"first is point {row}); they are left out."
         )
-    if config.texture == "none":
-        return Scene(config, surfels, None)
-    contract = config.contraction == "on" or (config.contraction == "auto" and not metadata.get("has_alpha", False))
-    mid, half = _domain(surfels["means"], centers, contract)
-    generator = torch.Generator().manual_seed(train.seed)
-    log2_size = config.log2_table_size
-    if log2_size is None:
-        log2_size = _table_size(metadata.get("train_pixels", 0))
-    return Scene(config, surfels, HashField(config, mid, half, contract, log2_size, generator))
-
-
-def _table_size(pixels: int) -> int:
-    """Entries a hash level, as a power of two: what the photographs can tell apart, and what a cache can hold.
-
-    A level gets one entry of 4 features for 32 pixels of all photographs together; four levels of 2^17 entries are 8 MB
-    in float32.
-    """
-    return min(17, max(14, round(math.log2(max(1, pixels) / 32))))
+    return scene
 
 
 def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
@@ -97,13 +86,3 @@ def _box(scene_box: SceneBox | None, given: int) -> Tensor | None:
             "point cloud (ply_file_path in transforms.json), or a positive --scene-scale after `nerfstudio-data`."
         )
     return torch.stack([low, high])
-
-
-def _domain(means: Tensor, centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
-    """Middle and half size of the field's domain: the ball of the cameras, or a box around the surfels."""
-    if contract and len(centers):
-        mid = centers.mean(0)
-        return tuple(mid.tolist()), scene_extent(centers, means)  # type: ignore[return-value]
-    low, high = means.amin(0), means.amax(0)
-    mid, half = (low + high) / 2, 0.55 * float((high - low).max())
-    return tuple(mid.tolist()), max(half, 1e-3)  # type: ignore[return-value]

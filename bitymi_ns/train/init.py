@@ -91,6 +91,8 @@ def surfels_from_points(
     Returns:
         The parameters by name, float32, on the CPU (table in docs/architecture.md), and what became of the points.
     """
+    if not 0.0 < config.init_opacity < 1.0:
+        raise ValueError(f"the training option init_opacity must lie between 0 and 1, not {config.init_opacity}")
     generator = torch.Generator().manual_seed(config.seed)
     centers = camera_centers.detach().reshape(-1, 3).float().cpu()
     centers = centers[centers.isfinite().all(-1)]

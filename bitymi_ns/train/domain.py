@@ -1,0 +1,105 @@
+"""The scene that training starts from: its surfels, and where in space the texture field lies."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.init import PointReport, scene_extent, surfels_from_points
+
+MAX_TERMS = 32
+"""Most Voronoi sites or lobes a surfel that the kernels take."""
+
+
+def build_scene(
+    points: Tensor,
+    colours: Tensor,
+    camera_centers: Tensor,
+    scene_config: SceneConfig,
+    train_config: TrainConfig,
+    bounded: bool,
+    image_pixels: int,
+    box: Tensor | None = None,
+) -> tuple[Scene, PointReport]:
+    """Surfels at the points, or at random in the box, and an empty texture field around them.
+
+    Args:
+        points: [M, 3] world positions; M may be 0.
+        colours: [M, 3] in [0, 1].
+        camera_centers: [C, 3] world positions of the training cameras.
+        scene_config: the representation.
+        train_config: training options.
+        bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off.
+        image_pixels: of all training images together; decides the size of the hash table where none is given.
+        box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
+
+    Returns:
+        The scene on the CPU, and what became of the points.
+
+    Raises:
+        ValueError: an option is out of range, or there is nothing to start from.
+    """
+    check_representation(scene_config)
+    surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
+    if scene_config.texture == "none":
+        return Scene(scene_config, surfels, None), report
+    contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
+    mid, half = field_domain(surfels["means"], camera_centers, contract)
+    log2_size = scene_config.log2_table_size
+    if log2_size is None:
+        log2_size = default_table_size(image_pixels)
+    generator = torch.Generator().manual_seed(train_config.seed)
+    field = HashField(scene_config, mid, half, contract, log2_size, generator)
+    return Scene(scene_config, surfels, field), report
+
+
+def check_representation(config: SceneConfig) -> None:
+    """Refuse options that the kernels would stumble over later.
+
+    Raises:
+        ValueError: naming the option and its range.
+    """
+    ranges = {
+        "sv_sites": (config.sv_sites, 1, MAX_TERMS),
+        "lobes": (config.lobes, 1, MAX_TERMS),
+        "sh_degree": (config.sh_degree, 0, 3),
+        "levels": (config.levels, 1, 4),
+        "min_resolution": (config.min_resolution, 2, 1 << 20),
+        "log2_table_size": (config.log2_table_size or 1, 1, 24),
+        "near": (config.near, 1e-6, math.inf),
+        "weight_bound": (config.weight_bound, 0.0, 1.0),
+        "rim": (config.rim, 1e-8, 1.0),
+    }
+    for name, (value, low, high) in ranges.items():
+        if not low <= value <= high:
+            limits = f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
+            raise ValueError(f"the scene option {name} must be {limits}, not {value}")
+
+
+def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
+    """Middle and half size of the field's domain, world units.
+
+    With contraction: the ball about the mean of the cameras that holds them all (`scene_extent`). Without: a cube
+    around the first surfels, a tenth larger.
+    """
+    if contract and len(camera_centers):
+        middle = camera_centers.detach().float().cpu().mean(0)
+        return tuple(middle.tolist()), scene_extent(camera_centers, means)  # type: ignore[return-value]
+    low, high = means.amin(0), means.amax(0)
+    middle, half = (low + high) / 2, 0.55 * float((high - low).max())
+    return tuple(middle.tolist()), max(half, 1e-3)  # type: ignore[return-value]
+
+
+def default_table_size(image_pixels: int) -> int:
+    """Entries a hash level, as a power of two: what the photographs can tell apart, and what a cache can hold.
+
+    A level gets one entry of 4 features for 32 pixels of all photographs together; four levels of 2^17 entries are 8 MB
+    in float32.
+    """
+    return min(17, max(14, round(math.log2(max(1, image_pixels) / 32))))

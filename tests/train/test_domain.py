@@ -1,0 +1,66 @@
+"""Building a scene without nerfstudio."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.domain import build_scene, check_representation, default_table_size, field_domain
+
+CENTERS = torch.tensor([[3.0, 0.0, 1.0], [-1.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def cloud() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return 2 * torch.rand(50, 3, generator=generator) - 1, torch.rand(50, 3, generator=generator)
+
+
+def build(cloud, bounded=False, pixels=0, **options):
+    config = SceneConfig(**{"log2_table_size": 8, **options})
+    return build_scene(*cloud, CENTERS, config, TrainConfig(), bounded, pixels)
+
+
+def test_an_open_scene_is_contracted_about_its_cameras(cloud) -> None:
+    scene, report = build(cloud)
+    geometry = scene.field.geometry
+    assert len(scene) == report.given == 50
+    assert geometry.contract and geometry.mid == (1.0, 0.0, 1.0) and geometry.half == pytest.approx(2.2)
+
+
+def test_a_bounded_scene_has_a_box_around_its_points(cloud) -> None:
+    geometry = build(cloud, bounded=True)[0].field.geometry
+    low, high = cloud[0].amin(0), cloud[0].amax(0)
+    assert not geometry.contract
+    assert geometry.half == pytest.approx(0.55 * float((high - low).max()))
+    assert geometry.mid == pytest.approx(((low + high) / 2).tolist())
+
+
+@pytest.mark.parametrize(("option", "bounded", "contract"), [("on", True, True), ("off", False, False)])
+def test_the_option_comes_before_what_the_capture_says(cloud, option, bounded, contract) -> None:
+    assert build(cloud, bounded, contraction=option)[0].field.geometry.contract is contract
+
+
+def test_a_domain_is_never_empty() -> None:
+    assert field_domain(torch.ones(1, 3), CENTERS[:0], contract=True) == ((1.0, 1.0, 1.0), 1e-3)
+
+
+def test_the_table_grows_with_the_photographs_between_two_bounds(cloud) -> None:
+    assert [default_table_size(pixels) for pixels in (0, 44 * 270 * 480, 10**9)] == [14, 17, 17]
+    assert build(cloud, pixels=2**20, log2_table_size=None)[0].field.field_table.shape == (4, 2**15, 4)
+
+
+def test_a_scene_without_texture_has_no_field(cloud) -> None:
+    assert build(cloud, texture="none")[0].field is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("sv_sites", 0), ("sv_sites", 33), ("lobes", 0), ("sh_degree", 4), ("levels", 5), ("min_resolution", 0)]
+    + [("log2_table_size", 40), ("near", 0.0), ("weight_bound", -1.0), ("rim", 0.0)],
+)
+def test_options_out_of_range_are_named(name, value) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be .*, not {value}"):
+        check_representation(SceneConfig(**{name: value}))

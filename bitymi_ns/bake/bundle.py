@@ -99,6 +99,7 @@ def write_bundle(
     world: World | None = None,
     statistics: Mapping[str, Any] | None = None,
     extra_files: Mapping[str, bytes] | None = None,
+    loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Writes a bundle; the folder appears complete or not at all.
@@ -116,6 +117,7 @@ def write_bundle(
         world: place in the capture's own frame.
         statistics: anything worth knowing about the bake, for people and reports.
         extra_files: further files by name, such as preview.png.
+        loose_files: files that bundle.json does not vouch for, because they may be edited later.
         overwrite: replace an existing bundle.
 
     Returns:
@@ -126,7 +128,7 @@ def write_bundle(
     """
     folder = Path(folder)
     _check_surfels(surfels, tiles)
-    for name in extra_files or {}:
+    for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS):
             raise BundleError(f"extra_files may not replace {name}")
@@ -141,6 +143,8 @@ def write_bundle(
                 (new / name).write_bytes(data)
             info["files"] = {path.name: _fingerprint(path) for path in sorted(new.iterdir())}
             (new / MANIFEST).write_bytes(dump(info))
+            for name, data in (loose_files or {}).items():
+                (new / name).write_bytes(data)
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)

@@ -207,6 +207,7 @@ def export(
     world: World | None = None,
     statistics: Mapping[str, Any] | None = None,
     extra_files: Mapping[str, bytes] | None = None,
+    loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Writes a baked scene as a bundle; see `write_bundle` for the arguments and errors.
@@ -226,6 +227,7 @@ def export(
         world=world,
         statistics={**baked.statistics, **(statistics or {})},
         extra_files=extra_files,
+        loose_files=loose_files,
         overwrite=overwrite,
     )
 

@@ -58,10 +58,12 @@ class ExportAtlas(BakeOptions):
 
     def main(self) -> None:
         """Run the export."""
+        self._written = False
         try:
             self._run()
         except KeyboardInterrupt:
-            state = "is complete" if (self.output_dir / MANIFEST).is_file() else "was not written"
+            there = (self.output_dir / MANIFEST).is_file()
+            state = "is complete" if self._written else "is the earlier one" if there else "was not written"
             CONSOLE.print(f"[bold yellow]The export was interrupted; the bundle {self.output_dir} {state}.")
             raise SystemExit(INTERRUPTED) from None
         except BundleError as error:
@@ -82,7 +84,7 @@ class ExportAtlas(BakeOptions):
         try:
             with rich_progress() as progress:
                 baked = bake(model.scene, views, options, progress)
-        except ValueError as error:
+        except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
         export(
@@ -92,9 +94,10 @@ class ExportAtlas(BakeOptions):
             world=World(np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)),
             statistics={"options": asdict(options), "method": config.method_name},
             extra_files={"preview.png": preview(model, datamanager, views)},
+            loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
         )
-        write_config(config, self.output_dir, background)
+        self._written = True
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
             from bitymi_ns.scene.baked import BakedScene
@@ -165,7 +168,7 @@ def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera
     return {"views": len(rows), **dict(zip(names, means, strict=True))}
 
 
-def write_config(config: Any, folder: Path, background: tuple[float, ...]) -> None:
+def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> bytes:
     """The config.yml with which nerfstudio's tools open the bundle.
 
     It is no part of what bundle.json vouches for: nothing of ours reads it, and its data path may have to be edited
@@ -175,7 +178,7 @@ def write_config(config: Any, folder: Path, background: tuple[float, ...]) -> No
     config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=background)  # type: ignore[arg-type]
     config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None
     config.optimizers = {}
-    replace_file(folder / "config.yml", yaml.dump(config).encode("utf8"))
+    return yaml.dump(config).encode("utf8")
 
 
 def replace_file(path: Path, data: bytes) -> None:

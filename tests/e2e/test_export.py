@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,27 @@ def test_ctrl_c_in_the_export_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_ctrl_c_before_a_bundle_is_replaced_says_which_one_is_there(
+    trained: BitymiTrainerConfig, copied: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(host_export, "bake", interrupted)
+    with pytest.raises(SystemExit):
+        run_export(trained, copied, overwrite=True)
+    assert "is the earlier one" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_missing_encoder_is_named(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
+    with pytest.raises(InputError, match="pip install ispc_texcomp"):
+        run_export(trained, tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_options_that_make_no_sense(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be baked: .*power of two"):
         run_export(trained, tmp_path / "b", r_min=5)
@@ -185,6 +207,18 @@ def test_a_bundle_of_a_newer_version_is_refused(copied: Path) -> None:
     (copied / "bundle.json").write_text(json.dumps({**info, "version": "2.0"}))
     with pytest.raises(InputError, match="version 2.0.*update bitymi-ns"):
         eval_setup(copied / "config.yml")
+
+
+def test_a_run_is_found_beside_its_configuration(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "moved"))
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir = Path("outputs")  # as recorded by default: relative to the folder of the training
+    (folder / "config.yml").write_text(yaml.dump(config))
+    monkeypatch.chdir(tmp_path)
+    _, _, path, step = eval_setup(Path("moved/config.yml"))
+    assert path.parent == folder / "nerfstudio_models" and step == 59
 
 
 def test_a_configuration_without_its_bundle(copied: Path, tmp_path: Path) -> None:

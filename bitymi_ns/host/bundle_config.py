@@ -49,18 +49,20 @@ def find_bundle(recorded: Path) -> Path:
     fail(f"no bundle found (looked for {MANIFEST} in {places}). Keep config.yml in the bundle's folder.")
 
 
-def _loaded_from() -> list[Path]:
-    """The folder of the config.yml that is being loaded, which nerfstudio does not pass on.
-
-    It is `config_path` in the frame of nerfstudio's eval_setup, from where this is called; or, should that change, the
-    argument of --load-config on the command line.
-    """
-    folders = []
+def folder_being_evaluated() -> Path | None:
+    """The folder of the config.yml that nerfstudio's eval_setup is loading, which it does not pass on; else None."""
     frame = sys._getframe()
     while frame is not None:
         if frame.f_code.co_name == "eval_setup" and isinstance(frame.f_locals.get("config_path"), Path):
-            folders.append(frame.f_locals["config_path"].absolute().parent)
+            return frame.f_locals["config_path"].absolute().parent
         frame = frame.f_back
+    return None
+
+
+def _loaded_from() -> list[Path]:
+    """Where the config.yml that is being loaded may be: by eval_setup or, should that change, by the command line."""
+    evaluated = folder_being_evaluated()
+    folders = [] if evaluated is None else [evaluated]
     for i, argument in enumerate(sys.argv):
         name, _, value = argument.partition("=")
         if name in ("--load-config", "--load_config"):
@@ -72,9 +74,10 @@ def _loaded_from() -> list[Path]:
 def stub_checkpoint_dir(bundle: Path) -> Path:
     """A temporary folder with an empty checkpoint, named after the bundle.
 
-    nerfstudio insists on a checkpoint file. It is not kept in the bundle, so that a bundle holds no pickled data.
+    nerfstudio insists on a checkpoint file. It is not kept in the bundle, so that a bundle holds no pickled data. Its
+    path ends up in the results of ns-eval, where `bitymi report` tells by it that they are those of a bundle.
     """
-    scratch = Path(tempfile.mkdtemp(prefix="bitymi-"))
+    scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
     folder = scratch / bundle.name / "nerfstudio_models"
     folder.mkdir(parents=True)

@@ -12,10 +12,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, stub_checkpoint_dir
+from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels
+from bitymi_ns.host.errors import fail
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
 from bitymi_ns.host.preset import OptimizerOptions, Preset, load_preset
@@ -55,9 +57,23 @@ class BitymiTrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
         super().set_timestamp()
+        if self.machine.device_type != "cpu" and not has_cuda_kernels():
+            why = "there is no GPU" if not torch.cuda.is_available() else "this installation has no kernels for the GPU"
+            CONSOLE.print(f"[bold yellow]Training on the CPU instead of {self.machine.device_type}: {why}.")
+            self.machine.device_type = "cpu"
         self._make_paths_absolute()
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
+
+    def save_config(self) -> None:
+        """Write config.yml; this is the first that a run writes, so a folder that cannot be used shows here."""
+        try:
+            super().save_config()
+        except OSError as error:
+            fail(
+                f"{self.get_base_dir()} cannot be written: {error}. Free some disk space or give another --output-dir.",
+                error,
+            )
 
     def resolve_length(self, trained_for: int | None = None) -> None:
         """Fill in the length of the run where it was not given.
@@ -69,7 +85,7 @@ class BitymiTrainerConfig(TrainerConfig):
             default = self.default_iterations_cpu if self.machine.device_type == "cpu" else self.default_iterations
             self.max_num_iterations = trained_for or default
         if self.max_num_iterations < 1:
-            raise SystemExit(f"bitymi: --max-num-iterations must be at least 1, not {self.max_num_iterations}")
+            fail(f"--max-num-iterations must be at least 1, not {self.max_num_iterations}")
         if self.steps_per_save is None:
             self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
 
@@ -84,7 +100,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return text
 
     def _make_paths_absolute(self) -> None:
-        """So that config.yml can be used from any folder."""
+        """So that the capture is found from any folder, also by the commands that read config.yml later."""
         datamanager = self.pipeline.datamanager
         if datamanager.data is None:  # given to the dataparser; the experiment is named after this one
             datamanager.data = getattr(datamanager.dataparser, "data", None)
@@ -99,10 +115,14 @@ class BitymiTrainerConfig(TrainerConfig):
     def get_checkpoint_dir(self) -> Path:
         """The folder of the checkpoints; for the configuration in a bundle, a stand-in that satisfies nerfstudio.
 
-        nerfstudio's tools ask here before they build the model, so this is also where a bundle that was moved is found.
+        nerfstudio's tools ask here before they build the model, so this is also where a bundle or a run that was moved
+        is found, or one that is used from another folder than it was trained in.
         """
         model = self.pipeline.model
         if not isinstance(model, BakedModelConfig):
+            evaluated = folder_being_evaluated()
+            if evaluated is not None and (evaluated / self.relative_model_dir).is_dir():
+                return evaluated / self.relative_model_dir
             return super().get_checkpoint_dir()
         model.bundle = find_bundle(model.bundle)
         return stub_checkpoint_dir(model.bundle)
@@ -150,7 +170,12 @@ def trainer_config(preset: Preset) -> BitymiTrainerConfig:
                 cache_images_type=data.cache_images_type,
                 cache_images="gpu" if has_cuda_kernels() else "cpu",
             ),
-            model=BitymiModelConfig(scene=preset.scene, train=preset.train, curve_points=trainer.curve_points),
+            model=BitymiModelConfig(
+                scene=preset.scene,
+                train=preset.train,
+                curve_points=trainer.curve_points,
+                curve_views=trainer.curve_views,
+            ),
         ),
         optimizers=optimizers(preset.optimizer),
         viewer=ViewerConfig(quit_on_train_completion=trainer.quit_on_train_completion),

@@ -9,6 +9,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from bitymi_ns.host.errors import fail
+
 FILE = "training_curve.jsonl"
 
 
@@ -41,12 +43,15 @@ class TrainingCurve:
             last_step: last step that the checkpoint contains.
         """
         self.path = path
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         source = resumed_from if resumed_from is not None else path if last_step >= 0 else None
-        kept = _points_until(source, last_step) if source is not None and source.is_file() else []
         unfinished = path.with_name(path.name + ".new")
-        unfinished.write_text("".join(line + "\n" for line in kept), "utf8")
-        os.replace(unfinished, path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            kept = _points_until(source, last_step) if source is not None and source.is_file() else []
+            unfinished.write_text("".join(line + "\n" for line in kept), "utf8")
+            os.replace(unfinished, path)
+        except OSError as error:
+            fail(f"the training curve {path} cannot be written: {error}. Free some disk space.", error)
 
     def add(self, point: dict[str, Any]) -> None:
         """Write one point, whole and at once. A full disk costs the point, not the run."""

@@ -32,6 +32,8 @@ class TrainerOptions:
     """Checkpoints written over a run."""
     curve_points: int = 20
     """Evaluations over a run, for the curve of quality against time; 0 = none."""
+    curve_views: int = 8
+    """Held-out views rendered for each of them, all for the last one; 0 = all."""
     vis: str = "viewer"
     """Default of --vis."""
     quit_on_train_completion: bool = True

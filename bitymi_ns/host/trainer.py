@@ -27,8 +27,12 @@ class BitymiTrainer(Trainer):
     """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one."""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        super().setup(test_mode)
         self._stop_requested = False
+        try:
+            super().setup(test_mode)
+        except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
+            CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
+            raise SystemExit(INTERRUPTED) from None
         # after all other callbacks of a step: the state is then complete and can be saved
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._stop_if_asked))
 

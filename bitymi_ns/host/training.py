@@ -47,7 +47,13 @@ class TrainingRun:
         self.first_step: int = trainer._start_step
         self.step = self.first_step
         extent = scene_extent(model.metadata["camera_centers"], model.scene.surfels["means"])
-        self.schedule = Schedule(self.config, self.total, extent)
+        try:
+            self.schedule = Schedule(self.config, self.total, extent)
+            self.schedule.reset_opacity()
+            for name in self.optimizers.optimizers:
+                self.schedule.lr(name, 0)
+        except ValueError as error:
+            fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
         cameras = self.datamanager.train_dataset.cameras
         pixels = float((cameras.width * cameras.height).double().mean())
         self.strategy = Strategy(self.config, self.schedule, extent, self._on_resize, pixels)

@@ -90,15 +90,21 @@ class LearningRates:
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
     """Times the scene extent."""
     quats: float = 1e-3
+    """Rotations."""
     log_scales: float = 5e-3
+    """Logarithms of the tangent scales."""
     opacity_logits: float = 0.025
+    """Opacities, as logits."""
     beta_raw: float = 5e-3
+    """Kernel exponents: beta = 4 sigmoid(beta_raw)."""
     view_color: tuple[float, float] = (2.5e-3, 5e-4)
     """View-dependent colour: sv_rgb, sh_dc, sb_base and sg_base."""
     view_shape: tuple[float, float] = (5e-3, 5e-4)
     """View-dependent colour: Voronoi sites and temperatures, lobes; higher SH bands use a twentieth of view_color."""
     field_table: tuple[float, float] = (1e-2, 1e-3)
+    """Hash table of the texture field."""
     field_mlp: tuple[float, float] = (1e-3, 1e-4)
+    """Its MLP."""
 
 
 @dataclass

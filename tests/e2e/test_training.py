@@ -133,6 +133,42 @@ def test_a_full_disk_keeps_the_earlier_checkpoint(start: Start, monkeypatch: pyt
     assert checkpoint(config, 20)["step"] == 20
 
 
+def test_a_folder_that_cannot_be_written(start: Start) -> None:
+    config = start(name="readonly")
+    config.output_dir = config.output_dir / "file"
+    config.output_dir.parent.mkdir()
+    config.output_dir.write_text("in the way")
+    with pytest.raises(InputError, match="cannot be written: .*--output-dir"):
+        ns_train.main(config)
+
+
+def test_ctrl_c_while_the_capture_is_read(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    config = start(name="early")
+    monkeypatch.setattr(type(config.pipeline), "setup", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        ns_train.main(config)
+    assert stop.value.code == 130
+
+
+@pytest.mark.parametrize(
+    ("group", "option", "value", "message"),
+    [
+        ("scene", "levels", 5, "levels must be between 1 and 4"),
+        ("scene", "sv_sites", 40, "sv_sites must be between 1 and 32"),
+        ("train", "init_opacity", 1.0, "init_opacity must lie between 0 and 1"),
+        ("train", "freeze_every", 0, "out of range .*freeze_every"),
+    ],
+)
+def test_options_out_of_range(start: Start, group: str, option: str, value: Any, message: str) -> None:
+    config = start()
+    setattr(getattr(config.pipeline.model, group), option, value)
+    with pytest.raises(InputError, match=message):
+        ns_train.main(config)
+
+
 def test_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, start: Start) -> None:
     config = start(method="bitymi-sh")
     config.load_dir = trained.get_checkpoint_dir()

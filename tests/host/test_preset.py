@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bitymi_ns.host.preset import PresetError, load_preset
+from bitymi_ns.bake import BakeOptions
+from bitymi_ns.host.preset import PresetError, TrainerOptions, load_preset
 from bitymi_ns.presets import preset_names, preset_path
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
@@ -32,12 +33,16 @@ def test_the_default_preset_states_every_option() -> None:
     values = yaml.safe_load(preset_path("bitymi").read_text("utf8"))
     assert missing_keys(SceneConfig, values["scene"]) == []
     assert missing_keys(TrainConfig, values["train"]) == []
+    assert missing_keys(BakeOptions, values["bake"]) == []
+    assert missing_keys(TrainerOptions, values["trainer"]) == []
 
 
 def test_the_default_preset_agrees_with_the_declared_defaults() -> None:
     preset = load_preset("bitymi")
     assert preset.scene == SceneConfig()
     assert preset.train == TrainConfig()
+    assert BakeOptions(**preset.bake) == BakeOptions()
+    assert preset.trainer == TrainerOptions()
 
 
 @pytest.mark.parametrize("name", METHODS)

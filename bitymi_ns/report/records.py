@@ -146,7 +146,7 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     # Of the checkpoint only .../<folder>/<folder>/nerfstudio_models/step-*.ckpt counts: not the name of some data set.
     tail = "/".join(Path(checkpoint.replace("\\", "/")).parts[-4:]).lower()
     named = _BUNDLE.search(name.lower()) or _BUNDLE.search(tail)
-    baked = results.get("atlas_bytes", 0.0) > 0 or bool(named) or _lies_in_bundle(checkpoint)
+    baked = results.get("atlas_bytes", 0.0) > 0 or bool(named)
     method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
     atlas_format = _FORMAT.search(tail) or _FORMAT.search(f"{source.parent.name}/{source.stem}".lower())
     return Evaluation(
@@ -158,14 +158,6 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
         checkpoint=checkpoint,
         source=source,
     )
-
-
-def _lies_in_bundle(checkpoint: str) -> bool:
-    """Whether the folder of a checkpoint's run is a bundle: one without texture has an atlas of 0 bytes, or none."""
-    try:
-        return bool(checkpoint) and (Path(checkpoint).parent.parent / "bundle.json").is_file()
-    except (OSError, ValueError):  # a path that this system cannot have
-        return False
 
 
 def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:

@@ -43,11 +43,8 @@ def test_baked_or_neural(method: str, checkpoint: str, atlas_bytes: int, baked: 
     assert row.method == "bitymi"
 
 
-def test_export_without_texture_is_known_by_its_folder(tmp_path: Path):
-    checkpoint = str(tmp_path / "export" / "nerfstudio_models" / "step-0.ckpt")
-    assert not make(method="bitymi-notexture", checkpoint=checkpoint).baked
-    (tmp_path / "export").mkdir()
-    (tmp_path / "export" / "bundle.json").write_text("{}")
+def test_export_without_texture_is_known_by_its_stand_in_for_a_checkpoint():
+    checkpoint = "/tmp/bitymi-bundle-x7/room/nerfstudio_models/step-000000000.ckpt"
     assert make(method="bitymi-notexture", checkpoint=checkpoint, atlas_bytes=0).baked
     assert not make(checkpoint="nul\0/a/b").baked
 

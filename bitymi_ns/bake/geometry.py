@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bitymi_ns.train.rotations import tangents
+
 
 def tangent_vectors(quats: Tensor) -> Tensor:
     """The two tangent directions of surfels: the first two columns of their rotation matrices.
@@ -15,10 +17,7 @@ def tangent_vectors(quats: Tensor) -> Tensor:
     Returns:
         [N, 3, 2] unit vectors in the world frame; [..., 0] is the u axis, [..., 1] the v axis.
     """
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)  # [N, 3]
-    v = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)  # [N, 3]
-    return torch.stack([u, v], dim=-1)
+    return torch.stack(tangents(quats), dim=-1)
 
 
 def texel_centres(count: int, extent: float, *, device: torch.device | str = "cpu") -> Tensor:

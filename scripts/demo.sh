@@ -4,7 +4,8 @@
 #   scripts/demo.sh [FOLDER]     FOLDER: a nerfstudio capture (transforms.json and images)
 #
 # The commands are on PATH after `make setup` when called by `make demo`, or in an environment with this package
-# installed. Each step is skipped when its result is there; remove the result to do it again.
+# installed. Each step is skipped when its result is there; remove the result to do it again. A training that was
+# interrupted goes on from its last checkpoint.
 # METHOD (default bitymi) and STEPS (default: the method's own) choose what is trained.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -16,14 +17,18 @@ if [ $# -ge 1 ]; then
       "ns-process-data makes one from photographs or a video" >&2
     exit 1
   }
-  out=demo/$(basename -- "$data")
+  name=$(basename -- "$data")
+  out=demo/capture-$name
 else
+  name=demo
   out=demo
   data=$PWD/demo/data
 fi
-run=$out/outputs/demo/$method/run
-steps=()
-[ -z "${STEPS:-}" ] || steps=(--max-num-iterations "$STEPS")
+[ "$method" = bitymi ] || out=$out/$method
+run=$out/outputs/$name/$method/run
+options=()
+[ -z "${STEPS:-}" ] || options=(--max-num-iterations "$STEPS")
+asked="$data ${STEPS:-}" # what the results in $out belong to
 
 say() { printf '\n== %s (%d s so far)\n' "$*" "$SECONDS"; }
 
@@ -32,11 +37,18 @@ if [ ! -f "$data/transforms.json" ]; then
   bitymi sample --output-dir "$data"
 fi
 
-if [ ! -f "$run/finished" ]; then
+if [ ! -f "$run/finished" ] || [ "$(cat "$run/asked" 2>/dev/null)" != "$asked" ]; then
   say "Training $method on $data"
-  rm -rf "$run" "$out/bundle" "$out/renders" "$out/report" "$out"/eval-*.json
-  ns-train "$method" --data "$data" --output-dir "$out/outputs" --experiment-name demo --timestamp run \
-    --vis tensorboard "${steps[@]}"
+  rm -rf "$run/finished" "$out/bundle" "$out/renders" "$out/report" "$out"/eval-*.json
+  if [ "$(cat "$run/asked" 2>/dev/null)" = "$asked" ] && compgen -G "$run/nerfstudio_models/*.ckpt" >/dev/null; then
+    options+=(--load-dir "$run/nerfstudio_models")
+  else
+    rm -rf "$run"
+    mkdir -p "$run"
+    printf '%s\n' "$asked" >"$run/asked"
+  fi
+  ns-train "$method" --data "$data" --output-dir "$out/outputs" --experiment-name "$name" --timestamp run \
+    --vis tensorboard "${options[@]}"
   touch "$run/finished"
 fi
 

@@ -35,19 +35,19 @@ class Stopwatch:
 class TrainingCurve:
     """Appends points to the file of a run."""
 
-    def __init__(self, path: Path, resumed_from: Path | None = None, last_step: int = -1) -> None:
+    def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
         """
         Args:
             path: the file; a new run starts it afresh.
-            resumed_from: curve of the run that is continued; its points up to `last_step` are taken over.
-            last_step: last step that the checkpoint contains.
+            resumed_from: curve of the run that is continued; its points up to the checkpoint are taken over.
+            steps_done: number of steps that the checkpoint contains; 0 = a new run.
         """
         self.path = path
-        source = resumed_from if resumed_from is not None else path if last_step >= 0 else None
+        source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
         unfinished = path.with_name(path.name + ".new")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            kept = _points_until(source, last_step) if source is not None and source.is_file() else []
+            kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
             unfinished.write_text("".join(line + "\n" for line in kept), "utf8")
             os.replace(unfinished, path)
         except OSError as error:
@@ -62,11 +62,11 @@ class TrainingCurve:
             warnings.warn(f"a point of the training curve {self.path} could not be written: {error}", stacklevel=2)
 
 
-def _points_until(path: Path, last_step: int) -> list[str]:
+def _points_until(path: Path, steps: int) -> list[str]:
     kept = []
     for line in path.read_text("utf8").splitlines():
         try:
-            if json.loads(line)["step"] <= last_step:
+            if json.loads(line)["step"] <= steps:
                 kept.append(line)
         except (ValueError, KeyError, TypeError):
             continue  # cut off when the run was killed

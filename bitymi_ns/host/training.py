@@ -65,7 +65,7 @@ class TrainingRun:
         self.curve = TrainingCurve(
             trainer.base_dir / FILE,
             None if resumed_from is None else resumed_from.parent / FILE,
-            self.first_step - 1,
+            self.first_step,
         )
         self.names = {
             "experiment_name": trainer.config.experiment_name,

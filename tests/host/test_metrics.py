@@ -96,8 +96,8 @@ def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> Non
         first.add({"step": step})
     with open(tmp_path / "a.jsonl", "a") as file:
         file.write('{"step": 4')  # the run was killed here
-    TrainingCurve(tmp_path / "b.jsonl", tmp_path / "a.jsonl", last_step=19).add({"step": 40})
-    assert [json.loads(line)["step"] for line in (tmp_path / "b.jsonl").read_text().splitlines()] == [10, 40]
+    TrainingCurve(tmp_path / "b.jsonl", tmp_path / "a.jsonl", steps_done=20).add({"step": 40})
+    assert [json.loads(line)["step"] for line in (tmp_path / "b.jsonl").read_text().splitlines()] == [10, 20, 40]
     TrainingCurve(tmp_path / "a.jsonl")
     assert (tmp_path / "a.jsonl").read_text() == ""
 

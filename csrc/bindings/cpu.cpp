@@ -55,6 +55,18 @@ Pinhole<S> camera(const Array<const S>& viewmat, const Array<const S>& K) {
   return c;
 }
 
+template <class S>
+Surfels<S> surfels(int64_t n, const Array<const S>& means, const Array<const S>& quats,
+                   const Array<const S>& log_scales, const Array<const S>& opacity_logits,
+                   const Array<const S>& beta_raw) {
+  return {n,
+          data(means, 3 * n, "means"),
+          data(quats, 4 * n, "quats"),
+          data(log_scales, 2 * n, "log_scales"),
+          opacity_logits.data(),
+          data(beta_raw, n, "beta_raw")};
+}
+
 // What trace() found: tile boundaries and, until copied, the fragments.
 template <class S>
 struct Trace {
@@ -125,12 +137,7 @@ void bind(nb::module_& m, const char* suffix) {
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, int width, int height,
          double near, Out geom, Out frames, Out radii) {
         const int64_t n = int64_t(opacity_logits.size());
-        const Surfels<S> in = {n,
-                               data(means, 3 * n, "means"),
-                               data(quats, 4 * n, "quats"),
-                               data(log_scales, 2 * n, "log_scales"),
-                               opacity_logits.data(),
-                               data(beta_raw, n, "beta_raw")};
+        const Surfels<S> in = surfels<S>(n, means, quats, log_scales, opacity_logits, beta_raw);
         S *g = data(geom, n * kGeom, "geom"), *f = data(frames, n * kFrame, "frames");
         S* r = data(radii, 2 * n, "radii");
         const Pinhole<S> cam = camera<S>(viewmat, K);
@@ -146,12 +153,7 @@ void bind(nb::module_& m, const char* suffix) {
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, In geom, In dgeom,
          Maybe<const S> dframes, Out dmeans, Out dquats, Out dlog_scales, Out dopacity_logits, Out dbeta_raw) {
         const int64_t n = int64_t(opacity_logits.size());
-        const Surfels<S> in = {n,
-                               data(means, 3 * n, "means"),
-                               data(quats, 4 * n, "quats"),
-                               data(log_scales, 2 * n, "log_scales"),
-                               opacity_logits.data(),
-                               data(beta_raw, n, "beta_raw")};
+        const Surfels<S> in = surfels<S>(n, means, quats, log_scales, opacity_logits, beta_raw);
         const SurfelGradients<S> out = {data(dmeans, 3 * n, "dmeans"), data(dquats, 4 * n, "dquats"),
                                         data(dlog_scales, 2 * n, "dlog_scales"),
                                         data(dopacity_logits, n, "dopacity_logits"), data(dbeta_raw, n, "dbeta_raw")};

@@ -29,12 +29,20 @@ from bitymi_ns.bake.manifest import (
     parse,
 )
 from bitymi_ns.bake.quantise import EncodedAtlas, decode_pages
-from bitymi_ns.bake.surfel_table import from_columns, to_columns, view_color_kind
+from bitymi_ns.bake.surfel_table import (
+    EXTENT_COLUMN,
+    from_columns,
+    mean_residuals,
+    tile_extents,
+    to_columns,
+    view_color_kind,
+)
 
 __all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
 
 GENERATOR = f"bitymi-ns {__version__}"
 COLOR_BIAS = 0.5
+SUPPORT = 3.0  # radius of the kernel in scale units
 _MANIFEST_LIMIT = 64 << 20
 _CHUNK = 1 << 22
 
@@ -62,6 +70,8 @@ class Bundle:
         tiles: [N, 5] int32 (x, y, layer, r_u, r_v), zeros for a surfel without a tile.
         atlas: [layers, height, width, 4] uint8 (bc7, uint8) or float32 (fp16); None when the scene has no texture.
         offset, scale: residual colour = offset + scale * value, value = stored / 255 for uint8, stored for float32.
+        extent: [N] float32 half side of the tile in scale units.
+        mean_residual: [N, 3] float32 mean of the tile; the residual of a surfel without a tile.
         info: bundle.json.
     """
 
@@ -71,6 +81,8 @@ class Bundle:
     atlas: Tensor | None
     offset: float
     scale: float
+    extent: Tensor
+    mean_residual: Tensor
     info: dict[str, Any]
 
     def __len__(self) -> int:
@@ -91,7 +103,7 @@ def write_bundle(
     tiles: npt.NDArray[np.int32],
     atlas: EncodedAtlas | None,
     *,
-    extent: float = 3.0,
+    extent: Tensor | None = None,
     mean_residual: Tensor | None = None,
     near: float = 0.2,
     weight_bound: float = 0.0,
@@ -109,8 +121,9 @@ def write_bundle(
         surfels: per-surfel parameters, N rows each, all finite.
         tiles: [N, 5] int32.
         atlas: the encoded atlas, None for a scene without texture.
-        extent: half side of a tile in scale units.
-        mean_residual: [N, 3] mean of each tile, for the colour that other viewers show.
+        extent: [N] half side of each tile in scale units, None = 3, the kernel's support.
+        mean_residual: [N, 3] mean of each tile; the residual of the surfels without a tile, and part of the colour that
+            other viewers show. None = 0.
         near: nearest drawn depth.
         weight_bound: fragments of smaller blending weight get no residual.
         background: colour behind the surfels.
@@ -132,10 +145,10 @@ def write_bundle(
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS):
             raise BundleError(f"extra_files may not replace {name}")
-    info = _describe(surfels, atlas, extent, near, weight_bound, background, world or World(), statistics)
+    info = _describe(surfels, atlas, near, weight_bound, background, world or World(), statistics)
     try:
         with complete_folder(folder, overwrite) as new:
-            columns = to_columns(surfels, tiles, mean_residual)
+            columns = to_columns(surfels, tiles, mean_residual, extent)
             ply.write_ply(new / SURFELS, columns, comments=[GENERATOR, "2D Beta surfels; see bundle.json"])
             if atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
@@ -173,6 +186,8 @@ def read_bundle(folder: str | Path, verify: bool = True) -> Bundle:
     try:
         columns = ply.parse_ply(_checked(folder / SURFELS, info["files"][SURFELS], verify))
         surfels, tiles = from_columns(columns, info["surfels"]["view_color"])
+        extent = tile_extents(columns, float(info["atlas"]["extent"]) if info["atlas"] else SUPPORT)
+        mean_residual = mean_residuals(columns)
     except ply.PlyError as error:
         raise BundleError(f"{folder / SURFELS}: {error}") from error
     if len(tiles) != info["surfels"]["count"]:
@@ -180,7 +195,8 @@ def read_bundle(folder: str | Path, verify: bool = True) -> Bundle:
     atlas = _read_atlas(folder, info, verify)
     _check_tiles(tiles, None if atlas is None else tuple(atlas.shape[:3]), folder / SURFELS)
     offset, scale = (info["atlas"]["offset"], info["atlas"]["scale"]) if info["atlas"] else (0.0, 1.0)
-    return Bundle(surfels, info["surfels"]["view_color"], tiles, atlas, float(offset), float(scale), info)
+    kind = info["surfels"]["view_color"]
+    return Bundle(surfels, kind, tiles, atlas, float(offset), float(scale), extent, mean_residual, info)
 
 
 def verify_bundle(folder: str | Path) -> dict[str, Any]:
@@ -191,7 +207,6 @@ def verify_bundle(folder: str | Path) -> dict[str, Any]:
 def _describe(
     surfels: Mapping[str, Tensor],
     atlas: EncodedAtlas | None,
-    extent: float,
     near: float,
     weight_bound: float,
     background: Sequence[float],
@@ -211,7 +226,8 @@ def _describe(
             "count": len(means),
             "view_color": kind,
             "kernel": "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))",
-            "support": 3.0,
+            "support": SUPPORT,
+            "residual": "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound",
             "activations": {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"},
         },
         "atlas": None,
@@ -242,7 +258,8 @@ def _describe(
             "width": atlas.width,
             "height": atlas.height,
             "layers": len(atlas.payload),
-            "extent": extent,
+            "extent": SUPPORT,
+            "extent_column": EXTENT_COLUMN,
             "offset": atlas.range.offset,
             "scale": atlas.range.scale,
             "range": atlas.range.rule,

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 FORMAT = "bitymi-bundle"
-VERSION = (1, 0)
+VERSION = (1, 1)
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 _NUMBER_LIMIT = 1e30
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")

@@ -98,7 +98,8 @@ class Baked:
         rows: [N] int64, their rows in the scene.
         packing: where the tiles lie.
         texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
-        mean_residual: [N, 3] mean of every tile.
+        extent: [N] half side of every tile in scale units.
+        mean_residual: [N, 3] mean of every tile; the residual of a surfel without a tile.
         atlas: the encoded atlas, None without texture.
         near: nearest drawn depth.
         weight_bound: fragments of smaller blending weight get no residual.
@@ -109,6 +110,7 @@ class Baked:
     surfels: dict[str, Tensor]
     rows: Tensor
     packing: Packing
+    extent: Tensor
     texels: Tensor | None
     mean_residual: Tensor
     atlas: EncodedAtlas | None
@@ -124,7 +126,8 @@ class Baked:
         texels = texels.detach().float().cpu().contiguous()
         atlas = _encode(texels.numpy(), self.packing, self.options, progress)
         statistics = {**self.statistics, "atlas": _atlas_statistics(self.packing, atlas)}
-        means = tile_means(texels, self.packing)
+        tiled = torch.from_numpy(self.packing.tiles[:, 3:4] > 0)
+        means = torch.where(tiled, tile_means(texels, self.packing), self.mean_residual)
         return replace(self, texels=texels, mean_residual=means, atlas=atlas, statistics=statistics)
 
 
@@ -196,7 +199,10 @@ def bake(
         }
     statistics["seconds"] = round(time.perf_counter() - started, 3)
     surfels = {name: value.cpu() for name, value in surfels.items()}
-    return Baked(surfels, kept.cpu(), packing, texels, mean_residual, atlas, near, weight_bound, options, statistics)
+    extent = torch.full((len(kept),), options.extent)
+    return Baked(
+        surfels, kept.cpu(), packing, extent, texels, mean_residual, atlas, near, weight_bound, options, statistics
+    )
 
 
 def export(
@@ -219,7 +225,7 @@ def export(
         baked.surfels,
         baked.packing.tiles,
         baked.atlas,
-        extent=baked.options.extent,
+        extent=baked.extent,
         mean_residual=baked.mean_residual,
         near=baked.near,
         weight_bound=baked.weight_bound,

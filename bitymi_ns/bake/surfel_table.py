@@ -2,7 +2,8 @@
 
 The names of 3D Gaussian splatting come first, so that its viewers show a sensible colour: x y z, f_dc_0..2, opacity
 (logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour by
-name, `<parameter>_<i>` in C order, and the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv.
+name, `<parameter>_<i>` in C order, the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv, the half side of
+the tile in scale units, tile_extent, and the mean residual residual_0..2, which is that of a surfel without a tile.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from bitymi_ns.bake.ply import PlyError
 SH_C0 = 0.28209479177387814
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
+EXTENT_COLUMN = "tile_extent"
 
 # Trailing shape of every view-colour parameter; -1 is read from the number of columns.
 VIEW_COLORS: dict[str, dict[str, tuple[int, ...]]] = {
@@ -66,14 +68,18 @@ def mean_view_color(surfels: Mapping[str, Tensor]) -> Tensor:
 
 
 def to_columns(
-    surfels: Mapping[str, Tensor], tiles: npt.NDArray[np.int32], mean_residual: Tensor | None = None
+    surfels: Mapping[str, Tensor],
+    tiles: npt.NDArray[np.int32],
+    mean_residual: Tensor | None = None,
+    extent: Tensor | None = None,
 ) -> dict[str, npt.NDArray]:
     """The columns of surfels.ply.
 
     Args:
         surfels: the per-surfel parameters of docs/architecture.md, N rows each.
         tiles: [N, 5] int32.
-        mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers.
+        mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers; None = 0, no column.
+        extent: [N] half side of each tile in scale units; None = no column.
     """
     kind = view_color_kind(surfels)
     surfels = {name: value.detach().float().cpu() for name, value in surfels.items()}
@@ -95,7 +101,35 @@ def to_columns(
         values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
         groups[_numbered(name, values.shape[1])] = values
     columns = {name: values[:, i].numpy() for names, values in groups.items() for i, name in enumerate(names)}
-    return columns | {name: tiles[:, i] for i, name in enumerate(TILE_COLUMNS)}
+    columns |= {name: tiles[:, i] for i, name in enumerate(TILE_COLUMNS)}
+    if extent is not None:
+        columns[EXTENT_COLUMN] = extent.detach().float().cpu().numpy()
+    if mean_residual is not None:
+        residual = mean_residual.detach().float().cpu().numpy()
+        columns |= {name: residual[:, i] for i, name in enumerate(_numbered("residual", 3))}
+    return columns
+
+
+def tile_extents(columns: Mapping[str, npt.NDArray], default: float) -> Tensor:
+    """[N] float32 half sides of the tiles in scale units; `default` where the file has no such column.
+
+    Raises:
+        PlyError: a value is not positive, or the column has the wrong type.
+    """
+    if EXTENT_COLUMN not in columns:
+        return torch.full((len(columns["x"]),), default)
+    extent = _stack(columns, (EXTENT_COLUMN,))[:, 0].contiguous()
+    if not (extent > 0).all():
+        raise PlyError(f"{EXTENT_COLUMN} is not positive in row {int(torch.nonzero(extent <= 0)[0])}")
+    return extent
+
+
+def mean_residuals(columns: Mapping[str, npt.NDArray]) -> Tensor:
+    """[N, 3] float32 mean residuals, 0 where the file has no such columns."""
+    names = _numbered("residual", 3)
+    if names[0] not in columns:
+        return torch.zeros(len(columns["x"]), 3)
+    return _stack(columns, names)
 
 
 def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[str, Tensor], Tensor]:
@@ -111,20 +145,12 @@ def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[st
     if kind not in VIEW_COLORS:
         raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
 
-    def stack(names: tuple[str, ...], dtype: type = np.float32) -> Tensor:
-        for name in names:
-            if name not in columns:
-                raise PlyError(f"the column {name} is missing")
-            if columns[name].dtype != dtype:
-                raise PlyError(f"the column {name} holds {columns[name].dtype}, not {np.dtype(dtype)}")
-        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(dtype, copy=False))
-
     surfels = {
-        "means": stack(("x", "y", "z")),
-        "quats": stack(_numbered("rot", 4)),
-        "log_scales": stack(_numbered("scale", 3))[:, :2].contiguous(),
-        "opacity_logits": stack(("opacity",))[:, 0].contiguous(),
-        "beta_raw": stack(("beta",))[:, 0].contiguous(),
+        "means": _stack(columns, ("x", "y", "z")),
+        "quats": _stack(columns, _numbered("rot", 4)),
+        "log_scales": _stack(columns, _numbered("scale", 3))[:, :2].contiguous(),
+        "opacity_logits": _stack(columns, ("opacity",))[:, 0].contiguous(),
+        "beta_raw": _stack(columns, ("beta",))[:, 0].contiguous(),
     }
     count = len(surfels["means"])
     for name, shape in VIEW_COLORS[kind].items():
@@ -132,11 +158,21 @@ def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[st
         width = int(np.prod([size for size in shape if size > 0]))
         if sorted(found) != list(range(len(found))) or len(found) % width or (-1 not in shape and len(found) != width):
             raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {len(found)} columns")
-        values = stack(_numbered(name, len(found))) if found else torch.zeros(count, 0)
+        values = _stack(columns, _numbered(name, len(found))) if found else torch.zeros(count, 0)
         surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
     if kind == "sv" and len({surfels[name].shape[1] for name in VIEW_COLORS["sv"]}) != 1:
         raise PlyError("the Spherical Voronoi parameters disagree about the number of sites")
-    return surfels, stack(TILE_COLUMNS, np.int32)
+    return surfels, _stack(columns, TILE_COLUMNS, np.int32)
+
+
+def _stack(columns: Mapping[str, npt.NDArray], names: tuple[str, ...], dtype: type = np.float32) -> Tensor:
+    """[N, len(names)] of the columns; PlyError where one is missing or of another type."""
+    for name in names:
+        if name not in columns:
+            raise PlyError(f"the column {name} is missing")
+        if columns[name].dtype != dtype:
+            raise PlyError(f"the column {name} holds {columns[name].dtype}, not {np.dtype(dtype)}")
+    return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(dtype, copy=False))
 
 
 def _numbered(name: str, count: int) -> tuple[str, ...]:

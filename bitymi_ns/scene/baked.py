@@ -40,7 +40,8 @@ class BakedScene:
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
         atlas: [layers, height, width, 4] uint8 or float32, None = no residual.
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
-        extent: half side of a tile in scale units.
+        extent: [N] half side of the tile in scale units, None = 3, the kernel's support, everywhere.
+        mean_residual: [N, 3] float32 mean residual of every tile; a surfel without a tile has this residual. None = 0.
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
     """
@@ -51,7 +52,8 @@ class BakedScene:
     atlas: Tensor | None
     offset: float = 0.0
     scale: float = 1.0
-    extent: float = 3.0
+    extent: Tensor | None = None
+    mean_residual: Tensor | None = None
     near: float = 0.2
     weight_bound: float = 0.0
 
@@ -66,7 +68,8 @@ class BakedScene:
             atlas=None if bundle.atlas is None else bundle.atlas.contiguous(),
             offset=bundle.offset,
             scale=bundle.scale,
-            extent=info["atlas"]["extent"] if info["atlas"] else 3.0,
+            extent=bundle.extent,
+            mean_residual=bundle.mean_residual,
             near=info["render"]["near"],
             weight_bound=info["render"]["weight_bound"],
         )
@@ -91,6 +94,8 @@ class BakedScene:
         image = means.new_empty(camera.height, camera.width, 9 if maps else 5)
         overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
         atlas = self.atlas
+        extent = torch.full((len(self),), 3.0) if self.extent is None else self.extent
+        mean_residual = torch.zeros(len(self), 3) if self.mean_residual is None else self.mean_residual
         is_bytes = atlas is not None and atlas.dtype == torch.uint8
         tracer = tracers.take(means)
         tracer.run(projection.geom, projection.radii, *size, self.near, fragments=False)
@@ -107,8 +112,9 @@ class BakedScene:
             (0, 0, 0) if atlas is None else tuple(atlas.shape[:3]),
             self.offset,
             self.scale / 255 if is_bytes else self.scale,
-            self.extent,
+            extent,
             self.tiles,
+            mean_residual,
             image,
             overdraw,
         )

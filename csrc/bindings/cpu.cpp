@@ -200,8 +200,8 @@ void bind(nb::module_& m, const char* suffix) {
           "baked",
           [](const Trace<S>& t, In geom, In radii, int width, int height, double near, double weight_bound, bool maps,
              In base, Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> atlas_shape,
-             double offset, double scale, double extent, Array<const int32_t> tiles, Out image,
-             Maybe<int32_t> overdraw) {
+             double offset, double scale, Array<const float> extent, Array<const int32_t> tiles,
+             Array<const float> mean_residual, Out image, Maybe<int32_t> overdraw) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
             const auto [layers, rows, columns] = atlas_shape;
             const int64_t texels = int64_t(layers) * rows * columns * 4;
@@ -212,9 +212,10 @@ void bind(nb::module_& m, const char* suffix) {
                                  data_or_null(floats, texels, "atlas floats"),
                                  float(offset),
                                  float(scale),
-                                 float(extent),
+                                 data(extent, n, "extent"),
                                  float(weight_bound),
-                                 data(tiles, 5 * n, "tiles")};
+                                 data(tiles, 5 * n, "tiles"),
+                                 data(mean_residual, 3 * n, "mean_residual")};
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data(), *b = data(base, 3 * n, "base");
             S* out = data(image, pixels * (maps ? kMapChannels : kImageChannels), "image");
             int32_t* o = data_or_null(overdraw, pixels, "overdraw");
@@ -223,8 +224,8 @@ void bind(nb::module_& m, const char* suffix) {
           },
           "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "weight_bound"_a, "maps"_a,
           "base"_a.noconvert(), "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "atlas_shape"_a,
-          "offset"_a, "scale"_a, "extent"_a, "tiles"_a.noconvert(), "image"_a.noconvert(),
-          "overdraw"_a.noconvert().none());
+          "offset"_a, "scale"_a, "extent"_a.noconvert(), "tiles"_a.noconvert(), "mean_residual"_a.noconvert(),
+          "image"_a.noconvert(), "overdraw"_a.noconvert().none());
 
   m.def(
       name("trace_backward").c_str(),

@@ -1,5 +1,5 @@
 // Where a surfel coordinate falls in its atlas tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e,
-// with e the half side of a tile in scale units (eq. texel centres; e = R unless a bundle says otherwise).
+// with e the half side of the surfel's tile in scale units (eq. texel centres).
 #pragma once
 
 #include "core/surfel.h"

@@ -58,7 +58,11 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
       const int64_t id = bins.surfels[k];
       const S* g = geom + id * kGeom;
       const int32_t* patch = atlas.tiles + 5 * id;
-      const S bound = !textured || patch[3] == 0 ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
+      const bool tiled = textured && patch[3] != 0;
+      const float* flat = atlas.mean_residual + 3 * id;
+      const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
+      const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
+      const S extent = S(atlas.extent[id]);
       const S view[3] = {relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)), relu(base[3 * id + 2] + S(0.5))};
       state.blend(g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
         const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
@@ -73,9 +77,13 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
         if (overdraw) sums[drawn][pack] += select(taken, P(S(1)), P(S(0)));
         const uint32_t rest = bits(textures);
         if (!rest) return;
+        if (!tiled) {
+          for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(relu(view[c] + S(flat[c])));
+          return;
+        }
         S x[kLanes], y[kLanes], wt[kLanes];
-        store(x, texel_position(f.u, patch[3], S(atlas.extent)));
-        store(y, texel_position(f.v, patch[4], S(atlas.extent)));
+        store(x, texel_position(f.u, patch[3], extent));
+        store(y, texel_position(f.v, patch[4], extent));
         store(wt, weight);
         const Quad<S> colour = {view[0], view[1], view[2], S(0)};
         Quad<S>* to = rgb + pack * kLanes;

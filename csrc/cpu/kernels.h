@@ -144,12 +144,13 @@ S ssim(int height, int width, int channels, const S* a, const S* b, S* da);
 // Forward-only renderer of a baked scene.
 struct Atlas {
   int layers, height, width;
-  const uint8_t* bytes;  // RGBA [layers, height, width, 4], or null
-  const float* floats;   // RGBA likewise, or null
-  float offset, scale;   // residual = offset + scale * stored
-  float extent;          // half side of a tile, scale units
-  float weight_bound;    // fragments of smaller weight get no residual
-  const int32_t* tiles;  // [n, 5]: x, y, layer, r_u, r_v; r_u = 0: no tile
+  const uint8_t* bytes;        // RGBA [layers, height, width, 4], or null
+  const float* floats;         // RGBA likewise, or null
+  float offset, scale;         // residual = offset + scale * stored
+  const float* extent;         // [n] half side of the tile, scale units
+  float weight_bound;          // fragments of smaller weight get no residual
+  const int32_t* tiles;        // [n, 5]: x, y, layer, r_u, r_v; r_u = 0: no tile
+  const float* mean_residual;  // [n, 3] of every tile; the residual of a surfel without one
 };
 // image [pixels, channels] as composite_forward; overdraw [pixels] int32 or null
 template <class S>

@@ -79,7 +79,7 @@ def test_the_manifest_states_files_world_and_statistics(surfels, tmp_path):
     extra = {"preview.png": b"\x89PNG...", "config.yml": b"method: bitymi\n"}
     params, *_ = make(surfels, tmp_path / "b", world=world, statistics=statistics, extra_files=extra)
     info = verify_bundle(tmp_path / "b")
-    assert (info["format"], info["version"]) == ("bitymi-bundle", "1.0")
+    assert (info["format"], info["version"]) == ("bitymi-bundle", "1.1")
     assert info["generator"].startswith("bitymi-ns ")
     assert info["world"] == {"transform": [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]], "scale": 0.25}
     assert info["statistics"] == {"psnr": 27.5, "never": None, "views": [1, 2], "path": str(tmp_path)}

@@ -3,7 +3,15 @@ import pytest
 import torch
 
 from bitymi_ns.bake.ply import PlyError
-from bitymi_ns.bake.surfel_table import SH_C0, VIEW_COLORS, from_columns, mean_view_color, to_columns
+from bitymi_ns.bake.surfel_table import (
+    SH_C0,
+    VIEW_COLORS,
+    from_columns,
+    mean_residuals,
+    mean_view_color,
+    tile_extents,
+    to_columns,
+)
 
 KINDS = ["sv", "sh", "sb", "sg"]
 TILES = np.arange(25, dtype=np.int32).reshape(5, 5)
@@ -69,6 +77,21 @@ def test_degree_zero_and_one_site_keep_their_shapes(surfels):
     params = surfels(5, "sv")
     params = {name: value[:, :1] if name.startswith("sv_") else value for name, value in params.items()}
     assert from_columns(to_columns(params, TILES), "sv")[0]["sv_sites"].shape == (5, 1, 3)
+
+
+def test_extents_and_mean_residuals_are_optional_columns(surfels):
+    params = surfels(5)
+    plain = to_columns(params, TILES)
+    assert tile_extents(plain, 3.0).tolist() == [3.0] * 5 and not mean_residuals(plain).any()
+    extent, residual = torch.linspace(0.5, 3.0, 5), torch.randn(5, 3)
+    columns = to_columns(params, TILES, residual, extent)
+    assert torch.equal(tile_extents(columns, 3.0), extent) and torch.equal(mean_residuals(columns), residual)
+    columns["tile_extent"] = np.float32([1, 0, 1, 1, 1])
+    with pytest.raises(PlyError, match="tile_extent is not positive in row 1"):
+        tile_extents(columns, 3.0)
+    del columns["residual_2"]
+    with pytest.raises(PlyError, match="residual_2 is missing"):
+        mean_residuals(columns)
 
 
 def test_missing_or_extra_columns_are_refused(surfels):

@@ -97,6 +97,52 @@ def test_golden_textured_scene_through_the_baked_renderer(dtype: torch.dtype) ->
     assert torch.equal(output.overdraw[..., 0].double(), golden.outputs["overdraw"].double())
 
 
+def test_a_surfel_without_a_tile_has_its_mean_residual_where_a_tile_would_count() -> None:
+    case = random_scene(80, 4, width=70, height=50)
+    params = {key: value.float() for key, value in case.params.items()}
+    camera = Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
+    residual = torch.rand(80, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    atlas = torch.zeros(1, 4, 4 * 80, 4)
+    atlas[0, :, :, :3] = residual.repeat_interleave(4, dim=0)
+    tiles = torch.tensor([(4 * i, 0, 0, 4, 4) for i in range(80)], dtype=torch.int32)
+    tiled = BakedScene(params, "sv", tiles, atlas, weight_bound=0.05).render(camera).rgb
+    assert not torch.allclose(tiled, BakedScene(params, "sv", tiles, None).render(camera).rgb, atol=0.05)
+    none = torch.zeros_like(tiles)
+    some = torch.where(torch.arange(80)[:, None] % 2 == 0, tiles, none)
+    for few, texels in ((some, atlas), (none, None)):
+        scene = BakedScene(params, "sv", few, texels, weight_bound=0.05, mean_residual=residual)
+        torch.testing.assert_close(scene.render(camera).rgb, tiled, atol=1e-5, rtol=0)
+
+
+def test_every_tile_has_its_own_extent() -> None:
+    """Texels that are linear in u and v: smaller tiles give the same between their outer texel centres."""
+    params = {
+        "means": torch.tensor([[0.0, 0.0, 4.0]]),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "log_scales": torch.zeros(1, 2),
+        "opacity_logits": torch.tensor([4.0]),
+        "beta_raw": torch.tensor([-2.0]),
+        "sv_sites": torch.ones(1, 1, 3),
+        "sv_log_tau": torch.zeros(1, 1),
+        "sv_rgb": torch.zeros(1, 1, 3),
+    }
+    camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]]), 64, 48)
+    tiles = torch.tensor([[0, 0, 0, 8, 4]], dtype=torch.int32)
+
+    def render(extent: float) -> Tensor:
+        u, v = ((torch.arange(r) + 0.5) / r * 2 * extent - extent for r in (8, 4))
+        atlas = torch.zeros(1, 4, 8, 4)
+        atlas[0, ..., 0], atlas[0, ..., 1] = 0.1 * u[None, :], 0.1 * v[:, None]
+        return BakedScene(params, "sv", tiles, atlas, extent=torch.tensor([extent])).render(camera).rgb
+
+    u = (torch.arange(64) + 0.5 - 32) / 10  # 40 pixels a unit at depth 4
+    v = (torch.arange(48) + 0.5 - 24) / 10
+    inner = (v.abs()[:, None] < 1.5 * 3 / 4) & (u.abs()[None, :] < 1.5 * 7 / 8)
+    full, small = render(3.0), render(1.5)
+    torch.testing.assert_close(small[inner], full[inner], atol=1e-6, rtol=0)
+    assert (small - full)[~inner].abs().max() > 0.01
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_random_scenes_in_single_precision(seed: int) -> None:
     case = random_scene(80, seed, width=70, height=50)

@@ -14,7 +14,11 @@ DATA   ?=
 TORCH       := torch==2.13.0
 TORCHVISION := torchvision==0.28.0
 CPU_INDEX   := https://download.pytorch.org/whl/cpu
-CXX_FILES   := $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name '*.hpp')
+CXX_FILES   := $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name '*.cu')
+# The CUDA kernels are built where nvcc is found: for the cards of this machine, for one architecture where there is no
+# card and they can only be compiled. They are also built for the host, so that the tests run them without a card.
+CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
+  $(if $(shell command -v nvidia-smi),,-Ccmake.define.BITYMI_CUDA_ARCHITECTURES=90)
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
@@ -56,8 +60,8 @@ $(VENV)/.stamp-deps: $(VENV)/.stamp-torch constraints.txt pyproject.toml scripts
 	@touch $@
 
 # Editable: changes to Python are live, changes to C++ need another make (seconds: build/ is kept).
-$(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(CXX_FILES)
-	$(PIP) install -qq --no-build-isolation --no-deps -e .
+$(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt cmake/cuda.cmake $(CXX_FILES)
+	$(PIP) install -qq --no-build-isolation --no-deps $(CMAKE_ARGS) -e .
 	@touch $@
 
 demo: setup

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -10,6 +13,47 @@ from torch import Tensor
 
 SUFFIX = {torch.float32: "_f32", torch.float64: "_f64"}
 
+_emulated = False
+
+
+@contextmanager
+def emulated_cuda(seed: int = 0) -> Iterator[None]:
+    """Within this context tensors on the CPU go to the CUDA kernels, which run thread by thread on the host. For tests.
+
+    Args:
+        seed: of the order in which the threads of a block take turns.
+
+    Raises:
+        RuntimeError: the package was built without them (CMake option BITYMI_EMULATED_CUDA).
+    """
+    global _emulated
+    before = _emulated
+    _load("_emulated").set_seed(seed)
+    _emulated = True
+    try:
+        yield
+    finally:
+        _emulated = before
+
+
+def _load(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(f"bitymi_ns.{name}")
+    except ImportError as error:
+        advice = {
+            "_cpu": "install the package (`pip install .`, or `make setup` in a checkout)",
+            "_cuda": "install the package again where the CUDA toolkit's nvcc is found, or move the tensors to the CPU",
+            "_emulated": "install the package with -Ccmake.define.BITYMI_EMULATED_CUDA=ON",
+        }[name]
+        raise RuntimeError(
+            f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
+        ) from (error)
+
+
+def cuda_backend(device: torch.device) -> bool:
+    """Whether tensors on that device go to the CUDA kernels (or to their emulation)."""
+    return device.type == "cuda" or _emulated
+
 
 def module(device: torch.device) -> ModuleType:
     """The kernel module for a device.
@@ -17,27 +61,43 @@ def module(device: torch.device) -> ModuleType:
     Raises:
         RuntimeError: the kernels for that device are not built.
     """
-    if device.type != "cpu":
-        raise RuntimeError(f"no kernels for device '{device}' in this build: move the tensors to the CPU")
-    try:
-        from bitymi_ns import _cpu
-    except ImportError as error:
-        raise RuntimeError(
-            "the compiled module bitymi_ns._cpu is missing: install the package (`pip install .`, or `make setup` in a "
-            f"checkout); the import said: {error}"
-        ) from error
-    return _cpu
+    if device.type not in ("cpu", "cuda"):
+        raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
+    return _load("_cuda" if device.type == "cuda" else "_emulated" if _emulated else "_cpu")
 
 
-def kernel(name: str, like: Tensor) -> Any:
-    """The kernel `name` for tensors like `like`.
+def function(name: str, device: torch.device) -> Callable[..., Any]:
+    """The kernel function of that name; on a CUDA device it runs on torch's current stream of that device."""
+    compiled = getattr(module(device), name)
+    if device.type != "cuda":
+        return compiled
+
+    def on_stream(*args: Any) -> Any:
+        with torch.cuda.device(device):
+            return compiled(*args, stream=torch.cuda.current_stream(device).cuda_stream)
+
+    return on_stream
+
+
+def _name(name: str, like: Tensor) -> str:
+    if like.dtype not in SUFFIX:
+        raise TypeError(f"{name} takes float32 or float64 tensors, not {like.dtype}")
+    return name + SUFFIX[like.dtype]
+
+
+def kernel(name: str, like: Tensor) -> Callable[..., Any]:
+    """The kernel function `name` for tensors like `like`.
 
     Raises:
         TypeError: the dtype is neither float32 nor float64.
+        RuntimeError: the kernels for that device are not built.
     """
-    if like.dtype not in SUFFIX:
-        raise TypeError(f"{name} takes float32 or float64 tensors, not {like.dtype}")
-    return getattr(module(like.device), name + SUFFIX[like.dtype])
+    return function(_name(name, like), like.device)
+
+
+def kernel_class(name: str, like: Tensor) -> type:
+    """The class `name` of the kernel module for tensors like `like`; raises what `kernel` raises."""
+    return getattr(module(like.device), _name(name, like))
 
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import dense, kernel, kernel_class
 
 FEATURES = 4
 """Features a level."""
@@ -49,7 +49,7 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(weight.shape)}")
     weights = [dense(t, table) for t in (table, w1, w2, w3)]
     g = geometry
-    return kernel("Field", table)(*weights, levels, log2_size, g.min_resolution, g.contract, tuple(g.mid), g.half)
+    return kernel_class("Field", table)(*weights, levels, log2_size, g.min_resolution, g.contract, tuple(g.mid), g.half)
 
 
 class _Field(torch.autograd.Function):

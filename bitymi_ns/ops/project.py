@@ -31,7 +31,7 @@ class Projection:
         radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0 = not visible.
         camera: the camera.
         near: nearest depth that is drawn, camera z.
-        not_finite: how many surfels were left out because a parameter is NaN or infinite.
+        broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
         mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken a fragment before the sum.
     """
@@ -41,9 +41,14 @@ class Projection:
     radii: Tensor
     camera: Camera
     near: float
-    not_finite: int
+    broken: Tensor
     mean2d_grad: Tensor | None = None
     mean2d_absgrad: Tensor | None = None
+
+    @property
+    def not_finite(self) -> int:
+        """`broken` as a number; waits for the device."""
+        return int(self.broken)
 
     @property
     def visible(self) -> Tensor:
@@ -57,9 +62,10 @@ class _Project(torch.autograd.Function):
         n = means.shape[0]
         inputs = [dense(t, means) for t in (means, quats, log_scales, opacity_logits, beta_raw, viewmat, K)]
         geom, frames, radii = (means.new_empty(n, k) for k in (GEOM, FRAME, 2))
-        broken = kernel("project_forward", means)(*inputs, width, height, near, geom, frames, radii)
+        broken = torch.zeros(1, dtype=torch.int32, device=means.device)
+        kernel("project_forward", means)(*inputs, width, height, near, geom, frames, radii, broken)
         ctx.save_for_backward(*inputs, geom)
-        ctx.mark_non_differentiable(radii)
+        ctx.mark_non_differentiable(radii, broken)
         ctx.set_materialize_grads(False)
         return geom, frames, radii, broken
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, module
+from .backend import dense, function, kernel, kernel_class
 from .project import GEOM, Projection
 
 
@@ -60,7 +60,7 @@ class _Tracers:
         self._lock = threading.Lock()
 
     def take(self, like: Tensor):
-        make = kernel("Trace", like)
+        make = kernel_class("Trace", like)
         with self._lock:
             return self._idle[make].pop() if self._idle[make] else make()
 
@@ -145,5 +145,5 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
     counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    module(counts.device).masked_counts(fragments.surfel, fragments.pixel, flat, counts)
+    function("masked_counts", counts.device)(fragments.surfel, fragments.pixel, flat, counts)
     return counts

@@ -1,7 +1,4 @@
 // bitymi_ns._cpu: arrays in, arrays out. The caller allocates; shapes and dtypes are checked here, values in Python.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
@@ -9,39 +6,18 @@
 #include <malloc.h>
 #endif
 
-#include <optional>
-#include <stdexcept>
-#include <string>
-#include <type_traits>
-
+#include "bindings/arrays.h"
 #include "cpu/kernels.h"
 
-namespace nb = nanobind;
+namespace bt {
 using namespace nb::literals;
 
-namespace bt {
 namespace {
 
 template <class T>
 using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Maybe = std::optional<Array<T>>;
-
-// Checks the number of elements: the kernels take flat memory.
-template <class T>
-T* data(const Array<T>& a, int64_t size, const char* name) {
-  if (int64_t(a.size()) != size)
-    throw std::invalid_argument(std::string(name) + " has " + std::to_string(a.size()) + " elements, expected " +
-                                std::to_string(size));
-  return a.data();
-}
-template <class T>
-T* data_or_null(const std::optional<Array<T>>& a, int64_t size, const char* name) {
-  static std::remove_const_t<T> nothing;  // an empty array has no address, but it was given
-  if (!a) return nullptr;
-  T* p = data(*a, size, name);
-  return p ? p : &nothing;
-}
 
 template <class S>
 Pinhole<S> camera(const Array<const S>& viewmat, const Array<const S>& K) {
@@ -135,18 +111,19 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(
       name("project_forward").c_str(),
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, int width, int height,
-         double near, Out geom, Out frames, Out radii) {
+         double near, Out geom, Out frames, Out radii, Array<int32_t> broken) {
         const int64_t n = int64_t(opacity_logits.size());
         const Surfels<S> in = surfels<S>(n, means, quats, log_scales, opacity_logits, beta_raw);
         S *g = data(geom, n * kGeom, "geom"), *f = data(frames, n * kFrame, "frames");
         S* r = data(radii, 2 * n, "radii");
         const Pinhole<S> cam = camera<S>(viewmat, K);
+        int32_t* count = data(broken, 1, "broken");
         nb::gil_scoped_release release;
-        return project_forward(cam, width, height, S(near), in, g, f, r);
+        *count += int32_t(project_forward(cam, width, height, S(near), in, g, f, r));
       },
       "means"_a.noconvert(), "quats"_a.noconvert(), "log_scales"_a.noconvert(), "opacity_logits"_a.noconvert(),
       "beta_raw"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a,
-      "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert());
+      "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert());
 
   m.def(
       name("project_backward").c_str(),

@@ -1,0 +1,16 @@
+// bitymi_ns._cuda: the functions of bitymi_ns._cpu for arrays on a CUDA device, each with the stream that it runs on.
+// The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
+#include "bindings/cuda.h"
+
+using namespace nanobind::literals;
+
+#if defined(BITYMI_EMULATED)
+NB_MODULE(_emulated, m) {
+  m.doc() = "The CUDA kernels, thread by thread on the host: for tests.";
+  m.def("set_seed", &bt::emulator::set_seed, "seed"_a, "Seed of the order in which a block's threads take turns.");
+#else
+NB_MODULE(_cuda, m) {
+  m.doc() = "CUDA kernels: see bitymi_ns.ops for their meaning.";
+#endif
+  bt::cuda::bind_project(m);
+}

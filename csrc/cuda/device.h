@@ -1,0 +1,55 @@
+// What a kernel's source may use. Compiled by nvcc it is CUDA; compiled by a C++ compiler the same source runs on the
+// host, thread by thread (emulator.h), so that indexing, barriers and warp steps are tested on machines without a card.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#if defined(__CUDACC__)
+
+#include <cuda_runtime.h>
+
+#include <stdexcept>
+#include <string>
+
+namespace bt::cuda {
+
+inline void check(cudaError_t error, const char* what) {
+  if (error != cudaSuccess) throw std::runtime_error(std::string(what) + ": " + cudaGetErrorString(error));
+}
+
+}  // namespace bt::cuda
+
+// Launches kernel<<<grid, block, shared bytes, stream>>>(...). A kernel with template commas goes in parentheses.
+#define BT_LAUNCH(kernel, grid, block, shared, stream, ...)                                \
+  do {                                                                                     \
+    kernel<<<(grid), (block), (shared), static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__); \
+    ::bt::cuda::check(cudaGetLastError(), #kernel);                                        \
+  } while (0)
+
+#define BT_DYNAMIC_SHARED(Type, name)                               \
+  extern __shared__ __align__(16) unsigned char bt_shared_memory[]; \
+  Type* name = reinterpret_cast<Type*>(bt_shared_memory)
+
+#else
+
+#include "cuda/emulator.h"
+
+#define BT_LAUNCH(kernel, grid, block, shared, stream, ...) \
+  ((void)(stream), ::bt::emulator::launch(#kernel, (grid), (block), (shared), [=] { kernel(__VA_ARGS__); }))
+
+#define BT_DYNAMIC_SHARED(Type, name) Type* name = static_cast<Type*>(::bt::emulator::dynamic_shared())
+
+#endif
+
+namespace bt::cuda {
+
+// A CUDA stream (cudaStream_t) without CUDA's headers; the emulator ignores it.
+using Stream = void*;
+
+constexpr int kWarp = 32;
+constexpr unsigned kFullMask = 0xffffffffu;
+
+constexpr int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
+
+}  // namespace bt::cuda

@@ -1,0 +1,148 @@
+// Fibers that stand in for the threads of a block.
+#include "cuda/emulator.h"
+
+#include <ucontext.h>
+
+#include <algorithm>
+#include <memory>
+#include <random>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+namespace bt::emulator {
+
+Index thread_index, block_index;
+dim3 block_size, grid_size;
+
+namespace {
+constexpr size_t kStack = 256 * 1024;
+constexpr unsigned kLanesOfWarp = 32;
+
+enum class State { kReady, kAtBlock, kAtWarp, kDone };
+
+struct Fiber {
+  ucontext_t context;
+  std::unique_ptr<char[]> stack{new char[kStack]};  // pages are touched only as deep as a kernel goes
+  State state;
+  Index index;
+  unsigned mask;                    // of the warp step it waits at
+  uint64_t posted;                  // what it gave
+  uint64_t received[kLanesOfWarp];  // what the warp gave
+};
+
+std::vector<std::unique_ptr<Fiber>> fibers;
+std::vector<uint64_t> shared_memory;
+std::mt19937 shuffle;
+ucontext_t scheduler;
+size_t current;
+const std::function<void()>* body;
+
+void run_thread() {
+  (*body)();
+  fibers[current]->state = State::kDone;
+  swapcontext(&fibers[current]->context, &scheduler);
+}
+
+void wait(State at) {
+  Fiber& me = *fibers[current];
+  me.state = at;
+  swapcontext(&me.context, &scheduler);
+}
+
+// Opens the barriers whose threads have all come. False when none did.
+bool open_barriers(size_t threads) {
+  bool opened = false;
+  size_t at_block = 0, done = 0;
+  for (size_t i = 0; i < threads; ++i) {
+    at_block += fibers[i]->state == State::kAtBlock;
+    done += fibers[i]->state == State::kDone;
+  }
+  if (at_block && at_block + done == threads) {
+    for (size_t i = 0; i < threads; ++i)
+      if (fibers[i]->state == State::kAtBlock) fibers[i]->state = State::kReady;
+    return true;
+  }
+  for (size_t warp = 0; warp < threads; warp += kLanesOfWarp) {
+    const size_t lanes = std::min<size_t>(kLanesOfWarp, threads - warp);
+    for (size_t i = 0; i < lanes; ++i) {
+      if (fibers[warp + i]->state != State::kAtWarp) continue;
+      const unsigned mask = fibers[warp + i]->mask;
+      bool complete = mask >> i & 1u;
+      for (size_t j = 0; j < lanes; ++j)
+        if (mask >> j & 1u) {
+          const Fiber& f = *fibers[warp + j];
+          complete &= f.state == State::kDone || (f.state == State::kAtWarp && f.mask == mask);
+        }
+      if (!complete) continue;
+      uint64_t values[kLanesOfWarp] = {};
+      for (size_t j = 0; j < lanes; ++j)
+        if ((mask >> j & 1u) && fibers[warp + j]->state == State::kAtWarp) values[j] = fibers[warp + j]->posted;
+      for (size_t j = 0; j < lanes; ++j)
+        if ((mask >> j & 1u) && fibers[warp + j]->state == State::kAtWarp) {
+          std::copy_n(values, kLanesOfWarp, fibers[warp + j]->received);
+          fibers[warp + j]->state = State::kReady;
+        }
+      opened = true;
+    }
+  }
+  return opened;
+}
+}  // namespace
+
+void set_seed(unsigned seed) { shuffle.seed(seed); }
+void* dynamic_shared() { return shared_memory.data(); }
+int lane() { return int(current % kLanesOfWarp); }
+
+void block_barrier() { wait(State::kAtBlock); }
+const uint64_t* warp_exchange(unsigned mask, uint64_t value) {
+  Fiber& me = *fibers[current];
+  me.mask = mask, me.posted = value;
+  wait(State::kAtWarp);
+  return me.received;
+}
+
+void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std::function<void()>& thread) {
+  const size_t threads = size_t(block.x) * block.y * block.z;
+  if (!threads || threads > 1024 || !grid.x || !grid.y || !grid.z || grid.y > 65535 || grid.z > 65535)
+    throw std::runtime_error(std::string(kernel) + ": invalid configuration of grid or block");
+  if (shared > 227 * 1024) throw std::runtime_error(std::string(kernel) + ": more shared memory than a block has");
+  while (fibers.size() < threads) fibers.push_back(std::make_unique<Fiber>());
+  shared_memory.assign(shared / 8 + 1, 0xffffffffffffffffull);  // NaN: nobody may count on zeros
+  block_size = block, grid_size = grid;
+  body = &thread;
+  std::vector<size_t> order(threads);
+  for (size_t i = 0; i < threads; ++i) order[i] = i;
+  for (block_index.z = 0; block_index.z < grid.z; ++block_index.z)
+    for (block_index.y = 0; block_index.y < grid.y; ++block_index.y)
+      for (block_index.x = 0; block_index.x < grid.x; ++block_index.x) {
+        for (size_t i = 0; i < threads; ++i) {
+          Fiber& f = *fibers[i];
+          getcontext(&f.context);
+          f.context.uc_stack.ss_sp = f.stack.get();
+          f.context.uc_stack.ss_size = kStack;
+          f.context.uc_link = nullptr;
+          makecontext(&f.context, run_thread, 0);
+          f.state = State::kReady;
+          f.index = {unsigned(i % block.x), unsigned(i / block.x % block.y), unsigned(i / block.x / block.y)};
+        }
+        for (;;) {
+          std::shuffle(order.begin(), order.end(), shuffle);
+          for (size_t i : order) {
+            if (fibers[i]->state != State::kReady) continue;
+            current = i;
+            thread_index = fibers[i]->index;
+            swapcontext(&scheduler, &fibers[i]->context);
+          }
+          const bool finished = std::all_of(fibers.begin(), fibers.begin() + threads,
+                                            [](const auto& f) { return f->state == State::kDone; });
+          if (finished) break;
+          const bool ready = std::any_of(fibers.begin(), fibers.begin() + threads,
+                                         [](const auto& f) { return f->state == State::kReady; });
+          if (!open_barriers(threads) && !ready)
+            throw std::runtime_error(std::string(kernel) + ": threads wait at barriers that not all of them reach");
+        }
+      }
+}
+
+}  // namespace bt::emulator

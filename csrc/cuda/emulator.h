@@ -1,0 +1,153 @@
+// The part of CUDA that our kernels use, on the host: every CUDA thread is a fiber, a block's threads take turns in a
+// shuffled order and switch at barriers and warp steps. A missing barrier shows as a wrong result for some seed, a
+// barrier that not all threads reach as an error. Blocks run one after another. For tests: correct, not fast.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+
+struct dim3 {
+  unsigned x, y, z;
+  constexpr dim3(unsigned x_ = 1, unsigned y_ = 1, unsigned z_ = 1) : x(x_), y(y_), z(z_) {}
+};
+struct alignas(16) float4 {
+  float x, y, z, w;
+};
+struct alignas(8) float2 {
+  float x, y;
+};
+struct uchar4 {
+  unsigned char x, y, z, w;
+};
+inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+inline float2 make_float2(float x, float y) { return {x, y}; }
+
+namespace bt::emulator {
+
+struct Index {
+  unsigned x, y, z;
+};
+extern Index thread_index, block_index;
+extern dim3 block_size, grid_size;
+
+// Runs every thread of every block; `seed` of the order in which threads take turns is set by set_seed.
+// Throws std::runtime_error when threads wait at barriers that can never open.
+void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std::function<void()>& thread);
+void set_seed(unsigned seed);
+void* dynamic_shared();
+
+void block_barrier();
+// Posts a value to the calling warp and returns those of all 32 lanes (lanes outside the mask: 0).
+const uint64_t* warp_exchange(unsigned mask, uint64_t value);
+int lane();
+
+template <class T>
+uint64_t to_bits(T value) {
+  static_assert(sizeof(T) <= 8);
+  uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof value);
+  return bits;
+}
+template <class T>
+T from_bits(uint64_t bits) {
+  T value;
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+}  // namespace bt::emulator
+
+#define __global__
+#define __device__
+#define __host__
+#define __forceinline__ inline
+#define __shared__ static
+#define __constant__ static
+#define __launch_bounds__(...)
+#define __restrict__
+
+#define threadIdx (::bt::emulator::thread_index)
+#define blockIdx (::bt::emulator::block_index)
+#define blockDim (::bt::emulator::block_size)
+#define gridDim (::bt::emulator::grid_size)
+
+inline void __syncthreads() { bt::emulator::block_barrier(); }
+inline void __syncwarp(unsigned mask = 0xffffffffu) { bt::emulator::warp_exchange(mask, 0); }
+inline unsigned __ballot_sync(unsigned mask, bool predicate) {
+  const uint64_t* votes = bt::emulator::warp_exchange(mask, predicate);
+  unsigned result = 0;
+  for (int i = 0; i < 32; ++i) result |= unsigned(votes[i] != 0) << i;
+  return result & mask;
+}
+inline bool __any_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, predicate) != 0; }
+inline bool __all_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, !predicate) == 0; }
+template <class T>
+T __shfl_sync(unsigned mask, T value, int source, int width = 32) {
+  const int lane = bt::emulator::lane();
+  const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
+  return bt::emulator::from_bits<T>(values[(lane & ~(width - 1)) | (source & (width - 1))]);
+}
+template <class T>
+T __shfl_xor_sync(unsigned mask, T value, int with) {
+  const int lane = bt::emulator::lane();
+  const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
+  return bt::emulator::from_bits<T>(values[(lane ^ with) & 31]);
+}
+template <class T>
+T __shfl_down_sync(unsigned mask, T value, unsigned by) {
+  const int lane = bt::emulator::lane();
+  const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
+  return lane + by < 32 ? bt::emulator::from_bits<T>(values[lane + by]) : value;
+}
+template <class T>
+T __shfl_up_sync(unsigned mask, T value, unsigned by) {
+  const unsigned lane = unsigned(bt::emulator::lane());
+  const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
+  return lane >= by ? bt::emulator::from_bits<T>(values[lane - by]) : value;
+}
+inline int __syncthreads_count(bool predicate) {
+  static int count;  // threads take turns, so a plain counter is enough
+  __syncthreads();
+  if (predicate) ++count;
+  __syncthreads();
+  const int result = count;
+  __syncthreads();
+  count = 0;
+  __syncthreads();
+  return result;
+}
+inline int __syncthreads_or(bool predicate) { return __syncthreads_count(predicate) > 0; }
+inline int __syncthreads_and(bool predicate) { return __syncthreads_count(!predicate) == 0; }
+
+inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline int __popcll(unsigned long long x) { return __builtin_popcountll(x); }
+inline int __ffs(int x) { return __builtin_ffs(x); }
+inline int __clz(int x) { return x ? __builtin_clz(unsigned(x)) : 32; }
+template <class T>
+T __ldg(const T* p) {
+  return *p;
+}
+
+// blocks and threads take turns: plain read-modify-write is atomic
+template <class T>
+T atomicAdd(T* to, T value) {
+  const T old = *to;
+  *to = old + value;
+  return old;
+}
+template <class T>
+T atomicMax(T* to, T value) {
+  const T old = *to;
+  if (value > old) *to = value;
+  return old;
+}
+template <class T>
+T atomicMin(T* to, T value) {
+  const T old = *to;
+  if (value < old) *to = value;
+  return old;
+}
+inline void __threadfence() {}

@@ -1,0 +1,60 @@
+"""Every test here runs on the CUDA kernels twice: thread by thread on the host, and on a card where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+from bitymi_ns.ops import backend
+from bitymi_ns.ops.backend import emulated_cuda
+
+
+def why_not_on_a_card() -> str | None:
+    """Why tests cannot run on a card here; None when they can."""
+    if not torch.cuda.is_available():
+        return "no CUDA device (or torch without CUDA)"
+    try:
+        from bitymi_ns import _cuda  # noqa: F401
+    except ImportError as error:
+        return f"bitymi_ns._cuda is not built: {error}"
+    return None
+
+
+def why_not_emulated() -> str | None:
+    """Why tests cannot run on the host's emulation; None when they can."""
+    try:
+        from bitymi_ns import _emulated  # noqa: F401
+    except ImportError:
+        return "built without BITYMI_EMULATED_CUDA"
+    return None
+
+
+@pytest.fixture(params=["emulated", "card"])
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """A device whose tensors go to the CUDA kernels."""
+    reason = why_not_emulated() if request.param == "emulated" else why_not_on_a_card()
+    if reason:
+        pytest.skip(reason)
+    if request.param == "card":
+        yield torch.device("cuda")
+    else:
+        with emulated_cuda(seed=1):
+            yield torch.device("cpu")
+
+
+@pytest.fixture
+def cpu():
+    """A context in which tensors on the CPU go to the CPU kernels although `device` is emulated."""
+
+    @contextmanager
+    def context() -> Iterator[None]:
+        before, backend._emulated = backend._emulated, False
+        try:
+            yield
+        finally:
+            backend._emulated = before
+
+    return context

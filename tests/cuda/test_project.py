@@ -1,0 +1,49 @@
+"""Projection by the CUDA kernels against the CPU kernels, which are held against the float64 references."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns.ops import project
+from bitymi_ns.scene import Camera
+from tests.ops.golden import GOLDEN_NAMES, load_golden
+
+NAMES = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
+RADII = 2  # place in what `run` returns
+
+
+def run(case, dtype: torch.dtype, device: torch.device):
+    """geom, frames, radii and the parameters' gradients for a fixed random direction."""
+    params = [case.params[name].to(device, dtype).requires_grad_() for name in NAMES]
+    camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+    p = project(*params, camera, 0.2)
+    generator = torch.Generator().manual_seed(3)
+    directions = [torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in (p.geom, p.frames)]
+    loss = sum((t * d.to(t)).sum() for t, d in zip((p.geom, p.frames), directions, strict=True))
+    grads = torch.autograd.grad(loss, params)
+    return [t.detach().cpu().double() for t in (p.geom, p.frames, p.radii, *grads)], p.not_finite
+
+
+@pytest.mark.parametrize("name", GOLDEN_NAMES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_projection_and_its_gradients(name: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
+    case = load_golden(name)
+    case.params["means"][0, 0] = float("nan")
+    got, broken = run(case, dtype, device)
+    with cpu():
+        want, want_broken = run(case, dtype, torch.device("cpu"))
+    assert broken == want_broken == 1
+    tolerance = 1e-10 if dtype == torch.float64 else 1e-4
+    for i, (a, b) in enumerate(zip(got, want, strict=True)):
+        assert torch.isfinite(a).all()
+        if i == RADII:  # box of the level set: the conic of a needle is ill-conditioned, its padding is 0.01 pixels
+            assert ((a - b).abs() <= 0.01 + 1e-3 * b).all()
+        else:
+            assert (a - b).abs().max() <= tolerance * b.abs().max()
+
+
+def test_no_surfels(device: torch.device) -> None:
+    empty = [torch.empty(0, *shape, device=device) for shape in ((3,), (4,), (2,), (), ())]
+    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 8], [0, 50, 8], [0, 0, 1]]), 16, 16)
+    assert project(*empty, camera).geom.shape == (0, 16)

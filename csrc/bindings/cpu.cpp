@@ -8,6 +8,7 @@
 
 #include "bindings/arrays.h"
 #include "cpu/kernels.h"
+#include "cpu/threads.h"
 
 namespace bt {
 using namespace nb::literals;
@@ -376,6 +377,7 @@ NB_MODULE(_cpu, m) {
   mallopt(M_TRIM_THRESHOLD, 1 << 30);
   mallopt(M_TOP_PAD, 64 << 20);
 #endif
+  wait_without_spinning();
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
   bind<float>(m, "_f32");

@@ -13,6 +13,9 @@ namespace bt {
 
 int num_threads();
 
+// From now on idle threads sleep instead of spinning, unless OMP_WAIT_POLICY or GOMP_SPINCOUNT decide; once a process.
+void wait_without_spinning();
+
 // fn(thread, begin, end) over n items in equal, fixed parts.
 template <class F>
 void parallel_parts(int64_t n, int64_t least, F&& fn) {

@@ -1,0 +1,54 @@
+"""Idle threads sleep: between parallel regions no processor time passes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("bitymi_ns._cpu")
+
+spinning = pytest.mark.skipif(os.cpu_count() == 1, reason="one processor: there are no other threads")
+
+SCRIPT = """
+import time, torch
+x = torch.rand(200_000)
+def cpu_seconds():
+    start = time.process_time()
+    for _ in range(40):
+        x * 2  # a parallel region of torch's, then nothing to do
+        time.sleep(0.002)
+    return time.process_time() - start
+x * 2
+before = cpu_seconds()
+import bitymi_ns._cpu
+print(before, cpu_seconds())
+"""
+
+
+def processor_time(**environment: str) -> tuple[float, float]:
+    """CPU seconds of mostly idling, before and after the kernels are loaded, in a fresh process."""
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env={**inherited, **environment}, capture_output=True, text=True, check=True
+    )
+    before, after = map(float, done.stdout.split())
+    return before, after
+
+
+@spinning
+def test_threads_do_not_spin_once_the_kernels_are_loaded() -> None:
+    before, after = processor_time()
+    if before < 0.1:
+        pytest.skip("this OpenMP does not spin")
+    assert after < 0.5 * before
+
+
+@spinning
+def test_the_users_own_choice_stands() -> None:
+    before, after = processor_time(GOMP_SPINCOUNT="300000")
+    if before < 0.1:
+        pytest.skip("this OpenMP does not spin")
+    assert after > 0.3 * before

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 import pickle
+import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +16,18 @@ import numpy as np
 import torch
 
 from bitymi_ns.host.errors import fail
+from bitymi_ns.scene.config import SceneConfig
+
+EXTRA_STATE = "_extra_state"
+"""torch's name for what a module saves beside its tensors."""
+SURFELS = "scene.surfels."
+"""Prefix of the surfels' parameters in the model."""
+STATE_VERSION = 1
+MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels")
+"""Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters
+mean, only how they are drawn or learned."""
+_READING = (RuntimeError, EOFError, OSError, LookupError, ValueError, TypeError, AttributeError)
+"""What torch.load raises for files that are not as it wrote them."""
 
 
 def allow_numpy_scalars() -> None:
@@ -73,19 +90,57 @@ def newest_step(folder: Path) -> int:
     return max(steps)
 
 
-def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint."""
+def path_of(folder: Path, step: int) -> Path:
+    """Where the checkpoint of a step is kept."""
+    return folder / f"step-{step:09d}.ckpt"
+
+
+def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
+    """Read a checkpoint of a run whose scene is of this kind."""
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
     try:
+        with zipfile.ZipFile(path) as archive:
+            altered = archive.testzip()  # torch does not look at the checksums
+        if altered is not None:
+            raise ValueError(f"the checksum of {altered} is wrong")
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, KeyError, ValueError, pickle.UnpicklingError) as error:
-        fail(f"the checkpoint {path} cannot be read; it is damaged or of another program: {_first_line(error)}", error)
+    except (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, *_READING) as error:
+        others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
+        way_out = (
+            f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
+        )
+        fail(f"the checkpoint {path} is damaged or of another program: {_first_line(error)}. {way_out}.", error)
     if not isinstance(state, dict) or not {"step", "pipeline", "optimizers"} <= state.keys():
         fail(f"{path} is not a nerfstudio checkpoint")
+    _check_scene(state["pipeline"], scene, path)
     return state
+
+
+def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) -> None:
+    """Stop when the parameters are not those of a scene of this kind."""
+    extra = parameters.get("_model." + EXTRA_STATE)
+    if not isinstance(extra, dict) or f"_model.{SURFELS}means" not in parameters:
+        fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with the method it is from.")
+    if extra.get("version", 0) > STATE_VERSION:
+        fail(f"{path} is from a newer bitymi-ns; update it to load this checkpoint")
+    there, here = json.loads(extra["scene"]), dataclasses.asdict(scene)
+    different = [k for k in there if k in here and k not in MAY_DIFFER and there[k] != here[k]]
+    if different:
+        listed = "\n".join(
+            f"  --pipeline.model.scene.{k.replace('_', '-')}: {there[k]} there, {here[k]} here" for k in different
+        )
+        fail(
+            f"the checkpoint {path} was trained with another preset:\n"
+            f"{listed}\n"
+            "Use the method that it was trained with (see the config.yml beside its nerfstudio_models folder)."
+        )
+    rows = {name: len(value) for name, value in parameters.items() if name.startswith("_model." + SURFELS)}
+    if len(set(rows.values())) > 1:
+        counts = ", ".join(f"{count} {name.rpartition('.')[2]}" for name, count in rows.items())
+        fail(f"the checkpoint {path} was altered: its surfels are not of one number ({counts}). Train again.")
 
 
 def _first_line(error: BaseException) -> str:
     lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    return lines[0].rstrip(".") if lines else type(error).__name__

@@ -14,6 +14,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from bitymi_ns.host import checkpoints
 from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels
@@ -119,13 +120,23 @@ class BitymiTrainerConfig(TrainerConfig):
         is found, or one that is used from another folder than it was trained in.
         """
         model = self.pipeline.model
-        if not isinstance(model, BakedModelConfig):
-            evaluated = folder_being_evaluated()
-            if evaluated is not None and (evaluated / self.relative_model_dir).is_dir():
-                return evaluated / self.relative_model_dir
-            return super().get_checkpoint_dir()
-        model.bundle = find_bundle(model.bundle)
-        return stub_checkpoint_dir(model.bundle)
+        if isinstance(model, BakedModelConfig):
+            model.bundle = find_bundle(model.bundle)
+            return stub_checkpoint_dir(model.bundle)
+        folder, evaluated = super().get_checkpoint_dir(), folder_being_evaluated()
+        if evaluated is not None:
+            if (evaluated / self.relative_model_dir).is_dir():
+                folder = evaluated / self.relative_model_dir
+            self._choose_checkpoint(folder)
+        return folder
+
+    def _choose_checkpoint(self, folder: Path) -> None:
+        """Fix the checkpoint that nerfstudio's tools will load, and stop now if it cannot be used: they would report
+        that with a traceback."""
+        # in a resumed run the recorded step is that of the run it went on from
+        if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
+            self.load_step = checkpoints.newest_step(folder)
+        checkpoints.load(checkpoints.path_of(folder, self.load_step), self.pipeline.model.scene)
 
 
 @dataclass

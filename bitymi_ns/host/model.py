@@ -14,6 +14,7 @@ from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.host.checkpoints import STATE_VERSION, SURFELS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
 from bitymi_ns.scene.camera import Camera
@@ -38,11 +39,6 @@ SURFEL_PARAMETERS = (
 )
 PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
 """Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
-
-EXTRA = "_extra_state"
-STATE_VERSION = 1
-RENDER_ONLY = ("near", "weight_bound")
-"""Scene options that may differ from those that a checkpoint was trained with."""
 
 
 @dataclass
@@ -157,31 +153,12 @@ class BitymiModel(SurfelModel):
         self.resume_state = state.get("run", {})
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load a checkpoint: check that it belongs to this preset, then take over its number of surfels."""
-        self._check_preset(state_dict)
-        self.scene.resize(len(state_dict["scene.surfels.means"]))
+        """Load a checkpoint (`checkpoints.load` has checked that it belongs to this preset), whatever its number of
+        surfels."""
+        self.scene.resize(len(state_dict[SURFELS + "means"]))
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
             if saved is not None and saved.shape != parameter.shape:
                 # the same Parameter object: nerfstudio's optimisers hold it already
                 parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super().load_state_dict(state_dict, strict=True)
-
-    def _check_preset(self, state_dict: Mapping[str, Any]) -> None:
-        extra = state_dict.get(EXTRA)
-        if not isinstance(extra, dict) or "scene.surfels.means" not in state_dict:
-            fail("the checkpoint is not one of this method: it holds no surfels. Load it with the method it is from.")
-        if extra.get("version", 0) > STATE_VERSION:
-            fail("the checkpoint is from a newer bitymi-ns; update it to load this checkpoint")
-        saved = json.loads(extra["scene"])
-        mine = dataclasses.asdict(self.config.scene)
-        different = [k for k in saved if k in mine and k not in RENDER_ONLY and saved[k] != mine[k]]
-        if different:
-            listed = "\n".join(
-                f"  --pipeline.model.scene.{k.replace('_', '-')}: {saved[k]} there, {mine[k]} here" for k in different
-            )
-            fail(
-                "the checkpoint was trained with another preset:\n"
-                f"{listed}\n"
-                "Use the method that it was trained with (see the config.yml beside its nerfstudio_models folder)."
-            )

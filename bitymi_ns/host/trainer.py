@@ -14,6 +14,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host import checkpoints
+from bitymi_ns.host.errors import fail
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the convention of shells."""
@@ -45,20 +46,23 @@ class BitymiTrainer(Trainer):
         if config.load_dir is not None or config.load_checkpoint is not None:
             if config.load_dir is not None:
                 step = config.load_step if config.load_step is not None else checkpoints.newest_step(config.load_dir)
-                path = Path(config.load_dir) / f"step-{step:09d}.ckpt"
+                path = checkpoints.path_of(config.load_dir, step)
             else:
                 path = Path(config.load_checkpoint)
-            self._restore(checkpoints.load(path))
+            self._restore(checkpoints.load(path, config.pipeline.model.scene), path)
             CONSOLE.print(f"Resuming after step {self._start_step - 1} from {path}")
         config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
 
-    def _restore(self, state: dict[str, Any]) -> None:
+    def _restore(self, state: dict[str, Any], path: Path) -> None:
         self._start_step = state["step"] + 1
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        self.optimizers.load_optimizers(state["optimizers"])
-        if "schedulers" in state and self.config.load_scheduler:
-            self.optimizers.load_schedulers(state["schedulers"])
-        self.grad_scaler.load_state_dict(state["scalers"])
+        try:
+            self.optimizers.load_optimizers(state["optimizers"])
+            if "schedulers" in state and self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        except (RuntimeError, LookupError, ValueError, TypeError) as error:
+            fail(f"{path} cannot be resumed: the state of its optimisers does not fit ({error}). Train again.", error)
 
     def train(self) -> None:
         """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
@@ -111,7 +115,7 @@ class BitymiTrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write the checkpoint of a finished step; older ones are removed only after that."""
-        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        path = checkpoints.path_of(self.checkpoint_dir, step)
         pipeline = getattr(self.pipeline, "module", self.pipeline)
         state = {
             "step": step,

@@ -176,17 +176,6 @@ def test_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, start: Sta
         ns_train.main(config)
 
 
-def test_a_checkpoint_of_another_method(start: Start, tmp_path: Path) -> None:
-    folder = tmp_path / "other"
-    folder.mkdir()
-    state = {"step": 5, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "scalers": {}}
-    torch.save(state, folder / "step-000000005.ckpt")
-    config = start()
-    config.load_dir = folder
-    with pytest.raises(InputError, match="not one of this method"):
-        ns_train.main(config)
-
-
 def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
     config = start()
     config.load_dir = tmp_path / "nowhere"
@@ -197,8 +186,59 @@ def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, s
         ns_train.main(copy.deepcopy(config))
     whole = (trained.get_checkpoint_dir() / "step-000000059.ckpt").read_bytes()
     (config.load_dir / "step-000000059.ckpt").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="cannot be read; it is damaged"):
+    with pytest.raises(InputError, match="damaged"):
         ns_train.main(copy.deepcopy(config))
+
+
+def test_optimisers_of_another_scene(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
+    state = checkpoint(trained, 59)
+    del state["optimizers"]["means"]["param_groups"]
+    torch.save(state, tmp_path / "step-000000059.ckpt")
+    config = start()
+    config.load_dir = tmp_path
+    with pytest.raises(InputError, match="step-000000059.ckpt cannot be resumed"):
+        ns_train.main(config)
+
+
+def a_run_of(trained: BitymiTrainerConfig, folder: Path) -> Path:
+    """A copy of the run, in another place: its folder."""
+    return Path(shutil.copytree(trained.get_base_dir(), folder / "run"))
+
+
+def rewrite(folder: Path, change: Callable[[BitymiTrainerConfig], None]) -> None:
+    """Apply `change` to the config.yml of a run."""
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    change(config)
+    (folder / "config.yml").write_text(yaml.dump(config))
+
+
+def test_evaluation_refuses_a_checkpoint_that_is_damaged_or_missing(
+    trained: BitymiTrainerConfig, tmp_path: Path
+) -> None:
+    folder = a_run_of(trained, tmp_path)
+    newest = folder / "nerfstudio_models" / "step-000000059.ckpt"
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.raises(InputError, match=f"{newest} is damaged(.|\n)*go back to step-000000040.ckpt"):
+        eval_setup(folder / "config.yml")
+    newest.unlink()
+    assert eval_setup(folder / "config.yml")[3] == 40
+    shutil.rmtree(newest.parent)
+    newest.parent.mkdir()
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        eval_setup(folder / "config.yml")
+
+
+def test_evaluation_refuses_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    folder = a_run_of(trained, tmp_path)
+    rewrite(folder, lambda config: setattr(config.pipeline.model.scene, "view_color", "sg"))
+    with pytest.raises(InputError, match="another preset:\n.*view-color: sv there, sg here"):
+        eval_setup(folder / "config.yml")
+
+
+def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    folder = a_run_of(trained, tmp_path)
+    rewrite(folder, lambda config: setattr(config, "load_step", 7))  # of the run that it went on from
+    assert eval_setup(folder / "config.yml")[3] == 59
 
 
 @pytest.mark.parametrize("method", ["bitymi-quality", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"])

@@ -10,7 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
+from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host.errors import fail
@@ -69,6 +73,17 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig) -> Non
 
 def _interactive() -> bool:
     return sys.stdin is not None and sys.stdin.isatty()
+
+
+def declares_box(dataparser: DataParserConfig) -> bool:
+    """Whether the capture itself states the box that holds its scene. Other parsers' boxes are defaults of nerfstudio,
+    which say nothing about the capture."""
+    if isinstance(dataparser, (MinimalDataParserConfig, SDFStudioDataParserConfig)):
+        return True
+    if isinstance(dataparser, InstantNGPDataParserConfig):
+        path = dataparser.data if dataparser.data.suffix == ".json" else dataparser.data / "transforms.json"
+        return "aabb_scale" in json.loads(path.read_text("utf8"))
+    return False
 
 
 @contextmanager

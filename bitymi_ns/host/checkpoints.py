@@ -110,7 +110,11 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
         way_out = (
             f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
         )
-        fail(f"the checkpoint {path} is damaged or of another program: {_first_line(error)}. {way_out}.", error)
+        fail(
+            f"the checkpoint {path} is damaged (cut off or altered) or of another program: "
+            f"{_first_line(error)}. {way_out}.",
+            error,
+        )
     if not isinstance(state, dict) or not {"step", "pipeline", "optimizers"} <= state.keys():
         fail(f"{path} is not a nerfstudio checkpoint")
     _check_scene(state["pipeline"], scene, path)

@@ -14,7 +14,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host.capture import check_capture, reporting_input_errors
+from bitymi_ns.host.capture import check_capture, declares_box, reporting_input_errors
 from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
 from bitymi_ns.host.errors import fail
 from bitymi_ns.train.views import training_order
@@ -60,6 +60,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self.train_dataset.metadata["has_alpha"] = bool(outputs.image_filenames) and file_has_transparency(
             outputs.image_filenames[0]
         )
+        self.train_dataset.metadata["declares_box"] = declares_box(config.dataparser)
         cameras = outputs.cameras
         self.train_dataset.metadata["train_pixels"] = int((cameras.width.long() * cameras.height.long()).sum())
         self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)

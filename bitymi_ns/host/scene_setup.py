@@ -33,9 +33,10 @@ def new_scene(
         metadata: what the data manager says about the capture.
     """
     xyz, rgb = _points(points)
+    declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
-        box = _box(scene_box, len(xyz))
+        box = _box_for_random_points(scene_box, len(xyz))
     try:
         scene, report = build_scene(
             xyz,
@@ -46,6 +47,7 @@ def new_scene(
             bounded=metadata.get("has_alpha", False),
             image_pixels=metadata.get("train_pixels", 0),
             box=box,
+            declared=declared,
         )
     except ValueError as error:
         fail(str(error), error)
@@ -70,19 +72,24 @@ def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
     return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
 
 
-def _box(scene_box: SceneBox | None, given: int) -> Tensor | None:
-    """[2, 3] corners for random points."""
+def _box_for_random_points(scene_box: SceneBox | None, given: int) -> Tensor | None:
+    """[2, 3] corners."""
     if given:
         fail(
             f"all {given} points of the capture's point cloud are NaN or infinite. Make the cloud again, or remove "
             "ply_file_path from transforms.json to start from random points."
         )
-    if scene_box is None:
-        return None
-    low, high = scene_box.aabb.float().cpu()
-    if not bool(torch.isfinite(scene_box.aabb).all()) or not bool((high > low).all()):
+    return None if scene_box is None else _corners(scene_box)
+
+
+def _corners(scene_box: SceneBox) -> Tensor:
+    """[2, 3]: low and high corner."""
+    corners = scene_box.aabb.float().cpu().reshape(2, 3)
+    low, high = corners
+    if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):
         fail(
-            f"the capture has no points, and its scene box from {low.tolist()} to {high.tolist()} is empty. Give a "
-            "point cloud (ply_file_path in transforms.json), or a positive --scene-scale after `nerfstudio-data`."
+            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it in the "
+            "capture's files; in nerfstudio's own format give a point cloud (ply_file_path in transforms.json) or a "
+            "positive --scene-scale after `nerfstudio-data`."
         )
-    return torch.stack([low, high])
+    return corners

@@ -14,25 +14,27 @@ class SceneConfig:
     """View-dependent colour of a surfel: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta,
     sg = spherical Gaussians."""
     sv_sites: int = 7
-    """Number of Spherical Voronoi sites a surfel (the paper's K)."""
+    """Number of Spherical Voronoi sites a surfel (the paper's K), 1 to 32."""
     sh_degree: int = 3
     """Degree of the spherical harmonics, 0 to 3."""
     lobes: int = 2
-    """Number of lobes a surfel of the Spherical Beta and spherical Gaussian colours."""
+    """Number of lobes a surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Literal["hash", "none"] = "hash"
     """Residual colour field: hash = multiresolution hash grid and MLP, none = surfels alone."""
     levels: int = 4
-    """Hash grid levels; the paper's 4, with resolutions min_resolution * 2^level."""
+    """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: int = 256
-    """Resolution of the coarsest hash grid level."""
+    """Cells along an edge of the coarsest hash grid level, 2 to 2^20."""
     log2_table_size: int | None = None
-    """Entries a hash level, as a power of two; not given: chosen so that the table fits the scene and the cache."""
+    """Entries a hash level, as a power of two, 1 to 24; not given: chosen so that the table fits the scene and the
+    cache."""
     contraction: Literal["auto", "on", "off"] = "auto"
-    """mip-NeRF 360 contraction of space outside the unit ball of the cameras; auto: off for scenes with alpha."""
+    """mip-NeRF 360 contraction of space outside the unit ball of the cameras; auto: off for images with alpha, and for
+    captures that declare a box around their scene, unless it is more than twice as large as that ball."""
     near: float = 0.2
-    """Nearest depth that is drawn, in scene units (camera z)."""
+    """Nearest depth that is drawn, in scene units (camera z), above 0."""
     weight_bound: float = 0.02
-    """Fragments whose blending weight is below this keep the surfel's colour without the residual field."""
+    """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels."""
     rim: float = 1e-3

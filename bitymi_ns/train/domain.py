@@ -26,6 +26,7 @@ def build_scene(
     bounded: bool,
     image_pixels: int,
     box: Tensor | None = None,
+    declared: Tensor | None = None,
 ) -> tuple[Scene, PointReport]:
     """Surfels at the points, or at random in the box, and an empty texture field around them.
 
@@ -35,9 +36,11 @@ def build_scene(
         camera_centers: [C, 3] world positions of the training cameras.
         scene_config: the representation.
         train_config: training options.
-        bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off.
+        bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off, as it is for
+            scenes with a small `declared` box.
         image_pixels: of all training images together; decides the size of the hash table where none is given.
         box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
+        declared: [2, 3] corners of the box that the capture declares to hold its scene, if it does.
 
     Returns:
         The scene on the CPU, and what became of the points.
@@ -49,8 +52,10 @@ def build_scene(
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
     if scene_config.texture == "none":
         return Scene(scene_config, surfels, None), report
+    means = surfels["means"]
+    bounded = bounded or (declared is not None and box_is_small(declared, camera_centers))
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
-    mid, half = field_domain(surfels["means"], camera_centers, contract)
+    mid, half = field_domain(means if declared is None else declared, camera_centers, contract)
     log2_size = scene_config.log2_table_size
     if log2_size is None:
         log2_size = default_table_size(image_pixels)
@@ -82,11 +87,17 @@ def check_representation(config: SceneConfig) -> None:
             raise ValueError(f"the scene option {name} must be {limits}, not {value}")
 
 
+def box_is_small(box: Tensor, camera_centers: Tensor) -> bool:
+    """Whether a grid over the box [2, 3] is at least as fine as one over contracted space, where the cameras' ball has
+    half the width of the grid. Captures of open scenes may declare a box, too: a large one."""
+    return float((box[1] - box[0]).max()) <= 4 * scene_extent(camera_centers)
+
+
 def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
     """Middle and half size of the field's domain, world units.
 
     With contraction: the ball about the mean of the cameras that holds them all (`scene_extent`). Without: a cube
-    around the first surfels, a tenth larger.
+    around `means` (the first surfels, or the corners of the capture's box), a tenth larger.
     """
     if contract and len(camera_centers):
         middle = camera_centers.detach().float().cpu().mean(0)

@@ -307,5 +307,5 @@ def test_a_capture_without_points_starts_at_random(
 def test_no_points_and_an_empty_scene_box(room: Path, start: Start, tmp_path: Path) -> None:
     config = start(data=without_points(room, tmp_path))
     config.pipeline.datamanager.dataparser.scene_scale = 0.0
-    with pytest.raises(InputError, match="no points, and its scene box .* is empty"):
+    with pytest.raises(InputError, match="scene box of the capture, .*, is empty. .*--scene-scale"):
         ns_train.main(config)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
@@ -65,6 +66,17 @@ def test_alpha_is_kept_for_the_model(capture: Path) -> None:
     assert manager.train_dataset.metadata["has_alpha"] is True
     assert manager.cached_train[0]["image"].shape[-1] == 4
     assert manager.train_dataset[0]["image"].shape[-1] == 3  # what viewer and ns-render show
+
+
+def test_a_box_counts_only_where_the_capture_declares_one(capture: Path, edit: Any) -> None:
+    assert load(capture).train_dataset.metadata["declares_box"] is False  # nerfstudio's default box
+    for declared in (False, True):
+        if declared:
+            edit(capture, lambda meta: meta.update(aabb_scale=2))
+        config = BitymiDataManagerConfig(data=capture, dataparser=InstantNGPDataParserConfig(eval_mode="interval"))
+        manager = config.setup(device="cpu", test_mode="val")
+        assert manager.train_dataset.metadata["declares_box"] is declared
+    assert manager.train_dataset.scene_box.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
 
 
 def test_masks_are_loaded(capture: Path, edit: Any) -> None:

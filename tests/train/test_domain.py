@@ -18,9 +18,9 @@ def cloud() -> tuple[torch.Tensor, torch.Tensor]:
     return 2 * torch.rand(50, 3, generator=generator) - 1, torch.rand(50, 3, generator=generator)
 
 
-def build(cloud, bounded=False, pixels=0, **options):
+def build(cloud, bounded=False, pixels=0, declared=None, **options):
     config = SceneConfig(**{"log2_table_size": 8, **options})
-    return build_scene(*cloud, CENTERS, config, TrainConfig(), bounded, pixels)
+    return build_scene(*cloud, CENTERS, config, TrainConfig(), bounded, pixels, declared=declared)
 
 
 def test_an_open_scene_is_contracted_about_its_cameras(cloud) -> None:
@@ -36,6 +36,16 @@ def test_a_bounded_scene_has_a_box_around_its_points(cloud) -> None:
     assert not geometry.contract
     assert geometry.half == pytest.approx(0.55 * float((high - low).max()))
     assert geometry.mid == pytest.approx(((low + high) / 2).tolist())
+
+
+def test_a_declared_box_is_the_domain_if_it_is_small(cloud) -> None:
+    box = torch.tensor([[-2.0, -2.0, -3.0], [2.0, 2.0, 1.0]])
+    geometry = build(cloud, declared=box)[0].field.geometry
+    assert not geometry.contract and geometry.mid == (0.0, 0.0, -1.0) and geometry.half == pytest.approx(2.2)
+    assert build(cloud, declared=2.19 * box)[0].field.geometry.contract is False  # the cameras' ball has radius 2.2
+    assert build(cloud, declared=2.21 * box)[0].field.geometry.contract is True
+    assert build(cloud, declared=box, contraction="on")[0].field.geometry.contract is True
+    assert build(cloud, declared=4 * box, contraction="off")[0].field.geometry.half == pytest.approx(8.8)
 
 
 @pytest.mark.parametrize(("option", "bounded", "contract"), [("on", True, True), ("off", False, False)])

@@ -21,8 +21,9 @@ from bitymi_ns.host.device import default_device_type, has_cuda_kernels
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
-from bitymi_ns.host.preset import OptimizerOptions, Preset, load_preset
+from bitymi_ns.host.preset import Preset, load_preset
 from bitymi_ns.host.trainer import BitymiTrainer
+from bitymi_ns.train.config import AdamConfig
 
 
 @dataclass
@@ -143,13 +144,13 @@ class BitymiTrainerConfig(TrainerConfig):
 class BitymiAdamConfig(OptimizerConfig):
     """Adam; the learning rate is set at every step from the preset's schedule."""
 
-    betas: tuple[float, float] = (0.9, 0.999)
+    betas: tuple[float, float] = AdamConfig.betas
     """Decay of the running averages."""
     fused: bool = True
     """Update all entries of a tensor in one pass."""
 
 
-def optimizers(options: OptimizerOptions) -> dict[str, Any]:
+def optimizers(options: AdamConfig) -> dict[str, Any]:
     """nerfstudio's optimiser dictionary: one Adam a parameter group, no scheduler (the model sets the rates)."""
 
     def adam(group: str) -> BitymiAdamConfig:

@@ -30,10 +30,10 @@ from bitymi_ns.bake.manifest import MANIFEST, dump
 from bitymi_ns.host.bundle_config import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
-from bitymi_ns.host.metrics import psnr
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import as_float, over_background
 
 INTERRUPTED = 130
@@ -159,9 +159,7 @@ def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera
         baked = render_baked(camera.to("cpu")).clamp(0.0, 1.0)
         photo = over_background(as_float(batch["image"].cpu()), background.cpu())
         mask = batch.get("mask")
-        if mask is not None:
-            mask = mask.cpu()
-            neural, baked, photo = neural * mask, baked * mask, photo * mask
+        mask = None if mask is None else mask.cpu()
         rows.append([psnr(baked, neural, mask), psnr(neural, photo, mask), psnr(baked, photo, mask)])
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
     means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))

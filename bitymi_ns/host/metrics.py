@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import socket
 import time
@@ -14,6 +13,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from bitymi_ns.train.losses import psnr
 
 LPIPS_TIMEOUT = 30.0
 """Seconds to wait for the server that has the weights of LPIPS."""
@@ -39,13 +40,6 @@ def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) 
         if value is not None:
             result[name] = value
     return result
-
-
-def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal to noise ratio in dB, at most 100 (equal images)."""
-    error = (image - reference).square()
-    mse = error.mean() if mask is None else error.sum() / (3 * mask.sum()).clamp(min=1)
-    return min(100.0, -10.0 * math.log10(max(float(mse), 1e-12)))
 
 
 def ssim(image: Tensor, reference: Tensor) -> float:

@@ -13,7 +13,7 @@ import yaml
 
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.config import AdamConfig, TrainConfig
 
 
 class PresetError(ValueError):
@@ -51,16 +51,6 @@ class DataOptions:
 
 
 @dataclass
-class OptimizerOptions:
-    """Adam's constants."""
-
-    eps: float = 1e-15
-    betas: tuple[float, float] = (0.9, 0.999)
-    field_betas: tuple[float, float] = (0.9, 0.99)
-    """Of the texture field, whose gradients are sparse and large early on."""
-
-
-@dataclass
 class Preset:
     """One method: everything its YAML file says."""
 
@@ -68,7 +58,7 @@ class Preset:
     description: str = ""
     trainer: TrainerOptions = field(default_factory=TrainerOptions)
     data: DataOptions = field(default_factory=DataOptions)
-    optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
+    optimizer: AdamConfig = field(default_factory=AdamConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     bake: dict[str, Any] = field(default_factory=dict)

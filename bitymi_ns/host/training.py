@@ -16,9 +16,9 @@ from torch.nn import Parameter
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
 from bitymi_ns.host.errors import fail
-from bitymi_ns.host.metrics import psnr
 from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.trainer import training_step
@@ -188,10 +188,9 @@ class TrainingRun:
             rgb = output.rgb.clamp(0.0, 1.0)
             target = over_background(as_float(batch["image"].to(rgb.device)), background)
             mask = batch.get("mask")
-            if mask is not None:
-                mask = mask.to(rgb.device)
-                rgb, target = rgb * mask, target * mask
-            values.append((psnr(rgb, target, mask), float(len(output.fragments.weight))))
+            values.append(
+                (psnr(rgb, target, None if mask is None else mask.to(rgb.device)), float(len(output.fragments.weight)))
+            )
         first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
         return first, second
 

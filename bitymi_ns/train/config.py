@@ -108,6 +108,18 @@ class LearningRates:
 
 
 @dataclass
+class AdamConfig:
+    """Adam's constants."""
+
+    eps: float = 1e-15
+    """Added to the root of the second moment."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay of the running averages, of the surfels' parameters."""
+    field_betas: tuple[float, float] = (0.9, 0.99)
+    """The same of the texture field, which forgets faster: its gradients are sparse and large early on."""
+
+
+@dataclass
 class TrainConfig:
     """How a scene is trained."""
 

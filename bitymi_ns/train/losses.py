@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -130,3 +131,16 @@ def beta_only_map(output: RenderOutput, beta_raw: Tensor) -> Tensor:
     beta = 4.0 * torch.sigmoid(beta_raw)
     values = beta[output.fragments.surfel.long()].unsqueeze(-1)  # [F, 1]
     return ops.composite(fragments, values).reshape(output.beta.shape)
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal to noise ratio in dB, at most 100 (equal images).
+
+    Args:
+        image, target: [H, W, 3] in [0, 1].
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+    """
+    error = (image - target).square()
+    if mask is not None:
+        error = error[mask.reshape(error.shape[:2])]
+    return min(100.0, -10.0 * math.log10(max(float(error.sum()) / max(1, error.numel()), 1e-10)))

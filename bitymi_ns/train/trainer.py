@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.optim import Adam
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.config import AdamConfig, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import objective
+from bitymi_ns.train.losses import objective, psnr
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.views import (
@@ -32,10 +32,6 @@ from bitymi_ns.train.views import (
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
-
-ADAM_EPS = 1e-15
-FIELD_BETAS = (0.9, 0.99)
-"""The texture field forgets faster: its gradients are sparse and large early on."""
 
 
 @dataclass
@@ -106,12 +102,12 @@ def training_step(
     return terms, output
 
 
-def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = (0.9, 0.999)) -> Adam:
+def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = AdamConfig.betas) -> Adam:
     """Adam with the method's epsilon, fused where torch can do that on the parameters' device."""
     try:
-        return Adam(parameters, lr=0.0, betas=betas, eps=ADAM_EPS, fused=True)
+        return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps, fused=True)
     except RuntimeError:
-        return Adam(parameters, lr=0.0, betas=betas, eps=ADAM_EPS)
+        return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps)
 
 
 def make_optimizers(scene: Scene) -> dict[str, Adam]:
@@ -119,8 +115,8 @@ def make_optimizers(scene: Scene) -> dict[str, Adam]:
     optimizers = {name: adam([p]) for name, p in scene.surfels.items()}
     if scene.field is not None:
         table, *mlp = scene.field.weights
-        optimizers["field_table"] = adam([table], FIELD_BETAS)
-        optimizers["field_mlp"] = adam(mlp, FIELD_BETAS)
+        optimizers["field_table"] = adam([table], AdamConfig.field_betas)
+        optimizers["field_mlp"] = adam(mlp, AdamConfig.field_betas)
     return optimizers
 
 
@@ -219,16 +215,13 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> tuple[
     device = scene.surfels["means"].device
     # evaluation has one background, also when training draws a new one each step
     background = background_color("white" if config.background == "white" else "black", config.seed, 0, device)
-    psnr, fragments = [], []
+    quality, fragments = [], []
     for camera, image, mask in views:
         output = scene.render(camera.to(device), background=background, field_mode="frozen")
         target = over_background(as_float(image.to(device)), background)
-        error = (output.rgb.clamp(0.0, 1.0) - target).square()
-        if mask is not None:
-            error = error[mask.to(device).reshape(error.shape[:2])]
-        psnr.append(-10.0 * math.log10(max(error.mean().item(), 1e-10)))
+        quality.append(psnr(output.rgb.clamp(0.0, 1.0), target, None if mask is None else mask.to(device)))
         fragments.append(len(output.fragments.weight))
-    return (sum(psnr) / len(psnr), sum(fragments) / len(fragments)) if psnr else (math.nan, math.nan)
+    return (sum(quality) / len(quality), sum(fragments) / len(fragments)) if quality else (math.nan, math.nan)
 
 
 def fit(
@@ -261,9 +254,9 @@ def fit(
         if report:
             log.events.append({"step": trainer.step - 1, **report})
         if trainer.step in due:
-            psnr, fragments = evaluate(scene, eval_views, config)
+            quality, fragments = evaluate(scene, eval_views, config)
             times = (trainer.seconds, trainer.cpu_seconds)
-            log.entries.append(LogEntry(trainer.step, *times, len(scene), fragments, trainer.loss, psnr))
+            log.entries.append(LogEntry(trainer.step, *times, len(scene), fragments, trainer.loss, quality))
         if callback is not None:
             callback(trainer, terms, output, report)
     return log

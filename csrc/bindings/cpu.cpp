@@ -183,8 +183,7 @@ void bind(nb::module_& m, const char* suffix) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
             const auto [layers, rows, columns] = atlas_shape;
             const int64_t texels = int64_t(layers) * rows * columns * 4;
-            const Atlas atlas = {layers,
-                                 rows,
+            const Atlas atlas = {rows,
                                  columns,
                                  data_or_null(bytes, texels, "atlas bytes"),
                                  data_or_null(floats, texels, "atlas floats"),

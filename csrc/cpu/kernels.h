@@ -46,7 +46,6 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
 // The fragments of a view, ordered by tile, then front to back by surfel, then by pixel.
 template <class S>
 struct FragmentList {
-  int width = 0, height = 0;
   std::vector<int64_t> tile_start;  // [tiles + 1], in fragments
   int64_t total = 0;
   // filled by trace, read out by copy: one arena a thread
@@ -143,7 +142,7 @@ S ssim(int height, int width, int channels, const S* a, const S* b, S* da);
 
 // Forward-only renderer of a baked scene.
 struct Atlas {
-  int layers, height, width;
+  int height, width;
   const uint8_t* bytes;        // RGBA [layers, height, width, 4], or null
   const float* floats;         // RGBA likewise, or null
   float offset, scale;         // residual = offset + scale * stored

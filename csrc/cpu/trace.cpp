@@ -24,7 +24,6 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
   using P = Pack<S>;
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   const int threads = num_threads();
-  list.width = width, list.height = height;
   if (int(list.arenas.size()) < threads) list.arenas.resize(threads);
   for (auto& a : list.arenas) a.used = 0;
   list.pieces.assign(tiles, {});

@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.host.preset import PresetError, TrainerOptions, load_preset
+from bitymi_ns.host.preset import DataOptions, PresetError, TrainerOptions, load_preset
 from bitymi_ns.presets import preset_names, preset_path
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.config import AdamConfig, TrainConfig
 
 METHODS = ["bitymi", "bitymi-quality", "bitymi-sb", "bitymi-sg", "bitymi-sh", "bitymi-notexture"]
 
@@ -35,6 +35,8 @@ def test_the_default_preset_states_every_option() -> None:
     assert missing_keys(TrainConfig, values["train"]) == []
     assert missing_keys(BakeOptions, values["bake"]) == []
     assert missing_keys(TrainerOptions, values["trainer"]) == []
+    assert missing_keys(AdamConfig, values["optimizer"]) == []
+    assert missing_keys(DataOptions, values["data"]) == []
 
 
 def test_the_default_preset_agrees_with_the_declared_defaults() -> None:
@@ -43,6 +45,8 @@ def test_the_default_preset_agrees_with_the_declared_defaults() -> None:
     assert preset.train == TrainConfig()
     assert BakeOptions(**preset.bake) == BakeOptions()
     assert preset.trainer == TrainerOptions()
+    assert preset.optimizer == AdamConfig()
+    assert preset.data == DataOptions()
 
 
 @pytest.mark.parametrize("name", METHODS)

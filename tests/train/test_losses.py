@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig
-from bitymi_ns.train.losses import beta_only_map, error_weight, falloff, objective, photometric
+from bitymi_ns.train.losses import beta_only_map, error_weight, falloff, objective, photometric, psnr
 
 
 @pytest.fixture
@@ -99,3 +99,15 @@ def test_objective_has_the_terms_that_are_on(make_scene, views):
     same = objective(output, target, beta_raw, LossConfig(falloff_gradient="beta_only"))
     torch.testing.assert_close(same["falloff"], terms["falloff"])
     assert set(objective(output, target, beta_raw, LossConfig(falloff_weight=0.0))) == {"photometric"}
+
+
+def test_psnr_of_a_known_error() -> None:
+    a = torch.full((8, 8, 3), 0.5)
+    assert psnr(a + 0.1, a) == pytest.approx(20.0, abs=1e-4)
+    assert psnr(a, a) == 100.0
+    mask = torch.zeros(8, 8, 1, dtype=torch.bool)
+    mask[:2] = True
+    b = a.clone()
+    b[2:] = 0.0  # where it does not count
+    assert psnr(b, a, mask) == 100.0
+    assert psnr(b, a, ~mask) < 10 and psnr(b, a, torch.zeros_like(mask)) == 100.0

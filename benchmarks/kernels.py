@@ -54,7 +54,7 @@ from common import number, page, publish, say, table
 
 from bitymi_ns import ops
 from bitymi_ns.bake.packing import pack
-from bitymi_ns.ops.trace import tracers
+from bitymi_ns.ops.trace_cpu import tracers
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig

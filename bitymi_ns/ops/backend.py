@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import ModuleType
 from typing import Any
 
@@ -98,6 +98,14 @@ def kernel(name: str, like: Tensor) -> Callable[..., Any]:
 def kernel_class(name: str, like: Tensor) -> type:
     """The class `name` of the kernel module for tensors like `like`; raises what `kernel` raises."""
     return getattr(module(like.device), _name(name, like))
+
+
+def workspace(name: str, like: Tensor, *sizes: int) -> Tensor:
+    """Working memory for the CUDA kernel `name`: [bytes] uint8, as many as its function `name`_workspace asks for."""
+    ask = getattr(module(like.device), _name(f"{name}_workspace", like))
+    with torch.cuda.device(like.device) if like.device.type == "cuda" else nullcontext():
+        size = ask(*sizes)
+    return torch.empty(size, dtype=torch.uint8, device=like.device)
 
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:

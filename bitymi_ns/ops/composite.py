@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import cuda_backend, dense, kernel
 from .project import Projection
 from .trace import Fragments
 
@@ -16,18 +16,20 @@ class _CompositeImage(torch.autograd.Function):
         arrays = fragments.arrays
         g, c = dense(geom, geom), dense(colors, geom)
         image = geom.new_empty(fragments.width * fragments.height, 9 if maps else 5)
-        kernel("composite_forward", geom)(maps, g, fragments.tile_start, *arrays, c, image)
-        ctx.save_for_backward(g, fragments.tile_start, c, *arrays)
-        ctx.maps = maps
+        kernel("composite_forward", geom)(maps, g, fragments.layout, *arrays, c, image)
+        ctx.save_for_backward(g, c, *arrays)
+        ctx.layout, ctx.maps = fragments.layout, maps
         return image
 
     @staticmethod
     def backward(ctx, dimage):
-        geom, tile_start, colors, *arrays = ctx.saved_tensors
+        geom, colors, *arrays = ctx.saved_tensors
         dweight, dcolors, dgeom = torch.empty_like(arrays[2]), torch.empty_like(colors), torch.empty_like(geom)
         ddepth = torch.empty_like(arrays[4]) if ctx.maps else None
+        # the CUDA kernel puts what a pair of surfel and tile adds to its surfel there
+        partial = (geom.new_empty(ctx.layout.pairs, 4 if ctx.maps else 1),) if cuda_backend(geom.device) else ()
         kernel("composite_backward", geom)(
-            ctx.maps, geom, tile_start, *arrays, colors, dense(dimage, geom), dweight, dcolors, ddepth, dgeom
+            ctx.maps, geom, ctx.layout, *arrays, colors, dense(dimage, geom), *partial, dweight, dcolors, ddepth, dgeom
         )
         return dweight, ddepth, dgeom, dcolors, None, None
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import threading
-from collections import defaultdict
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import dense, function, kernel, kernel_class
+from . import trace_cpu, trace_cuda
+from .backend import cuda_backend, dense, function
 from .project import GEOM, Projection
 
 
@@ -26,6 +26,8 @@ class Fragments:
         sigma: [F] effective opacity, negative in the low-pass branch.
         tile_start: [tiles + 1] int64, where each tile's fragments begin.
         width, height: of the image, pixels.
+        layout: how kernels find their way in the list: tile_start for those of the CPU, for those of CUDA a handle
+            on the pairs of surfel and tile (csrc/cuda/pairs.h).
     """
 
     weight: Tensor
@@ -37,6 +39,7 @@ class Fragments:
     tile_start: Tensor
     width: int
     height: int
+    layout: Any
 
     def __len__(self) -> int:
         return self.weight.shape[0]
@@ -52,62 +55,26 @@ class Fragments:
         return count.to(torch.int32).view(self.height, self.width, 1)
 
 
-class _Tracers:
-    """Tracers keep their memory from view to view; one is used by one thread at a time."""
-
-    def __init__(self) -> None:
-        self._idle: dict[object, list] = defaultdict(list)
-        self._lock = threading.Lock()
-
-    def take(self, like: Tensor):
-        make = kernel_class("Trace", like)
-        with self._lock:
-            return self._idle[make].pop() if self._idle[make] else make()
-
-    def give(self, tracer) -> None:
-        with self._lock:
-            self._idle[type(tracer)].append(tracer)
-
-
-tracers = _Tracers()
-
-
 class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, projection, rim):
-        camera, near = projection.camera, projection.near
-        tracer = tracers.take(geom)
-        n = tracer.run(geom.detach(), projection.radii, camera.width, camera.height, near)
-        ints = dict(dtype=torch.int32, device=geom.device)
-        surfel, pixel = torch.empty(n, **ints), torch.empty(n, **ints)
-        weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
-        uv = geom.new_empty(2, n)
-        tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64, device=geom.device)
-        tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
-        tracers.give(tracer)
-        ctx.save_for_backward(geom, tile_start, surfel, pixel, weight, uv, depth, sigma)
-        ctx.projection, ctx.rim = projection, rim
+        find = trace_cuda.find if cuda_backend(geom.device) else trace_cpu.find
+        layout, tile_start, *arrays = find(geom.detach(), projection)
+        surfel, pixel, weight, uv, depth, sigma = arrays
+        ctx.save_for_backward(geom, *arrays)
+        ctx.projection, ctx.rim, ctx.layout = projection, rim, layout
         ctx.mark_non_differentiable(surfel, pixel, sigma, tile_start)
         ctx.set_materialize_grads(False)
-        return weight, uv, depth, surfel, pixel, sigma, tile_start
+        return weight, uv, depth, surfel, pixel, sigma, tile_start, layout
 
     @staticmethod
     def backward(ctx, dweight, duv, ddepth, *_):
-        geom, tile_start, *arrays = ctx.saved_tensors
+        geom, *arrays = ctx.saved_tensors
         projection = ctx.projection
         grads = [None if g is None else dense(g, geom) for g in (dweight, duv, ddepth)]
         dgeom, absgrad = torch.empty_like(geom), geom.new_empty(geom.shape[0], 2)
-        kernel("trace_backward", geom)(
-            geom.detach(),
-            projection.near,
-            ctx.rim,
-            projection.camera.width,
-            tile_start,
-            *arrays,
-            *grads,
-            dgeom,
-            absgrad,
-        )
+        back = trace_cuda.backward if cuda_backend(geom.device) else trace_cpu.backward
+        back(geom.detach(), projection, ctx.rim, ctx.layout, arrays, grads, dgeom, absgrad)
         projection.mean2d_grad, projection.mean2d_absgrad = dgeom[:, :2], absgrad
         return dgeom, None, None
 
@@ -125,9 +92,9 @@ def trace(projection: Projection, rim: float = 1e-3) -> Fragments:
     """
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
-    weight, uv, depth, surfel, pixel, sigma, tile_start = _Trace.apply(projection.geom, projection, rim)
+    weight, uv, depth, surfel, pixel, sigma, tile_start, layout = _Trace.apply(projection.geom, projection, rim)
     camera = projection.camera
-    return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height)
+    return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height, layout)
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
@@ -145,5 +112,6 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
     counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    function("masked_counts", counts.device)(fragments.surfel, fragments.pixel, flat, counts)
+    where = (fragments.layout,) if cuda_backend(counts.device) else (fragments.surfel, fragments.pixel)
+    function("masked_counts", counts.device)(*where, flat, counts)
     return counts

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops import project, view_color
-from bitymi_ns.ops.trace import tracers
+from bitymi_ns.ops.trace_cpu import tracers
 
 from .camera import Camera
 

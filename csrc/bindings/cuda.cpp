@@ -13,4 +13,5 @@ NB_MODULE(_cuda, m) {
   m.doc() = "CUDA kernels: see bitymi_ns.ops for their meaning.";
 #endif
   bt::cuda::bind_project(m);
+  bt::cuda::bind_trace(m);
 }

@@ -111,4 +111,28 @@ BT_HD void row_interval(const Extent& e, double lo, double hi, double& x0, doubl
   }
 }
 
+// Which tiles: rows first, then the columns of a row.
+constexpr int kTile = 16;  // pixels a side
+BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
+
+struct TileSpan {
+  int first, last;  // none when first > last
+};
+// The surfel has radii above 0: its box meets the image.
+template <class F>
+BT_HD TileSpan tile_rows(const Extent& e, const F* geom, int height) {
+  const double cy = double(geom[kCy]) - 0.5;  // pixel centre i + 0.5 has the offset i + 0.5 - c
+  const int last = int(min_(double(height), ceil(cy + e.y1))) / kTile;
+  return {int(max_(0.0, floor_(cy + e.y0))) / kTile, min_(tiles_across(height) - 1, last)};
+}
+template <class F>
+BT_HD TileSpan tile_columns(const Extent& e, const F* geom, int row, int width) {
+  const double cx = double(geom[kCx]) - 0.5, cy = double(geom[kCy]) - 0.5;
+  double x0, x1;
+  row_interval(e, row * kTile - cy, row * kTile + kTile - 1 - cy, x0, x1);
+  if (x0 > x1 || cx + x1 < 0 || cx + x0 > width - 1) return {0, -1};
+  const int last = int(min_(double(width), ceil(cx + x1))) / kTile;
+  return {int(max_(0.0, floor_(cx + x0))) / kTile, min_(tiles_across(width) - 1, last)};
+}
+
 }  // namespace bt

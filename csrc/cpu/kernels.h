@@ -6,11 +6,9 @@
 #include <memory>
 #include <vector>
 
-#include "core/surfel.h"
+#include "core/bounds.h"
 
 namespace bt {
-
-constexpr int kTile = 16;  // pixels a side
 
 int num_threads();
 void set_num_threads(int n);

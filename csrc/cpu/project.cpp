@@ -81,26 +81,19 @@ void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom
 namespace {
 // Calls fn(tile) for every tile that the surfel may touch.
 template <class S, class F>
-void for_tiles(const S* g, int width, int height, int tiles_x, int tiles_y, F&& fn) {
+void for_tiles(const S* g, int width, int height, F&& fn) {
   const Extent e = extent(g);
-  // pixel centres i + 0.5 with offset i + 0.5 - c
-  const double cx = double(g[kCx]) - 0.5, cy = double(g[kCy]) - 0.5;
-  const int top = std::max(0, int(std::max(0.0, std::floor(cy + e.y0))) / kTile);
-  const int bottom = std::min(tiles_y - 1, int(std::min(double(height), std::ceil(cy + e.y1))) / kTile);
-  for (int ty = top; ty <= bottom; ++ty) {
-    double x0, x1;
-    row_interval(e, ty * kTile - cy, ty * kTile + kTile - 1 - cy, x0, x1);
-    if (x0 > x1 || cx + x1 < 0 || cx + x0 > width - 1) continue;
-    const int left = int(std::max(0.0, std::floor(cx + x0))) / kTile;
-    const int right = std::min(tiles_x - 1, int(std::min(double(width), std::ceil(cx + x1))) / kTile);
-    for (int tx = left; tx <= right; ++tx) fn(ty * tiles_x + tx);
+  const TileSpan rows = tile_rows(e, g, height);
+  for (int ty = rows.first; ty <= rows.last; ++ty) {
+    const TileSpan columns = tile_columns(e, g, ty, width);
+    for (int tx = columns.first; tx <= columns.last; ++tx) fn(ty * tiles_across(width) + tx);
   }
 }
 }  // namespace
 
 template <class S>
 void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
-  bins.tiles_x = (width + kTile - 1) / kTile, bins.tiles_y = (height + kTile - 1) / kTile;
+  bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   // front to back once for all tiles; equal depths keep their order
   std::vector<std::pair<S, int32_t>> order;
@@ -120,7 +113,7 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
     for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
       const size_t head = list.size();
       list.push_back(0);
-      for_tiles(geom + int64_t(order[k].second) * kGeom, width, height, bins.tiles_x, bins.tiles_y, [&](int tile) {
+      for_tiles(geom + int64_t(order[k].second) * kGeom, width, height, [&](int tile) {
         list.push_back(tile);
         ++at[t][tile];
       });

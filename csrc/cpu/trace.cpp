@@ -90,7 +90,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
                     const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad) {
   using P = Pack<S>;
   const int64_t total = tile_start[tiles];
-  const int tiles_x = (width + kTile - 1) / kTile;
+  const int tiles_x = tiles_across(width);
   const int most =
       int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max<int64_t>(n, 1) / kGeom)));
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));

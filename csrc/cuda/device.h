@@ -27,6 +27,8 @@ inline void check(cudaError_t error, const char* what) {
     ::bt::cuda::check(cudaGetLastError(), #kernel);                                        \
   } while (0)
 
+#define BT_UNROLL _Pragma("unroll")
+
 #define BT_DYNAMIC_SHARED(Type, name)                               \
   extern __shared__ __align__(16) unsigned char bt_shared_memory[]; \
   Type* name = reinterpret_cast<Type*>(bt_shared_memory)
@@ -37,6 +39,8 @@ inline void check(cudaError_t error, const char* what) {
 
 #define BT_LAUNCH(kernel, grid, block, shared, stream, ...) \
   ((void)(stream), ::bt::emulator::launch(#kernel, (grid), (block), (shared), [=] { kernel(__VA_ARGS__); }))
+
+#define BT_UNROLL
 
 #define BT_DYNAMIC_SHARED(Type, name) Type* name = static_cast<Type*>(::bt::emulator::dynamic_shared())
 
@@ -49,6 +53,18 @@ using Stream = void*;
 
 constexpr int kWarp = 32;
 constexpr unsigned kFullMask = 0xffffffffu;
+
+// Sets memory to zero bytes, which are zeros of every number type.
+template <class T>
+void fill_zero(T* to, int64_t count, Stream stream) {
+  if (count <= 0) return;
+#if defined(__CUDACC__)
+  check(cudaMemsetAsync(to, 0, size_t(count) * sizeof(T), static_cast<cudaStream_t>(stream)), "clear memory");
+#else
+  (void)stream;
+  for (int64_t i = 0; i < count; ++i) to[i] = T(0);
+#endif
+}
 
 constexpr int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
 

@@ -1,0 +1,70 @@
+"""The fragment list by the CPU kernels."""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .backend import kernel, kernel_class
+from .project import Projection
+
+
+class _Tracers:
+    """Tracers keep their memory from view to view; one is used by one thread at a time."""
+
+    def __init__(self) -> None:
+        self._idle: dict[object, list] = defaultdict(list)
+        self._lock = threading.Lock()
+
+    def take(self, like: Tensor):
+        make = kernel_class("Trace", like)
+        with self._lock:
+            return self._idle[make].pop() if self._idle[make] else make()
+
+    def give(self, tracer) -> None:
+        with self._lock:
+            self._idle[type(tracer)].append(tracer)
+
+
+tracers = _Tracers()
+
+
+def find(geom: Tensor, projection: Projection) -> tuple[Tensor, ...]:
+    """The fragments of a view.
+
+    Args:
+        geom: [N, 16] without graph.
+        projection: the view's.
+
+    Returns:
+        layout (tile_start), tile_start, surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
+    """
+    camera = projection.camera
+    tracer = tracers.take(geom)
+    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near)
+    surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
+    weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
+    uv = geom.new_empty(2, n)
+    tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
+    tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
+    tracers.give(tracer)
+    return tile_start, tile_start, surfel, pixel, weight, uv, depth, sigma
+
+
+def backward(
+    geom: Tensor,
+    projection: Projection,
+    rim: float,
+    tile_start: Tensor,
+    arrays: Sequence[Tensor],
+    grads: Sequence[Tensor | None],
+    dgeom: Tensor,
+    absgrad: Tensor,
+) -> None:
+    """Writes dgeom [N, 16] and absgrad [N, 2] from the gradients of weight, uv and depth (None = zero)."""
+    width = projection.camera.width
+    kernel("trace_backward", geom)(geom, projection.near, rim, width, tile_start, *arrays, *grads, dgeom, absgrad)

@@ -1,0 +1,180 @@
+// The fragment list of a view, and how kernels find their way in it.
+//
+// A pair is a surfel and a tile that it may touch. Pairs have two orders:
+//   list order  by tile, then front to back: the order of the fragments. A pair's fragments are one run of the list,
+//               offsets[k] to offsets[k + 1] - 1, its tile's pairs are tile_pairs[tile] to tile_pairs[tile + 1] - 1.
+//   slots       by surfel, front to back, then by tile. slot[k] is the slot of pair k; the surfel order[r] has the
+//   slots
+//               slot_start[r] to slot_start[r + 1] - 1. A kernel writes what a pair adds to its surfel into the pair's
+//               slot, and sum_slots adds a surfel's slots in order: no atomics, and the same bits every time.
+//
+// A tile is a block of 8 warps, a warp 8 x 4 pixels, a lane a pixel. masks[warp][k] has a bit for every pixel of the
+// warp that blends pair k; a run has the fragments of warp 0 first, in a warp by lane. So a fragment's place is
+// offsets[k] + the bits of lower warps + the bits of lower lanes, and no kernel has to search.
+#pragma once
+
+#include "core/bounds.h"
+#include "cuda/device.h"
+
+namespace bt::cuda {
+
+constexpr int kTileThreads = kTile * kTile, kTileWarps = kTileThreads / kWarp;
+constexpr int kWarpWidth = 8, kWarpHeight = 4;
+
+struct Pairs {
+  int width, height;          // of the image
+  int64_t surfels, pairs;     // counts
+  const int32_t* surfel;      // [pairs] list order
+  const int32_t* slot;        // [pairs] list order
+  const uint32_t* masks;      // [kTileWarps, pairs] list order
+  const int64_t* offsets;     // [pairs + 1] list order
+  const int64_t* tile_pairs;  // [tiles + 1]
+  const int32_t* order;       // [surfels] front to back
+  const int64_t* slot_start;  // [surfels + 1]
+  int64_t tiles() const { return int64_t(tiles_across(width)) * tiles_across(height); }
+};
+
+template <class S>
+struct FragmentArrays {
+  int64_t total;
+  int32_t *surfel, *pixel;
+  S *weight, *uv, *depth, *sigma;  // uv [2, total]; sigma is negative in the low-pass branch
+};
+
+// Where a thread of a tile's block stands.
+struct Spot {
+  int warp, lane;
+  int left, top;  // first pixel of the warp
+  int x, y;       // the thread's pixel; may lie outside the image
+};
+__device__ inline Spot spot(int width) {
+  Spot s;
+  s.warp = int(threadIdx.x) / kWarp, s.lane = int(threadIdx.x) % kWarp;
+  const int across = tiles_across(width), tile = int(blockIdx.x);
+  s.left = tile % across * kTile + s.warp % (kTile / kWarpWidth) * kWarpWidth;
+  s.top = tile / across * kTile + s.warp / (kTile / kWarpWidth) * kWarpHeight;
+  s.x = s.left + s.lane % kWarpWidth, s.y = s.top + s.lane / kWarpWidth;
+  return s;
+}
+
+// The first 12 columns of a row of geom, by the widest loads: all lanes of a warp read the same row.
+constexpr int kShape = kBeta + 1;
+template <class S>
+__device__ inline void load_shape(const S* row, S* g) {
+#if defined(__CUDACC__)
+  constexpr int kWide = 16 / sizeof(S);
+  struct alignas(16) Wide {
+    S v[kWide];
+  };
+#pragma unroll
+  for (int i = 0; i < kShape / kWide; ++i) {
+    const Wide w = reinterpret_cast<const Wide*>(row)[i];
+#pragma unroll
+    for (int k = 0; k < kWide; ++k) g[kWide * i + k] = w.v[k];
+  }
+#else
+  for (int i = 0; i < kShape; ++i) g[i] = row[i];
+#endif
+}
+
+// Visits the pairs of a tile that have a fragment in the calling warp, front to back or back to front. Every lane calls
+// load(k, surfel, mine, i) and later use(what load gave): `mine` says whether the lane's pixel has a fragment of pair
+// k, i is its place in the list. kAhead loads are under way before the first is used: a warp has about ten fragments of
+// a pair, far too few bytes to keep the memory busy one at a time. Warps go their own way: nothing waits for the block.
+template <int kAhead, bool kBack, class Load, class Use>
+__device__ inline void walk(const Pairs& p, const Spot& s, Load&& load, Use&& use) {
+  const int64_t begin = p.tile_pairs[blockIdx.x], end = p.tile_pairs[blockIdx.x + 1];
+  const int64_t batches = ceil_div(end - begin, kWarp);
+  const unsigned below = (1u << s.lane) - 1;
+  for (int64_t b = 0; b < batches; ++b) {
+    // a lane a pair: marks, and where the warp's fragments begin
+    const int64_t first = begin + kWarp * (kBack ? batches - 1 - b : b), own = first + s.lane;
+    uint32_t mark = 0;
+    int32_t id = 0;
+    int64_t from = 0;
+    if (own < end && (mark = p.masks[s.warp * p.pairs + own])) {
+      id = p.surfel[own], from = p.offsets[own];
+      for (int w = 0; w < s.warp; ++w) from += __popc(p.masks[w * p.pairs + own]);
+    }
+    unsigned todo = __ballot_sync(kFullMask, mark != 0);
+    while (todo) {
+      decltype(load(first, id, true, from)) value[kAhead];
+      BT_UNROLL
+      for (int a = 0; a < kAhead; ++a) {
+        const bool some = todo != 0;
+        const int j = !some ? 0 : kBack ? kWarp - 1 - __clz(int(todo)) : __ffs(int(todo)) - 1;
+        if (some) todo &= ~(1u << j);
+        const unsigned taken = __shfl_sync(kFullMask, mark, j);
+        const int64_t i = __shfl_sync(kFullMask, from, j) + __popc(taken & below);
+        value[a] = load(first + j, __shfl_sync(kFullMask, id, j), some && (taken >> s.lane & 1u), i);
+      }
+      BT_UNROLL
+      for (int a = 0; a < kAhead; ++a) use(value[a]);
+    }
+  }
+}
+
+// The other way through the list: kRunLanes lanes a pair, which take the fragments of its run in turns. Fragments of a
+// pair are about thirty on average: 16 lanes are busier than 32, and share a row of geom and one sum.
+constexpr int kRunLanes = 16, kRunThreads = 128;
+struct Run {
+  bool some;  // false behind the last pair: the lane has nothing to do but takes part in warp steps
+  int lane;   // of kRunLanes
+  int64_t k, begin, end;
+};
+__device__ inline Run run(const Pairs& p) {
+  Run r;
+  r.lane = int(threadIdx.x) % kRunLanes;
+  r.k = int64_t(blockIdx.x) * (kRunThreads / kRunLanes) + threadIdx.x / kRunLanes;
+  r.some = r.k < p.pairs;
+  r.begin = r.some ? p.offsets[r.k] : 0, r.end = r.some ? p.offsets[r.k + 1] : 0;
+  return r;
+}
+inline dim3 run_blocks(const Pairs& p) { return dim3(unsigned(ceil_div(p.pairs, kRunThreads / kRunLanes))); }
+
+// Sums of kColumns values each over the lanes of a run: lane c % kColumns gets that of column c. Each step halves both
+// the lanes that differ and the columns that a lane still keeps: 15 shuffles for 16 columns instead of 64.
+template <int kColumns, class S>
+__device__ inline S sum_over_run(S (&v)[kColumns], int lane) {
+  static_assert((kColumns & (kColumns - 1)) == 0 && kColumns <= kRunLanes);
+  BT_UNROLL
+  for (int step = kRunLanes / 2; step >= kColumns; step /= 2) {
+    BT_UNROLL
+    for (int c = 0; c < kColumns; ++c) v[c] += __shfl_xor_sync(kFullMask, v[c], step);
+  }
+  BT_UNROLL
+  for (int step = kColumns / 2; step > 0; step /= 2) {
+    const bool upper = lane & step;
+    BT_UNROLL
+    for (int c = 0; c < step; ++c) {
+      const S mine = upper ? v[c + step] : v[c], other = upper ? v[c] : v[c + step];
+      v[c] = mine + __shfl_xor_sync(kFullMask, other, step);
+    }
+  }
+  return v[0];
+}
+
+// put(surfel, column, sum) for every surfel and column of partial [pairs, kColumns], by slot. A warp a surfel: lanes
+// are columns, and groups of lanes take slots in turns.
+constexpr int kSlotThreads = 128;
+template <int kColumns, class S, class Put>
+__global__ void __launch_bounds__(kSlotThreads) sum_slots_kernel(Pairs p, const S* partial, Put put) {
+  constexpr int kGroups = kWarp / kColumns;
+  const int lane = int(threadIdx.x) % kWarp, column = lane % kColumns;
+  const int64_t r = int64_t(blockIdx.x) * (kSlotThreads / kWarp) + threadIdx.x / kWarp;
+  if (r >= p.surfels) return;  // whole warps
+  const int64_t end = p.slot_start[r + 1];
+  S sum = S(0);
+  for (int64_t i = p.slot_start[r] + lane / kColumns; i < end; i += kGroups) sum += partial[i * kColumns + column];
+  for (int step = kWarp / 2; step >= kColumns; step /= 2) sum += __shfl_xor_sync(kFullMask, sum, step);
+  if (lane < kColumns) put(p.order[r], column, sum);
+}
+template <int kColumns, class S, class Put>
+void sum_slots(const Pairs& p, const S* partial, Put put, Stream stream) {
+  static_assert((kColumns & (kColumns - 1)) == 0 && kColumns <= kWarp);
+  if (!p.surfels) return;
+  BT_LAUNCH((sum_slots_kernel<kColumns, S, Put>), dim3(unsigned(ceil_div(p.surfels, kSlotThreads / kWarp))),
+            dim3(kSlotThreads), 0, stream, p, partial, put);
+}
+
+}  // namespace bt::cuda

@@ -1,0 +1,21 @@
+// Sorting and scanning by CUB; on the host plain loops with the same contract.
+#pragma once
+
+#include <cstdint>
+
+#include "cuda/device.h"
+
+namespace bt::cuda {
+
+// Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint32_t or uint64_t; n below 2^31.
+template <class Key>
+int64_t sort_workspace(int64_t n, int bits);
+template <class Key>
+void sort_pairs(const Key* keys, Key* keys_out, const int32_t* values, int32_t* values_out, int64_t n, int bits,
+                void* workspace, int64_t workspace_size, Stream stream);
+
+// out[i] = in[0] + ... + in[i - 1], summed in 64 bits; n below 2^31.
+int64_t scan_workspace(int64_t n);
+void exclusive_sum(const int32_t* in, int64_t* out, int64_t n, void* workspace, int64_t workspace_size, Stream stream);
+
+}  // namespace bt::cuda

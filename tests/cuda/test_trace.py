@@ -1,0 +1,276 @@
+"""Visibility and compositing by the CUDA kernels: against the golden renders and against the CPU kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.reference import render as reference_render
+from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.scene import Camera
+from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, load_golden, random_scene
+
+CpuContext = Callable[[], AbstractContextManager[None]]
+EXACT_RIM = 1e-12  # the references bound nothing
+
+
+@dataclass
+class Rendered:
+    """What is compared; all on the CPU, in double."""
+
+    fragments: ops.Fragments
+    image: Tensor
+    leaves: dict[str, Tensor]
+    mean2d: tuple[Tensor, Tensor]
+
+
+def render(
+    case: SceneCase,
+    dtype: torch.dtype,
+    device: torch.device,
+    rim: float = EXACT_RIM,
+    maps: bool = True,
+    loss: Callable[[Tensor], Tensor] | None = None,
+) -> Rendered:
+    """A view and the gradients of a loss of its image; without a loss, of fixed random directions for the image and for
+    uv and depth of the fragments."""
+    leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
+    camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera)
+    fragments = ops.trace(projection, rim)
+    directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
+    base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions) + 0.5
+    rows = fragments.surfel.long()
+    image = ops.composite_image(fragments, projection, base.clamp(min=0)[rows], maps)
+    if loss is None:
+        # directions by pixel and surfel: they do not depend on the order in which the list has them
+        by_fragment = torch.sin(fragments.pixel * 0.7 + fragments.surfel * 1.3).to(dtype)
+        by_pixel = torch.cos(torch.arange(image.numel(), device=device) * 1.7).to(dtype).view_as(image)
+        total = (image * by_pixel).sum() + (fragments.uv * by_fragment).sum() + (fragments.depth * by_fragment).sum()
+    else:
+        total = loss(image)
+    total.backward()
+    grads = {key: leaf.grad.cpu().double() for key, leaf in leaves.items()}
+    found = (projection.mean2d_grad, projection.mean2d_absgrad)
+    return Rendered(fragments, image.detach().cpu().double(), grads, tuple(t.cpu().double() for t in found))
+
+
+def by_pixel_and_surfel(fragments: ops.Fragments) -> list[Tensor]:
+    """The list in an order of its own: sorted key, weight, uv, depth, sigma, in double on the CPU."""
+    key = fragments.pixel.cpu().long() * (1 << 32) + fragments.surfel.cpu().long()
+    order = torch.argsort(key)
+    values = (fragments.weight, *fragments.uv, fragments.depth, fragments.sigma)
+    return [key[order], *(value.detach().cpu().double()[order] for value in values)]
+
+
+def relative(a: Tensor, b: Tensor) -> float:
+    """Largest error over the largest value; absolute where all values are 0."""
+    if not b.numel():
+        return 0.0
+    error, scale = (a - b).abs().max().item(), b.abs().max().item()
+    return error / scale if scale > 0 else error
+
+
+def compare(got: Rendered, want: Rendered, image: float = 1e-12, gradient: float = 1e-10) -> None:
+    """The same fragments with the same numbers, the same images and gradients."""
+    for a, b in zip(by_pixel_and_surfel(got.fragments), by_pixel_and_surfel(want.fragments), strict=True):
+        assert a.shape == b.shape
+        assert relative(a.double(), b.double()) <= image
+    assert relative(got.image, want.image) <= image
+    for key, value in want.leaves.items():
+        assert relative(got.leaves[key], value) <= gradient, key
+    for a, b in zip(got.mean2d, want.mean2d, strict=True):
+        assert relative(a, b) <= gradient
+
+
+def check_order(fragments: ops.Fragments) -> None:
+    """By tile, in a tile one run a surfel, and the tiles' places in the list are right."""
+    x, y = fragments.pixel.cpu() % fragments.width, fragments.pixel.cpu() // fragments.width
+    across = -(-fragments.width // 16)
+    tile = (y // 16) * across + x // 16
+    assert (tile.diff() >= 0).all()
+    tiles = across * -(-fragments.height // 16)
+    starts = torch.searchsorted(tile.contiguous(), torch.arange(tiles + 1))
+    assert torch.equal(fragments.tile_start.cpu(), starts)
+    run = torch.stack([tile, fragments.surfel.cpu().long()])
+    assert torch.unique_consecutive(run, dim=1).shape[1] == torch.unique(run, dim=1).shape[1]
+
+
+@pytest.mark.parametrize("name", [name for name in GOLDEN_NAMES if name != "textured"])
+def test_golden_images_and_gradients(name: str, device: torch.device) -> None:
+    golden = load_golden(name)
+    shape = (golden.height, golden.width, -1)
+    weights = {key: value.to(device) for key, value in golden.loss_weights.items()}
+
+    def images(flat: Tensor) -> dict[str, Tensor]:
+        image = flat.view(shape)
+        rgb = image[..., :3] + (1 - image[..., 3:4]) * golden.background.to(flat)
+        return {"rgb": rgb, "alpha": image[..., 3], "beta_map": image[..., 4], "depth": image[..., 5]}
+
+    def loss(flat: Tensor) -> Tensor:
+        return sum((value * weights[key]).sum() for key, value in images(flat).items())
+
+    got = render(golden, torch.float64, device, loss=loss)
+    for key, image in images(got.image).items():
+        assert relative(image, golden.outputs[key]) < 1e-12, key
+    assert torch.equal(got.fragments.overdraw().cpu()[..., 0].double(), golden.outputs["overdraw"].double())
+    for key, want in golden.grads.items():
+        assert relative(got.leaves[key], want) < 1e-10, key
+    check_order(got.fragments)
+
+
+@pytest.mark.parametrize("maps", [True, False])
+@pytest.mark.parametrize(("seed", "width", "height"), [(0, 70, 50), (1, 16, 16), (2, 33, 17), (3, 8, 40)])
+def test_random_scenes_equal_those_of_the_cpu(
+    seed: int, width: int, height: int, maps: bool, device: torch.device, cpu: CpuContext
+) -> None:
+    case = random_scene(60, seed, width, height)
+    got = render(case, torch.float64, device, maps=maps)
+    with cpu():
+        want = render(case, torch.float64, torch.device("cpu"), maps=maps)
+    compare(got, want)
+    check_order(got.fragments)
+
+
+def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
+    case = random_scene(60, 5, 70, 50)
+    got = render(case, torch.float32, device, rim=1e-3)
+    with cpu():
+        want = render(case, torch.float64, torch.device("cpu"), rim=1e-3)
+    assert got.fragments.weight.dtype == torch.float32
+    error = (got.image - want.image).abs() / want.image.abs().max()
+    assert (error < 1e-5).double().mean() > 0.999  # the thresholds of alpha and transmittance may flip
+    for key, value in want.leaves.items():
+        error = (got.leaves[key] - value).abs() / value.abs().max()
+        assert (error < 1e-4).double().mean() >= 0.97 and error.max() < 1e-2, key
+
+
+def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
+    device: torch.device, cpu: CpuContext
+) -> None:
+    """Opaque layers close every pixel long before the list of the tile ends; translucent ones go through all of it."""
+    case = random_scene(150, 7, 20, 20, scale=1.0)
+    for logit, closes in ((3.0, True), (-4.0, False)):
+        case.params["opacity_logits"] = torch.full((150,), logit, dtype=torch.float64)
+        got = render(case, torch.float64, device)
+        with cpu():
+            want = render(case, torch.float64, torch.device("cpu"))
+        compare(got, want)
+        assert got.fragments.layout.pairs > 3 * 64
+        alpha = got.image[:, 3]
+        assert alpha.min() > 0.99 if closes else alpha.max() < 0.9
+
+
+def extreme() -> list[SceneCase]:
+    """Extreme scenes; the crowd on one pixel is thinned out, for the emulation's sake."""
+    cases = []
+    for case in extreme_scenes():
+        if len(case.params["means"]) > 400:
+            case = replace(case, params={key: value[:400] for key, value in case.params.items()})
+        cases.append(case)
+    return cases
+
+
+EXTREME = extreme()
+
+
+@pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
+def test_extreme_scenes_equal_those_of_the_cpu(case: SceneCase, device: torch.device, cpu: CpuContext) -> None:
+    maps = case.name != "edge_on"  # which side of a disc faces the camera is there decided by rounding
+    got = render(case, torch.float64, device, rim=1e-3, maps=maps)
+    with cpu():
+        want = render(case, torch.float64, torch.device("cpu"), rim=1e-3, maps=maps)
+    assert got.image.isfinite().all()
+    assert all(value.isfinite().all() for value in got.leaves.values())
+    compare(got, want, image=1e-9, gradient=1e-7)
+
+
+def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> None:
+    case = random_scene(70, 3, 20, 20, scale=2.0)
+    same = {key: value[:1].expand_as(value).clone() for key, value in case.params.items()}
+    same["opacity_logits"][:] = -5.0
+    fragments = render(replace(case, params=same), torch.float64, device).fragments
+    runs = torch.unique_consecutive(fragments.surfel.cpu())
+    assert len(runs) > 70
+    step = runs.diff()
+    assert ((step == 1) | (runs[1:] == 0)).all()  # 0, 1, 2, ... again in every tile
+
+
+def test_a_surfel_over_the_whole_screen_is_listed_by_its_warp(device: torch.device, cpu: CpuContext) -> None:
+    case = random_scene(3, 0, 300, 80, scale=30.0)  # 95 tiles
+    got = render(case, torch.float64, device)
+    with cpu():
+        want = render(case, torch.float64, torch.device("cpu"))
+    assert got.fragments.layout.pairs > 64
+    compare(got, want)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_every_order_of_the_threads_gives_the_same_bits(dtype: torch.dtype, device: torch.device) -> None:
+    case = random_scene(50, 11, 40, 30)
+    results = []
+    for seed in (2, 3, 4):
+        if device.type == "cuda":
+            results.append(render(case, dtype, device))
+            continue
+        with emulated_cuda(seed):
+            results.append(render(case, dtype, device))
+    first = results[0]
+    for other in results[1:]:
+        for a, b in zip(first.fragments.arrays, other.fragments.arrays, strict=True):
+            assert torch.equal(a, b)
+        assert torch.equal(first.image, other.image)
+        for key, value in first.leaves.items():
+            assert torch.equal(value, other.leaves[key]), key
+        assert all(torch.equal(a, b) for a, b in zip(first.mean2d, other.mean2d, strict=True))
+
+
+def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, cpu: CpuContext) -> None:
+    case = random_scene(30, 12, 24, 20)
+
+    def run(where: torch.device) -> list[Tensor]:
+        result = []
+        for part in ("weight", "uv", "depth"):
+            leaves = [case.params[key].to(where).clone().requires_grad_() for key in SURFEL_KEYS]
+            camera = Camera(case.viewmat, case.K, case.width, case.height)
+            fragments = ops.trace(ops.project(*leaves, camera))
+            direction = torch.sin(fragments.pixel * 0.7 + fragments.surfel * 1.3).double()
+            (getattr(fragments, part) * direction).sum().backward()
+            result += [leaf.grad.cpu() for leaf in leaves]
+        return result
+
+    got = run(device)
+    with cpu():
+        want = run(torch.device("cpu"))
+    for a, b in zip(got, want, strict=True):
+        assert relative(a, b) < 1e-10
+
+
+def test_masked_counts(device: torch.device) -> None:
+    case = random_scene(40, 4, 37, 29)
+    fragments = render(case, torch.float32, device, rim=1e-3).fragments
+    generator = torch.Generator().manual_seed(0)
+    for share in (0.5, 0.01, 0.0):
+        mask = (torch.rand(37 * 29, generator=generator) < share).to(device)
+        counts = ops.masked_counts(fragments, mask, 40)
+        on_mask = fragments.surfel[mask[fragments.pixel.long()]].long()
+        assert torch.equal(counts.long(), torch.bincount(on_mask, minlength=40))
+
+
+def test_wrong_arrays_are_refused(device: torch.device) -> None:
+    case = random_scene(10, 0, 20, 20)
+    leaves = [case.params[key].to(device) for key in SURFEL_KEYS]
+    projection = ops.project(*leaves, Camera(case.viewmat, case.K, 20, 20))
+    fragments = ops.trace(projection)
+    with pytest.raises(ValueError, match="colors has"):
+        ops.composite_image(fragments, projection, torch.zeros(3, 3, device=device).double())
+    shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
+    with pytest.raises(ValueError, match="16 bytes"):
+        ops.trace(replace(projection, geom=shifted))

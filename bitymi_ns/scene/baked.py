@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.ops import project, view_color
+from bitymi_ns.ops.backend import module
 from bitymi_ns.ops.trace_cpu import tracers
 
 from .camera import Camera
@@ -24,7 +25,7 @@ class BakedOutput:
 
     rgb: Tensor
     alpha: Tensor
-    beta: Tensor
+    beta: Tensor | None
     depth: Tensor | None
     normal: Tensor | None
     overdraw: Tensor | None
@@ -56,6 +57,7 @@ class BakedScene:
     mean_residual: Tensor | None = None
     near: float = 0.2
     weight_bound: float = 0.0
+    _patches: tuple | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
     def from_bundle(cls, bundle: Bundle) -> BakedScene:
@@ -84,21 +86,18 @@ class BakedScene:
         Args:
             camera: the view.
             background: [3] colour behind the scene; None = black.
-            maps: also depth, normals and overdraw.
+            maps: also beta, depth, normals and overdraw.
         """
         p = self.surfels
         means = p["means"]
         projection = project(means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"], camera, self.near)
         base = view_color(self.view_color, p, means, camera.center.to(means), projection.visible)
         size = (camera.width, camera.height)
-        image = means.new_empty(camera.height, camera.width, 9 if maps else 5)
+        image = means.new_empty(camera.height, camera.width, 9 if maps else 4)
         overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
-        atlas = self.atlas
-        extent = torch.full((len(self),), 3.0) if self.extent is None else self.extent
-        mean_residual = torch.zeros(len(self), 3) if self.mean_residual is None else self.mean_residual
-        is_bytes = atlas is not None and atlas.dtype == torch.uint8
         tracer = tracers.take(means)
         tracer.run(projection.geom, projection.radii, *size, self.near, fragments=False)
+        is_bytes = self.atlas is not None and self.atlas.dtype == torch.uint8
         tracer.baked(
             projection.geom,
             projection.radii,
@@ -107,14 +106,11 @@ class BakedScene:
             self.weight_bound,
             maps,
             base,
-            atlas if is_bytes else None,
-            None if is_bytes else atlas,
-            (0, 0, 0) if atlas is None else tuple(atlas.shape[:3]),
+            self._gathered(),
             self.offset,
             self.scale / 255 if is_bytes else self.scale,
-            extent,
-            self.tiles,
-            mean_residual,
+            torch.full((len(self),), 3.0) if self.extent is None else self.extent,
+            torch.zeros(len(self), 3) if self.mean_residual is None else self.mean_residual,
             image,
             overdraw,
         )
@@ -122,5 +118,18 @@ class BakedScene:
         rgb, alpha = image[..., :3], image[..., 3:4]
         if background is not None:
             rgb = rgb + (1 - alpha) * background
-        depth, normal = (image[..., 5:6], image[..., 6:9]) if maps else (None, None)
-        return BakedOutput(rgb, alpha, image[..., 4:5], depth, normal, overdraw)
+        beta, depth, normal = (image[..., 4:5], image[..., 5:6], image[..., 6:9]) if maps else (None, None, None)
+        return BakedOutput(rgb, alpha, beta, depth, normal, overdraw)
+
+    def _gathered(self):
+        """The atlas as the kernel reads it: gathered for the first view, kept while atlas and tiles are the same."""
+        atlas, tiles = self.atlas, self.tiles
+        state = (id(atlas), 0 if atlas is None else atlas._version, id(tiles), tiles._version)
+        if self._patches is None or self._patches[0] != state:
+            is_bytes = atlas is not None and atlas.dtype == torch.uint8
+            shape = (0, 0, 0) if atlas is None else tuple(atlas.shape[:3])
+            patches = module(tiles.device).Patches(
+                atlas if is_bytes else None, None if is_bytes else atlas, shape, tiles.contiguous()
+            )
+            self._patches = (state, patches)
+        return self._patches[1]

@@ -177,32 +177,25 @@ void bind(nb::module_& m, const char* suffix) {
       .def(
           "baked",
           [](const Trace<S>& t, In geom, In radii, int width, int height, double near, double weight_bound, bool maps,
-             In base, Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> atlas_shape,
-             double offset, double scale, Array<const float> extent, Array<const int32_t> tiles,
+             In base, const Patches& patches, double offset, double scale, Array<const float> extent,
              Array<const float> mean_residual, Out image, Maybe<int32_t> overdraw) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
-            const auto [layers, rows, columns] = atlas_shape;
-            const int64_t texels = int64_t(layers) * rows * columns * 4;
-            const Atlas atlas = {rows,
-                                 columns,
-                                 data_or_null(bytes, texels, "atlas bytes"),
-                                 data_or_null(floats, texels, "atlas floats"),
+            if (int64_t(patches.first.size()) != n) throw std::invalid_argument("the patches belong to other surfels");
+            const Atlas atlas = {patches,
                                  float(offset),
                                  float(scale),
                                  data(extent, n, "extent"),
                                  float(weight_bound),
-                                 data(tiles, 5 * n, "tiles"),
                                  data(mean_residual, 3 * n, "mean_residual")};
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data(), *b = data(base, 3 * n, "base");
-            S* out = data(image, pixels * (maps ? kMapChannels : kImageChannels), "image");
+            S* out = data(image, pixels * (maps ? kMapChannels : kBakedChannels), "image");
             int32_t* o = data_or_null(overdraw, pixels, "overdraw");
             nb::gil_scoped_release release;
             baked_forward(g, r, S(near), t.bins, width, height, maps, b, atlas, out, o);
           },
           "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "weight_bound"_a, "maps"_a,
-          "base"_a.noconvert(), "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "atlas_shape"_a,
-          "offset"_a, "scale"_a, "extent"_a.noconvert(), "tiles"_a.noconvert(), "mean_residual"_a.noconvert(),
-          "image"_a.noconvert(), "overdraw"_a.noconvert().none());
+          "base"_a.noconvert(), "patches"_a, "offset"_a, "scale"_a, "extent"_a.noconvert(),
+          "mean_residual"_a.noconvert(), "image"_a.noconvert(), "overdraw"_a.noconvert().none());
 
   m.def(
       name("trace_backward").c_str(),
@@ -379,6 +372,21 @@ NB_MODULE(_cpu, m) {
   wait_without_spinning();
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
+  nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
+      .def(
+          "__init__",
+          [](Patches* self, Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> shape,
+             Array<const int32_t> tiles) {
+            const auto [layers, rows, columns] = shape;
+            const int64_t texels = int64_t(layers) * rows * columns * 4, n = int64_t(tiles.size()) / 5;
+            const uint8_t* b = data_or_null(bytes, texels, "atlas bytes");
+            const float* f = data_or_null(floats, texels, "atlas floats");
+            data(tiles, 5 * n, "tiles");
+            new (self) Patches();
+            nb::gil_scoped_release release;
+            gather_patches(layers, rows, columns, b, f, n, tiles.data(), *self);
+          },
+          "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "shape"_a, "tiles"_a.noconvert());
   bind<float>(m, "_f32");
   bind<double>(m, "_f64");
   m.def(

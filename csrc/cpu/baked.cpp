@@ -1,4 +1,7 @@
 // The baked renderer: forward only, no fragment list, texels instead of the field.
+#include <stdexcept>
+#include <string>
+
 #include "core/texel.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
@@ -7,58 +10,115 @@
 namespace bt {
 
 namespace {
+// Two texels that lie next to each other, as eight reals.
 template <class S>
-inline Quad<S> texel(const Atlas& a, int64_t at) {
-  if (a.bytes) {
-    typedef uint8_t B __attribute__((vector_size(4)));
-    B b;
-    std::memcpy(&b, a.bytes + 4 * at, 4);
-    return __builtin_convertvector(b, Quad<S>);
+struct Wide;
+template <>
+struct Wide<float> {
+  typedef float V __attribute__((vector_size(32)));
+};
+template <>
+struct Wide<double> {
+  typedef double V __attribute__((vector_size(64)));
+};
+template <class S>
+inline typename Wide<S>::V texel_pair(const uint8_t* at) {
+  typedef uint8_t B __attribute__((vector_size(8)));
+  B b;
+  std::memcpy(&b, at, sizeof b);
+  return __builtin_convertvector(b, typename Wide<S>::V);
+}
+#if defined(__AVX2__)
+template <>
+inline Wide<float>::V texel_pair<float>(const uint8_t* at) {  // the compiler takes the bytes one by one
+  return (Wide<float>::V)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i*)at)));
+}
+#endif
+template <class S>
+inline typename Wide<S>::V texel_pair(const float* at) {
+  Wide<float>::V b;
+  std::memcpy(&b, at, sizeof b);
+  return __builtin_convertvector(b, typename Wide<S>::V);
+}
+
+// The textured fragments of a pack: to[lane] += weight * relu(colour + scale * texel), bilinear. The position is
+// clamped to the outer texel centres, so at a tile's last column and row the neighbour has weight 0 and may be any
+// texel.
+template <class S, class T>
+inline void add_textured(const T* patch, int columns, uint32_t lanes, Pack<S> x, Pack<S> y, Pack<S> weight,
+                         Quad<S> colour, S scale, Quad<S>* to) {
+  using P = Pack<S>;
+  const P x0 = floor_(x), y0 = floor_(y);
+  S fx[kLanes], fy[kLanes], at[kLanes], w[kLanes];
+  store(fx, x - x0), store(fy, y - y0), store(w, weight);
+  store(at, y0 * P(S(columns)) + x0);  // exact: a tile has fewer than 2^24 texels
+  const int stride = 4 * columns;
+  for (uint32_t r = lanes; r; r &= r - 1) __builtin_prefetch(patch + 4 * int(at[__builtin_ctz(r)]));
+  for (uint32_t r = lanes; r; r &= r - 1) {
+    const int i = __builtin_ctz(r);
+    const T* p = patch + 4 * int(at[i]);
+    const auto top = texel_pair<S>(p), bottom = texel_pair<S>(p + stride);
+    const auto column = top + fy[i] * (bottom - top);
+    const Quad<S> left = __builtin_shufflevector(column, column, 0, 1, 2, 3);
+    const Quad<S> right = __builtin_shufflevector(column, column, 4, 5, 6, 7);
+    const Quad<S> c = colour + scale * (left + fx[i] * (right - left));
+    to[i] += w[i] * (c < S(0) ? Quad<S>{} : c);
   }
-  Quad<float> t;
-  std::memcpy(&t, a.floats + 4 * at, sizeof t);
-  return __builtin_convertvector(t, Quad<S>);
-}
-// Residual colour at position (x, y) of a tile, bilinear; `at` is the texel at the whole numbers below.
-template <class S>
-inline Quad<S> residual(const Atlas& a, const int32_t* tile, int64_t at, S x, S y) {
-  const int x0 = int(x), y0 = int(y);
-  const int64_t right = x0 + 1 < tile[3] ? 1 : 0, down = y0 + 1 < tile[4] ? a.width : 0;
-  const S fx = x - S(x0), fy = y - S(y0);
-  const Quad<S> t00 = texel<S>(a, at), t10 = texel<S>(a, at + right);
-  const Quad<S> t01 = texel<S>(a, at + down), t11 = texel<S>(a, at + down + right);
-  const Quad<S> upper = t00 + fx * (t10 - t00), lower = t01 + fx * (t11 - t01);
-  return (upper + fy * (lower - upper)) * S(a.scale) + S(a.offset);
-}
-inline void prefetch(const Atlas& a, int64_t at) {
-  if (a.bytes)
-    __builtin_prefetch(a.bytes + 4 * at), __builtin_prefetch(a.bytes + 4 * (at + a.width));
-  else
-    __builtin_prefetch(a.floats + 4 * at), __builtin_prefetch(a.floats + 4 * (at + a.width));
 }
 }  // namespace
+
+void gather_patches(int layers, int height, int width, const uint8_t* bytes, const float* floats, int64_t n,
+                    const int32_t* tiles, Patches& out) {
+  out.first.resize(n), out.sides.resize(2 * n);
+  int64_t texels = 0;
+  int widest = 0;
+  for (int64_t i = 0; i < n; ++i) {
+    const int32_t* t = tiles + 5 * i;
+    const bool none = (!bytes && !floats) || t[3] == 0;
+    const int columns = none ? 0 : t[3], rows = none ? 0 : t[4];
+    if (!none && (t[0] < 0 || t[1] < 0 || t[2] < 0 || t[2] >= layers || columns < 1 || rows < 1 ||
+                  int64_t(t[0]) + columns > width || int64_t(t[1]) + rows > height))
+      throw std::invalid_argument("the tile of surfel " + std::to_string(i) + " does not lie on a page of the atlas");
+    out.first[i] = texels, out.sides[2 * i] = columns, out.sides[2 * i + 1] = rows;
+    texels += int64_t(columns) * rows;
+    widest = std::max(widest, columns);
+  }
+  const int64_t size = 4 * (texels + widest + 2);  // a fetch at the last texel reads its neighbours, with weight 0
+  out.bytes.assign(bytes ? size : 0, 0), out.floats.assign(floats ? size : 0, 0.0f);
+  parallel_parts(n, 64, [&](int, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      const int32_t* t = tiles + 5 * i;
+      const int64_t line = 4 * int64_t(out.sides[2 * i]);
+      for (int row = 0; row < out.sides[2 * i + 1]; ++row) {
+        const int64_t from = 4 * ((int64_t(t[2]) * height + t[1] + row) * width + t[0]);
+        const int64_t to = 4 * out.first[i] + row * line;
+        if (bytes) std::copy_n(bytes + from, line, out.bytes.data() + to);
+        if (floats) std::copy_n(floats + from, line, out.floats.data() + to);
+      }
+    }
+  });
+}
 
 template <class S>
 void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, bool maps,
                    const S* base, const Atlas& atlas, S* image, int32_t* overdraw) {
   using P = Pack<S>;
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
-  const int channels = maps ? kMapChannels : kImageChannels;
-  const bool textured = atlas.bytes || atlas.floats;
+  const int channels = maps ? kMapChannels : kBakedChannels;
+  const Patches& patches = atlas.patches;
 #pragma omp parallel for num_threads(num_threads()) schedule(dynamic, 2)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height);
     // fragments with a residual sum into rgb, one by one; all the rest in packs
     Quad<S> rgb[kTile * kTile] = {};
-    P sums[4 + kMapChannels][kPacks];  // rgb of the fragments without residual, alpha, beta, depth, normal, overdraw
+    P sums[kMapChannels + 1][kPacks];  // rgb of the fragments without residual, alpha, beta, depth, normal, overdraw
     for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
-    const int drawn = channels;
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
       const S* g = geom + id * kGeom;
-      const int32_t* patch = atlas.tiles + 5 * id;
-      const bool tiled = textured && patch[3] != 0;
+      const int32_t* sides = patches.sides.data() + 2 * id;
+      const bool tiled = sides[0] != 0;
       const float* flat = atlas.mean_residual + 3 * id;
       const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
       const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
@@ -69,36 +129,26 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
         const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
         for (int c = 0; c < 3; ++c) sums[c][pack] += plain * P(view[c]);
         sums[3][pack] += w;
-        sums[4][pack] += w * P(g[kBeta]);
         if (maps) {
+          sums[4][pack] += w * P(g[kBeta]);
           sums[5][pack] += w * f.depth;
           for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
         }
-        if (overdraw) sums[drawn][pack] += select(taken, P(S(1)), P(S(0)));
+        if (overdraw) sums[kMapChannels][pack] += select(taken, P(S(1)), P(S(0)));
         const uint32_t rest = bits(textures);
         if (!rest) return;
         if (!tiled) {
           for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(relu(view[c] + S(flat[c])));
           return;
         }
-        S x[kLanes], y[kLanes], wt[kLanes];
-        store(x, texel_position(f.u, patch[3], extent));
-        store(y, texel_position(f.v, patch[4], extent));
-        store(wt, weight);
-        const Quad<S> colour = {view[0], view[1], view[2], S(0)};
+        const P x = texel_position(f.u, sides[0], extent), y = texel_position(f.v, sides[1], extent);
+        const Quad<S> colour = {view[0] + S(atlas.offset), view[1] + S(atlas.offset), view[2] + S(atlas.offset), S(0)};
+        const int64_t first = 4 * patches.first[id];
         Quad<S>* to = rgb + pack * kLanes;
-        int64_t at[kLanes];
-        const int64_t corner = (int64_t(patch[2]) * atlas.height + patch[1]) * atlas.width + patch[0];
-        for (uint32_t r = rest; r; r &= r - 1) {
-          const int i = __builtin_ctz(r);
-          at[i] = corner + int64_t(int(y[i])) * atlas.width + int(x[i]);
-          prefetch(atlas, at[i]);
-        }
-        for (uint32_t r = rest; r; r &= r - 1) {
-          const int i = __builtin_ctz(r);
-          const Quad<S> c = colour + residual(atlas, patch, at[i], x[i], y[i]);
-          to[i] += wt[i] * (c < S(0) ? Quad<S>{} : c);
-        }
+        if (patches.floats.empty())
+          add_textured(patches.bytes.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
+        else
+          add_textured(patches.floats.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
       });
     }
     for (int pack = 0; pack < kPacks; ++pack)
@@ -110,7 +160,7 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
         S* to = image + pixel * channels;
         for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
         for (int c = 0; c < 3; ++c) to[c] += rgb[pack * kLanes + lane][c];
-        if (overdraw) overdraw[pixel] = int32_t(sums[drawn][pack][lane]);
+        if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][pack][lane]);
       }
   }
 }

@@ -138,18 +138,30 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
 template <class S>
 S ssim(int height, int width, int channels, const S* a, const S* b, S* da);
 
+// An atlas as the renderer reads it: every surfel's tile in one run, row by row. In pages the rows of a tile lie far
+// apart, and each costs a line of the cache and an entry of the page table's.
+struct Patches {
+  std::vector<uint8_t> bytes;  // RGBA, or empty
+  std::vector<float> floats;   // RGBA, or empty
+  std::vector<int64_t> first;  // [n] a patch's first texel
+  std::vector<int32_t> sides;  // [n, 2] r_u, r_v; 0: no tile
+};
+// Pages RGBA [layers, height, width, 4] as bytes or floats, the other null; tiles [n, 5]: x, y, layer, r_u, r_v.
+// Throws std::invalid_argument for a tile that does not lie on its page.
+void gather_patches(int layers, int height, int width, const uint8_t* bytes, const float* floats, int64_t n,
+                    const int32_t* tiles, Patches& out);
+
 // Forward-only renderer of a baked scene.
 struct Atlas {
-  int height, width;
-  const uint8_t* bytes;        // RGBA [layers, height, width, 4], or null
-  const float* floats;         // RGBA likewise, or null
+  const Patches& patches;
   float offset, scale;         // residual = offset + scale * stored
   const float* extent;         // [n] half side of the tile, scale units
   float weight_bound;          // fragments of smaller weight get no residual
-  const int32_t* tiles;        // [n, 5]: x, y, layer, r_u, r_v; r_u = 0: no tile
   const float* mean_residual;  // [n, 3] of every tile; the residual of a surfel without one
 };
-// image [pixels, channels] as composite_forward; overdraw [pixels] int32 or null
+// Channels of a baked image: rgb, alpha; with maps those of composite_forward.
+constexpr int kBakedChannels = 4;
+// image [pixels, channels] is written; overdraw [pixels] int32 or null
 template <class S>
 void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, bool maps,
                    const S* base, const Atlas& atlas, S* image, int32_t* overdraw);

@@ -7,7 +7,7 @@
 #include "core/common.h"
 #include "core/field.h"
 
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
+#if defined(__AVX2__)
 #include <immintrin.h>
 #endif
 

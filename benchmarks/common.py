@@ -323,10 +323,18 @@ def machine() -> str:
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
     except (OSError, ValueError):
         pass
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("torch", "nerfstudio"))
+    versions = ", ".join(f"{name} {version}" for name in ("torch", "nerfstudio") if (version := installed(name)))
     threads = os.environ.get("OMP_NUM_THREADS")
     limit = f", OMP_NUM_THREADS={threads}" if threads else ""
     return f"{model}, {cores()} cores{memory}; Python {platform.python_version()}, {versions}{limit}"
+
+
+def installed(distribution: str) -> str:
+    """Version of an installed distribution, empty when it is not there."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
 
 
 def cores() -> int:

@@ -108,7 +108,7 @@ def project(
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
-    if float(camera.K[0, 1]) != 0.0:
+    if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
     geom, frames, radii, broken = _Project.apply(
         means, quats, log_scales, opacity_logits, beta_raw, camera.viewmat, camera.K, camera.width, camera.height, near

@@ -7,6 +7,7 @@ surfel and tile, and for the number of fragments. Nothing else in a training ste
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,10 +16,102 @@ from torch import Tensor
 from .backend import kernel, module, workspace
 from .project import Projection
 
+TILE = 16
+"""Pixels a side."""
 WARPS = 8
 """Of a tile's block."""
 COLUMNS = 16
 """Sums a pair in the backward pass."""
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Which surfels may touch which tiles; P pairs.
+
+    Attributes:
+        order: [N] int32 surfels front to back.
+        slot_start: [N + 1] int64 by rank in that order: the surfel's first slot.
+        slot: [P] int32, by tile, then front to back: the pair's slot.
+        surfel: [P] int32, likewise: the pair's surfel.
+        tile_pairs: [tiles + 1] int64, where each tile's pairs begin.
+    """
+
+    order: Tensor
+    slot_start: Tensor
+    slot: Tensor
+    surfel: Tensor
+    tile_pairs: Tensor
+
+
+def _ints(like: Tensor, *shape: int) -> Tensor:
+    return torch.empty(shape, dtype=torch.int32, device=like.device)
+
+
+def _longs(like: Tensor, count: int) -> Tensor:
+    return torch.empty(count, dtype=torch.int64, device=like.device)
+
+
+def tile_lists(geom: Tensor, projection: Projection) -> Bins:
+    """Pairs of surfel and tile of a view; waits once for their number.
+
+    Raises:
+        RuntimeError: 2^31 pairs or more.
+    """
+    camera, n = projection.camera, geom.shape[0]
+    size = (camera.width, camera.height)
+    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+    order, slot_start = _ints(geom, n), _longs(geom, n + 1)
+    space = workspace("bin_count", geom, n)
+    kernel("bin_count", geom)(geom, projection.radii, *size, order, slot_start, space)
+    pairs = int(slot_start[-1])
+    if pairs >= 2**31:
+        raise RuntimeError(
+            f"the view has {pairs:,} pairs of surfel and tile, not below 2^31: the surfels are far too large for an "
+            f"image of {camera.width} x {camera.height} pixels"
+        )
+    slot, surfel, tile_pairs = _ints(geom, pairs), _ints(geom, pairs), _longs(geom, tiles + 1)
+    space = workspace("bin_fill", geom, pairs, *size)
+    kernel("bin_fill", geom)(geom, *size, order, slot_start, slot, surfel, tile_pairs, space)
+    return Bins(order, slot_start, slot, surfel, tile_pairs)
+
+
+def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tensor]:
+    """Which pixels blend which pairs: the layout of the fragment list and tile_start [tiles + 1] int64; waits once for
+    the number of fragments."""
+    camera, pairs = projection.camera, bins.surfel.shape[0]
+    size = (camera.width, camera.height)
+    masks, offsets = _ints(geom, WARPS, pairs), _longs(geom, pairs + 1)
+    tile_start = torch.empty_like(bins.tile_pairs)
+    space = workspace("trace_mark", geom, pairs)
+    kernel("trace_mark", geom)(
+        geom, projection.radii, projection.near, *size, bins.surfel, bins.tile_pairs, masks, offsets, tile_start, space
+    )
+    count = int(offsets[-1])
+    layout = module(geom.device).Pairs(
+        *size, count, bins.surfel, bins.slot, masks, offsets, bins.tile_pairs, bins.order, bins.slot_start
+    )
+    return layout, tile_start
+
+
+def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[Tensor, ...]:
+    """surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
+
+    Raises:
+        torch.cuda.OutOfMemoryError: the list does not fit the device; the message has its length.
+    """
+    count, camera = layout.fragments, projection.camera
+    try:
+        surfel, pixel = _ints(geom, count), _ints(geom, count)
+        weight, depth, sigma = (geom.new_empty(count) for _ in range(3))
+        uv = geom.new_empty(2, count)
+    except torch.cuda.OutOfMemoryError as error:
+        raise torch.cuda.OutOfMemoryError(
+            f"the view has {count:,} fragments, {count / (camera.width * camera.height):.0f} a pixel; their list needs "
+            f"{count * (8 + 5 * geom.element_size()) / 2**30:.1f} GiB, which the device does not have: render a "
+            f"smaller image or use fewer surfels ({error})"
+        ) from error
+    kernel("trace_fill", geom)(geom, projection.near, layout, surfel, pixel, weight, uv, depth, sigma)
+    return surfel, pixel, weight, uv, depth, sigma
 
 
 def find(geom: Tensor, projection: Projection) -> tuple[Any, ...]:
@@ -32,55 +125,11 @@ def find(geom: Tensor, projection: Projection) -> tuple[Any, ...]:
         layout, tile_start, surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
 
     Raises:
-        RuntimeError: more than 2^31 pairs of surfel and tile.
+        RuntimeError: 2^31 pairs of surfel and tile or more.
         torch.cuda.OutOfMemoryError: the list does not fit the device; the message has its length.
     """
-    camera, near, n = projection.camera, projection.near, geom.shape[0]
-    size = (camera.width, camera.height)
-    tiles = -(-camera.width // 16) * -(-camera.height // 16)
-
-    def ints(*shape: int) -> Tensor:
-        return torch.empty(shape, dtype=torch.int32, device=geom.device)
-
-    def longs(count: int) -> Tensor:
-        return torch.empty(count, dtype=torch.int64, device=geom.device)
-
-    order, slot_start = ints(n), longs(n + 1)
-    space = workspace("bin_count", geom, n)
-    kernel("bin_count", geom)(geom, projection.radii, *size, order, slot_start, space)
-    pairs = int(slot_start[-1])  # waits
-    if pairs >= 2**31:
-        raise RuntimeError(
-            f"the view has {pairs:,} pairs of surfel and tile, more than 2^31: surfels are far too large for an image "
-            f"of {camera.width} x {camera.height} pixels"
-        )
-    slot, surfel_of_pair, tile_pairs = ints(pairs), ints(pairs), longs(tiles + 1)
-    space = workspace("bin_fill", geom, pairs, *size)
-    kernel("bin_fill", geom)(geom, *size, order, slot_start, slot, surfel_of_pair, tile_pairs, space)
-
-    masks, offsets, tile_start = ints(WARPS, pairs), longs(pairs + 1), longs(tiles + 1)
-    space = workspace("trace_mark", geom, pairs)
-    kernel("trace_mark", geom)(
-        geom, projection.radii, near, *size, surfel_of_pair, tile_pairs, masks, offsets, tile_start, space
-    )
-    count = int(offsets[-1])  # waits
-    del space
-
-    layout = module(geom.device).Pairs(
-        *size, count, surfel_of_pair, slot, masks, offsets, tile_pairs, order, slot_start
-    )
-    try:
-        surfel, pixel = ints(count), ints(count)
-        weight, depth, sigma = (geom.new_empty(count) for _ in range(3))
-        uv = geom.new_empty(2, count)
-    except torch.cuda.OutOfMemoryError as error:
-        needed = count * (8 + 5 * geom.element_size()) / 2**30
-        raise torch.cuda.OutOfMemoryError(
-            f"the view has {count:,} fragments ({count / (size[0] * size[1]):.0f} a pixel), whose list needs "
-            f"{needed:.1f} GiB and does not fit the device: render a smaller image or use fewer surfels ({error})"
-        ) from error
-    kernel("trace_fill", geom)(geom, near, layout, surfel, pixel, weight, uv, depth, sigma)
-    return layout, tile_start, surfel, pixel, weight, uv, depth, sigma
+    layout, tile_start = blended(geom, projection, tile_lists(geom, projection))
+    return layout, tile_start, *fill(geom, projection, layout)
 
 
 def backward(

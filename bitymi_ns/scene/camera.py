@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,9 +39,19 @@ class Camera:
         """[3] camera centre in the world frame."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    @cached_property
+    def skewed(self) -> bool:
+        """Whether K has skew. Looked up before a camera goes to a device, so that nothing waits for that later."""
+        return float(self.K[0, 1]) != 0.0
+
+    def _with(self, **changes: Any) -> Camera:
+        skewed, other = self.skewed, replace(self, **changes)
+        other.__dict__["skewed"] = skewed
+        return other
+
     def to(self, device: torch.device | str) -> Camera:
         """The same camera on another device."""
-        return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+        return self._with(viewmat=self.viewmat.to(device), K=self.K.to(device))
 
     def scaled(self, factor: float) -> Camera:
         """The camera of the same view with its image resized by `factor` (size rounded to whole pixels)."""
@@ -48,4 +60,4 @@ class Camera:
         K = self.K.clone()
         K[0] *= width / self.width
         K[1] *= height / self.height
-        return replace(self, K=K, width=width, height=height)
+        return self._with(K=K, width=width, height=height)

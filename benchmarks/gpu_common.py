@@ -1,0 +1,162 @@
+"""What the sections of gpu.py share: timing with CUDA events, the card's measured limits, scenes like trained ones."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops import backend
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.scene import Scene
+
+SITES = 7
+LOG2_TABLE = 17
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a section is to be run.
+
+    Attributes:
+        device: that runs the kernels; the CPU = their emulation, to try the script without a card.
+        surfels: sizes of the scenes.
+        sizes: image sizes, width and height.
+        warm_up, runs: of every timing.
+        copy_bytes: measured bytes a second of a device-to-device copy, read and written bytes counted.
+    """
+
+    device: torch.device
+    surfels: Sequence[int]
+    sizes: Sequence[tuple[int, int]]
+    warm_up: int
+    runs: int
+    copy_bytes: float
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report.
+
+    Attributes:
+        name: on the command line.
+        needs: functions of the kernel module without which the section cannot run.
+        run: gives its Markdown, from a heading of level 3 on.
+    """
+
+    name: str
+    needs: tuple[str, ...]
+    run: Callable[[Options], str]
+
+
+def missing(needs: Sequence[str], device: torch.device) -> list[str]:
+    """Those functions that the kernel module of a device does not have."""
+    module = backend.module(device)
+    return [name for name in needs if not hasattr(module, name)]
+
+
+def milliseconds(run: Callable[[], object], options: Options) -> float:
+    """Median time of a call between two CUDA events: what the device does and what it waits for the host."""
+    for _ in range(options.warm_up):
+        run()
+    if options.device.type != "cuda":
+        return 1e3 * statistics.median(_seconds(run) for _ in range(options.runs))
+    events = [[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in range(options.runs)]
+    torch.cuda.synchronize()
+    for start, end in events:
+        start.record()
+        run()
+        end.record()
+    torch.cuda.synchronize()
+    return statistics.median(start.elapsed_time(end) for start, end in events)
+
+
+def _seconds(run: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def copy_bandwidth(device: torch.device) -> float:
+    """Bytes a second that a copy within the device reads and writes."""
+    cuda = device.type == "cuda"
+    a = torch.empty(1 << (30 if cuda else 24), dtype=torch.uint8, device=device)
+    b = torch.empty_like(a)
+    ms = milliseconds(lambda: b.copy_(a), Options(device, (), (), 3, 20, 0.0))
+    return 2 * a.numel() / (1e-3 * ms)
+
+
+def peak_memory(run: Callable[[], object], device: torch.device) -> int:
+    """Most bytes allocated at once during a call; 0 without a card."""
+    if device.type != "cuda":
+        return 0
+    torch.cuda.reset_peak_memory_stats(device)
+    run()
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device)
+
+
+def backward(outputs: Tensor | Sequence[Tensor], inputs: Sequence[Tensor]) -> Callable[[], object]:
+    """A backward pass on a graph that is kept, with fixed random gradients."""
+    outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+    gradients = [torch.randn_like(output) for output in outputs]
+    return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
+
+
+def trained_like(
+    n: int, width: int, height: int, device: torch.device, view_color: str = "sv", texture: bool = True
+) -> tuple[Scene, Camera]:
+    """A scene with the statistics of trained ones and the camera that looks at it; the same every time.
+
+    Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
+    deviation 0.85, the mean log scale in pixels 0.7, opacity and kernel exponent are logistic-normal (medians 0.45 and
+    2.4); about 23 fragments a pixel are blended, whatever n. A fifth of the surfels lies outside the view.
+    """
+    g = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g)
+
+    focal = 0.9 * width
+    K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+    z = 2.0 * torch.exp(1.4 * uniform(n))  # 2 to 8
+    margin = 0.5 * (math.sqrt(1.25) - 1)
+    x, y = ((uniform(n) * (1 + 2 * margin) - margin) * size for size in (width, height))
+    means = torch.stack([(x - K[0, 2]) / focal * z, (y - K[1, 2]) / focal * z, z], dim=-1)
+    pixels = PIXEL_SCALE * math.sqrt(width * height / n)
+    size = torch.log(pixels * z / focal) + 0.7 * normal(n)
+    aspect = 0.425 * normal(n)
+    surfels = {
+        "means": means,
+        "quats": normal(n, 4),
+        "log_scales": torch.stack([size + aspect, size - aspect], dim=-1),
+        "opacity_logits": 1.3 * normal(n) - 0.2,
+        "beta_raw": normal(n) + 0.45,
+    }
+    if view_color == "sv":
+        surfels |= {"sv_sites": normal(n, SITES, 3), "sv_log_tau": torch.zeros(n, SITES)}
+        surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
+    else:
+        surfels |= {"sh_dc": normal(n, 3), "sh_rest": 0.1 * normal(n, 15, 3)}
+    config = SceneConfig(view_color=view_color, sv_sites=SITES, texture="hash" if texture else "none")
+    field = None
+    if texture:
+        field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, LOG2_TABLE, g)
+        with torch.no_grad():
+            field.field_w3.copy_(0.1 * normal(*field.field_w3.shape))  # starts at zero
+    scene = Scene(config, surfels, field).to(device)
+    return scene, Camera(torch.eye(4), K, width, height).to(device)
+
+
+PIXEL_SCALE = 0.9
+"""Median scale of a surfel over the side of its share of the image."""

@@ -1,0 +1,213 @@
+"""Sections of gpu.py: the training operations against the memory's limit, and training steps beside gsplat's.
+
+Bytes that an operation cannot do without, single precision, with n surfels of which v are visible, b pairs of surfel
+and tile, f fragments and p pixels (gathers count once; what a later kernel of the same operation reads counts again):
+
+  project             152 n
+  project backward    260 n
+  tile lists          96 n + 64 v + 64 b   (two sorts: 4 passes of 16 bytes over n, 2 over b)
+  trace               64 v + 100 b + 28 f  (marks written, counted, scanned and read again; fragments written)
+  trace backward      32 f + 132 b + 72 n  (of the weights alone, as in training)
+  composite           16 f + 44 b + 20 p
+  composite backward  36 f + 16 b + 20 p + 72 n
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from common import number, say, table
+from gpu_common import Options, Section, backward, milliseconds, missing, peak_memory, trained_like
+from torch import Tensor
+from torch.nn.functional import l1_loss
+
+from bitymi_ns import ops
+from bitymi_ns.ops import trace_cuda
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import GEOMETRY, Scene
+
+OPERATIONS = ("project_forward_f32", "trace_mark_f32", "trace_backward_f32", "composite_backward_f32")
+STEP = (*OPERATIONS, "view_color_forward_f32", "shade_forward_f32", "shade_backward_f32")
+
+
+def operations(options: Options) -> str:
+    """Every operation on its own."""
+    header = ("operation", "ms", "million fragments/s", "bytes/fragment", "GB/s", "of the copy bandwidth")
+    parts = []
+    for width, height in options.sizes:
+        for n in options.surfels:
+            scene, camera = trained_like(n, width, height, options.device, texture=False)
+            sizes, cases = _operations(scene, camera)
+            rows = []
+            for name, needed, run in cases:
+                ms = milliseconds(run, options)
+                say(f"{n:,} surfels, {width} x {height}, {name}: {ms:.3f} ms")
+                rate = needed / (1e-3 * ms)
+                rows.append(
+                    [
+                        name,
+                        number(ms, 3),
+                        number(sizes["f"] / ms / 1e3, 0),
+                        number(needed / sizes["f"], 1),
+                        number(rate / 1e9, 0),
+                        f"{100 * rate / options.copy_bytes:.0f} %",
+                    ]
+                )
+            title = (
+                f"#### {n:,} surfels at {width} x {height}\n\n{sizes['v']:,} visible, {sizes['b']:,} pairs of surfel "
+                f"and tile, {sizes['f']:,} fragments ({sizes['f'] / sizes['p']:.1f} a pixel)\n"
+            )
+            parts.append(title + "\n" + table(header, rows))
+    return "### Training operations\n\n" + "\n\n".join(parts)
+
+
+def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tuple[str, int, Callable[[], object]]]]:
+    q = scene.surfels
+    geometry = tuple(q[name] for name in GEOMETRY)
+
+    def project() -> ops.Projection:
+        return ops.project(*geometry, camera, scene.config.near)
+
+    projection = project()
+    geom = projection.geom.detach()
+    fragments = ops.trace(projection, scene.config.rim)
+    bins = trace_cuda.tile_lists(geom, projection)
+    colors = torch.rand(len(fragments), 3, device=geom.device).requires_grad_()
+    image = ops.composite_image(fragments, projection, colors)
+
+    def trace() -> object:
+        layout, _ = trace_cuda.blended(geom, projection, bins)
+        return trace_cuda.fill(geom, projection, layout)
+
+    n, v, b = len(scene), int(projection.visible.sum()), bins.slot.shape[0]
+    f, p = len(fragments), camera.width * camera.height
+    return {"v": v, "b": b, "f": f, "p": p}, [
+        ("project", 152 * n, _without_graph(project)),
+        ("project backward", 260 * n, backward(projection.geom, geometry)),
+        ("tile lists", 96 * n + 64 * v + 64 * b, lambda: trace_cuda.tile_lists(geom, projection)),
+        ("trace", 64 * v + 100 * b + 28 * f, trace),
+        ("trace backward", 32 * f + 132 * b + 72 * n, backward(fragments.weight, (projection.geom,))),
+        (
+            "composite",
+            16 * f + 44 * b + 20 * p,
+            _without_graph(lambda: ops.composite_image(fragments, projection, colors)),
+        ),
+        (
+            "composite backward",
+            36 * f + 16 * b + 20 * p + 72 * n,
+            backward(image, (fragments.weight, projection.geom, colors)),
+        ),
+    ]
+
+
+def _without_graph(run: Callable[[], object]) -> Callable[[], object]:
+    def call() -> object:
+        with torch.no_grad():
+            return run()
+
+    return call
+
+
+def steps(options: Options) -> str:
+    """Whole training steps: rendering, L1 and, where its kernel is built, SSIM, backward, Adam."""
+    with_ssim = not missing(("ssim_f32",), options.device)
+    header = ("step", "ms", "pairs of surfel and tile", "peak MB")
+    parts = []
+    for width, height in options.sizes:
+        photo = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1)).to(options.device)
+        for n in options.surfels:
+            rows = []
+            for name, run, pairs in _steps(n, width, height, photo, with_ssim, options.device):
+                ms = milliseconds(run, options)
+                say(f"{n:,} surfels, {width} x {height}, step of {name}: {ms:.3f} ms")
+                memory = peak_memory(run, options.device) / 1e6
+                rows.append([name, number(ms, 3), number(pairs, 0), number(memory, 0)])
+            parts.append(f"#### {n:,} surfels at {width} x {height}\n\n" + table(header, rows))
+    loss = "0.8 L1 + 0.2 (1 - SSIM)" if with_ssim else "L1 (this build has no SSIM kernel)"
+    note = (
+        f"Loss: {loss}. gsplat gets the same centres, orientations and opacities, the scales at which its Gaussians "
+        "have the curvature of the Beta kernels at their centres, and SH of degree 3; its pairs are its own count."
+    )
+    return "### Training steps\n\n" + "\n\n".join(parts) + "\n\n" + note
+
+
+def _steps(
+    n: int, width: int, height: int, photo: Tensor, with_ssim: bool, device: torch.device
+) -> list[tuple[str, Callable[[], object], int | None]]:
+    def loss(rgb: Tensor) -> Tensor:
+        l1 = l1_loss(rgb, photo)
+        return 0.8 * l1 + 0.2 * (1 - ops.ssim(rgb, photo)) if with_ssim else l1
+
+    cases: list[tuple[str, Callable[[], object], int | None]] = []
+    for name, mode in (("bitymi, field training", "train"), ("bitymi, field frozen", "frozen"), ("bitymi, sv", "off")):
+        scene, camera = trained_like(n, width, height, device, texture=mode != "off")
+        parameters = list(scene.parameters() if mode == "train" else scene.surfels.parameters())
+
+        def render(scene: Scene = scene, camera: Camera = camera, mode: str = mode) -> Tensor:
+            return scene.render(camera, field_mode=mode).rgb
+
+        pairs = scene.render(camera, field_mode="off").fragments.layout.pairs
+        cases.append((name, _step(render, loss, parameters), pairs))
+    return cases + _gsplat_steps(n, width, height, loss, device)
+
+
+def _step(
+    render: Callable[[], Tensor], loss: Callable[[Tensor], Tensor], parameters: list[Tensor]
+) -> Callable[[], object]:
+    # a rate of zero: the work of a step, but the scene stays what it is
+    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
+
+    def run() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        loss(render()).backward()
+        optimizer.step()
+
+    return run
+
+
+def _gsplat_steps(
+    n: int, width: int, height: int, loss: Callable[[Tensor], Tensor], device: torch.device
+) -> list[tuple[str, Callable[[], object], int | None]]:
+    try:
+        import gsplat
+    except ImportError as error:
+        say(f"gsplat is not there: {error}")
+        return []
+    scene, camera = trained_like(n, width, height, device, view_color="sh", texture=False)
+    q = {name: value.detach() for name, value in scene.surfels.items()}
+    beta = 4 * torch.sigmoid(q["beta_raw"])
+    scales = q["log_scales"].exp() * (3 / (2 * beta).sqrt())[:, None]
+    scales = torch.cat([scales, scales.amin(dim=1, keepdim=True)], dim=1)
+    values = {
+        "means": q["means"],
+        "quats": q["quats"],
+        "scales": scales.log(),
+        "opacities": q["opacity_logits"],
+        "colors": torch.cat([q["sh_dc"][:, None], q["sh_rest"]], dim=1),
+    }
+    view = (camera.viewmat[None], camera.K[None], width, height)
+    cases: list[tuple[str, Callable[[], object], int | None]] = []
+    for name, function in (("gsplat 2DGS", gsplat.rasterization_2dgs), ("gsplat 3DGS", gsplat.rasterization)):
+        leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
+
+        def call(leaves: dict[str, Tensor] = leaves, function: Callable = function) -> tuple:
+            return function(
+                leaves["means"],
+                leaves["quats"],
+                leaves["scales"].exp(),
+                torch.sigmoid(leaves["opacities"]),
+                leaves["colors"],
+                *view,
+                sh_degree=3,
+                packed=False,
+            )
+
+        version = getattr(gsplat, "__version__", "")
+        pairs = int(call()[-1]["flatten_ids"].shape[0])
+        step = _step(lambda call=call: call()[0][0], loss, list(leaves.values()))
+        cases.append((f"{name} {version}, SH 3", step, pairs))
+    return cases
+
+
+SECTIONS = (Section("operations", OPERATIONS, operations), Section("steps", STEP, steps))

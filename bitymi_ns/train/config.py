@@ -103,7 +103,7 @@ class LearningRates:
     """View-dependent colour: Voronoi sites and temperatures, lobes; higher SH bands use a twentieth of view_color."""
     field_table: tuple[float, float] = (1e-2, 1e-3)
     """Hash table of the texture field."""
-    field_mlp: tuple[float, float] = (1e-3, 1e-4)
+    field_mlp: tuple[float, float] = (1e-2, 1e-3)
     """Its MLP."""
 
 
@@ -130,6 +130,8 @@ class TrainConfig:
     """From this step on the texture field learns on one step in `freeze_every` only."""
     freeze_every: int = 10
     """1 = no freezing."""
+    freeze_min_updates: int = 300
+    """Short runs freeze less, so that the field still learns on about this many steps after `freeze_after`."""
     field_warmup: int = 500
     """Steps over which the learning rate of the texture field rises to its full value."""
     resolution_schedule: int = 3000

@@ -108,9 +108,16 @@ class Schedule:
     def field_trains(self, step: int) -> bool:
         """Whether the texture field learns in this step; on the other steps it is evaluated without gradient.
 
-        From `freeze_after` on it learns in one step in `freeze_every` (section Training Time of the paper).
+        From `freeze_after` on it learns in one step in `freeze_every` (section Training Time of the paper). A run of
+        few steps freezes less often: it could not learn a texture in a tenth of them.
         """
-        return step < self.scaled(self.config.freeze_after) or step % self.config.freeze_every == 0
+        return step < self.scaled(self.config.freeze_after) or step % self.freeze_every == 0
+
+    @property
+    def freeze_every(self) -> int:
+        """After `freeze_after` the field learns in one step in so many."""
+        left = self.max_steps - self.scaled(self.config.freeze_after)
+        return max(1, min(self.config.freeze_every, left // max(1, self.config.freeze_min_updates)))
 
     def field_warmup(self, step: int) -> float:
         """Factor of the field's learning rate: rises linearly to 1 over the first `field_warmup` steps."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -18,21 +21,29 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host.errors import fail
+from bitymi_ns.host.point_cloud import what_is_wrong_with
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 
 
-def check_capture(config: FullImageDatamanagerConfig) -> None:
-    """Stop with a clear message when there is no usable capture where the configuration points."""
+def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> None:
+    """Stop with a clear message when there is no usable capture where the configuration points.
+
+    Args:
+        config: the data manager's.
+        images: the photographs are needed, too.
+    """
     dataparser = config.dataparser
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
         fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
     if isinstance(dataparser, NerfstudioDataParserConfig):
-        _check_transforms(data, dataparser)
+        _check_transforms(data, dataparser, images)
+    elif isinstance(dataparser, BlenderDataParserConfig) and dataparser.ply_path is not None:
+        _check_cloud(data / dataparser.ply_path, "leave --ply-path out")
 
 
-def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig) -> None:
+def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> None:
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         if not data.is_dir():
@@ -56,12 +67,12 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig) -> Non
         if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
             fail(f"{path}: frame {i} has no file_path or no transform_matrix")
     folder = path.parent
+    if images and dataparser.downscale_factor is None:  # else copies of another size are read
+        check_images([folder / str(frame["file_path"]) for frame in frames])
+    _check_poses(path, frames, dataparser)
     points = meta.get("ply_file_path")
-    if points is not None and dataparser.load_3D_points and not (folder / points).is_file():
-        fail(
-            f"{path} names the point cloud {folder / points}, which does not exist. Put it there, or remove "
-            "ply_file_path to start from random points."
-        )
+    if points is not None and dataparser.load_3D_points:
+        _check_cloud(folder / points, f"remove ply_file_path from {path}")
     if points is None and dataparser.load_3D_points and (folder / "colmap/sparse/0").is_dir() and not _interactive():
         # nerfstudio would ask whether to convert the COLMAP points and wait for an answer for ever
         CONSOLE.print(
@@ -69,6 +80,59 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig) -> Non
             "random points. Run once in a terminal to convert them."
         )
         dataparser.load_3D_points = False
+
+
+def check_images(paths: Sequence[Path]) -> None:
+    """Stop when images that the capture has poses for are not there."""
+    names = list(dict.fromkeys(paths))
+    missing = [path for path in names if not path.is_file()]
+    if missing:
+        some = "\n  ".join(str(path) for path in missing[:3])
+        fail(
+            f"{len(missing)} of {len(names)} images of the capture are missing:\n  {some}\n"
+            "Poses without images cannot be used: copy the images there or remove the frames."
+        )
+
+
+def _check_poses(path: Path, frames: list[dict[str, Any]], dataparser: NerfstudioDataParserConfig) -> None:
+    """Stop at poses that nerfstudio would spread over all others, or stumble over."""
+    places = []
+    for frame in frames:
+        try:
+            pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
+        except (ValueError, TypeError):
+            pose = np.zeros(0)
+        if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
+            fail(
+                f"{path}: the transform_matrix of {frame['file_path']} is not a matrix of 4 x 4 finite numbers. "
+                "Correct it or remove the frame."
+            )
+        places.append(pose[:3, 3])
+    if dataparser.auto_scale_poses and not np.ptp(places, axis=0).any():
+        fail(f"{path}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+
+
+def _check_cloud(cloud: Path, way_out: str) -> None:
+    wrong = what_is_wrong_with(cloud) if cloud.is_file() else "does not exist"
+    if wrong is not None:
+        fail(f"the point cloud {cloud} {wrong}. Put it there again, or {way_out} to start from random points.")
+
+
+def check_cameras(cameras: Cameras, names: Sequence[Path]) -> None:
+    """Stop at cameras through which nothing can be seen."""
+    for what, wrong in (
+        ("its pose is not finite", ~cameras.camera_to_worlds.isfinite().flatten(1).all(1)),
+        (
+            "its focal lengths are not positive and finite",
+            ~((cameras.fx > 0) & (cameras.fy > 0) & (cameras.fx + cameras.fy < 1e12)),
+        ),
+        ("its principal point is not finite", ~(cameras.cx + cameras.cy).isfinite()),
+        ("its image size is not positive", (cameras.width < 1) | (cameras.height < 1)),
+    ):
+        if bool(wrong.any()):
+            fail(
+                f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. Correct the capture."
+            )
 
 
 def _interactive() -> bool:

@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host import checkpoints
 from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
+from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels
 from bitymi_ns.host.errors import fail
@@ -64,6 +65,7 @@ class BitymiTrainerConfig(TrainerConfig):
             CONSOLE.print(f"[bold yellow]Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
         self._make_paths_absolute()
+        check_capture(self.pipeline.datamanager)  # before anything is written
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
 

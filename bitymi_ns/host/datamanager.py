@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -14,7 +13,13 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host.capture import check_capture, declares_box, reporting_input_errors
+from bitymi_ns.host.capture import (
+    check_cameras,
+    check_capture,
+    check_images,
+    declares_box,
+    reporting_input_errors,
+)
 from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
 from bitymi_ns.host.errors import fail
 from bitymi_ns.train.views import training_order
@@ -50,7 +55,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         local_rank: int = 0,
         **kwargs: Any,
     ) -> None:
-        check_capture(config)
+        check_capture(config, images=test_mode != "inference")
         with reporting_input_errors(config):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
@@ -83,14 +88,9 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         count = len(self.train_dataset)
         if test_mode == "inference":
             return
-        names = [*self.train_dataset.image_filenames, *self.eval_dataset.image_filenames]
-        missing = [path for path in dict.fromkeys(names) if not Path(path).is_file()]
-        if missing:
-            some = "\n  ".join(str(path) for path in missing[:3])
-            fail(
-                f"{len(missing)} of {len(set(names))} images of the capture are missing:\n  {some}\n"
-                "Poses without images cannot be used: copy the images there or remove the frames."
-            )
+        for dataset in (self.train_dataset, self.eval_dataset):
+            check_cameras(dataset.cameras, dataset.image_filenames)
+        check_images([*self.train_dataset.image_filenames, *self.eval_dataset.image_filenames])
         if count == 1 and test_mode == "val":
             fail(
                 f"only one training view in {self.config.data}. A scene cannot be learned from one image: take "

@@ -154,7 +154,36 @@ def test_poses_without_images(capture: Path) -> None:
 def test_no_images_at_all(capture: Path) -> None:
     for path in images_of(capture):
         path.unlink()
-    with expect("cannot be loaded|are missing"):
+    with expect("12 of 12 images of the capture are missing"):
+        load(capture)
+
+
+@pytest.mark.parametrize("pose", [[[float("nan")] * 4] * 4, [[1, 0], [0, 1]], "here"])
+def test_a_pose_that_is_none(capture: Path, edit: Any, pose: Any) -> None:
+    edit(capture, lambda meta: meta["frames"][3].update(transform_matrix=pose))
+    with expect("transform_matrix of images/frame_00004.png is not a matrix of 4 x 4 finite numbers"):
+        load(capture)
+
+
+def test_all_cameras_at_one_place(capture: Path, edit: Any) -> None:
+    first = json.loads((capture / "transforms.json").read_text())["frames"][0]["transform_matrix"]
+    edit(capture, lambda meta: [frame.update(transform_matrix=first) for frame in meta["frames"]])
+    with expect("all cameras are at one place"):
+        load(capture)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("fl_x", -30.0, "frame_00002.png cannot be used: its focal lengths are not positive"),
+        ("fl_y", float("inf"), "its focal lengths are not positive and finite"),
+        ("cx", float("nan"), "its principal point is not finite"),
+        ("w", 0, "its image size is not positive"),
+    ],
+)
+def test_cameras_through_which_nothing_is_seen(capture: Path, edit: Any, key: str, value: float, message: str) -> None:
+    edit(capture, lambda meta: meta.update({key: value}))
+    with expect(message):
         load(capture)
 
 
@@ -189,7 +218,18 @@ def test_few_views_work_with_a_warning(capture: Path, edit: Any, capsys: pytest.
 
 def test_a_point_cloud_that_is_not_there(capture: Path, edit: Any) -> None:
     edit(capture, lambda meta: meta.update(ply_file_path="gone.ply"))
-    with expect("point cloud .*gone.ply, which does not exist"):
+    with expect("point cloud .*gone.ply does not exist.*remove ply_file_path"):
+        load(capture)
+
+
+def test_a_point_cloud_that_is_cut_off(capture: Path) -> None:
+    cloud = capture / "sparse_pc.ply"
+    whole = cloud.read_bytes()
+    cloud.write_bytes(whole[: len(whole) // 2])
+    with expect("sparse_pc.ply is cut off: it has .* of 200 points"):
+        load(capture)
+    cloud.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    with expect("sparse_pc.ply is not a PLY file"):
         load(capture)
 
 

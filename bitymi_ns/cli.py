@@ -87,7 +87,9 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         command.run()
     except (ValueError, OSError) as error:
-        print(f"bitymi: {error}", file=sys.stderr)
+        # a full disk does not say where it is full
+        where = "" if not isinstance(error, OSError) or error.filename else f" ({command.output_dir})"
+        print(f"bitymi: {error}{where}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("bitymi: interrupted, nothing was left half-written", file=sys.stderr)

@@ -30,6 +30,19 @@ def test_unwritable_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert error.startswith("bitymi: ") and error.count("\n") == 1
 
 
+def test_a_full_disk_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import bitymi_ns.sample
+
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(bitymi_ns.sample, "generate", full)
+    assert cli.main(["sample", "--output-dir", str(tmp_path / "room")]) == 1
+    assert capsys.readouterr().err == f"bitymi: [Errno 28] No space left on device ({tmp_path / 'room'})\n"
+
+
 def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import bitymi_ns.report
 

@@ -59,12 +59,9 @@ def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
     except (OSError, RuntimeError) as error:  # torch reports some write errors as RuntimeError
         _remove(unfinished)
         kept = sorted(p.name for p in path.parent.glob("*.ckpt"))
-        fail(
-            f"the checkpoint {path} could not be written: {error}\n"
-            f"  Free some disk space and resume with --load-dir {path.parent}"
-            + (f" (from {kept[-1]}, which is intact)." if kept else " (there is no earlier checkpoint)."),
-            error,
-        )
+        detail = error if isinstance(error, OSError) else "the disk took only a part of it"  # torch says which byte
+        then = f"resume with --load-dir {path.parent} (from {kept[-1]}, which is intact)" if kept else "train again"
+        fail(f"the checkpoint {path} could not be written: {detail}.\n  Free some disk space and {then}.", error)
     except BaseException:  # Ctrl-C
         _remove(unfinished)
         raise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 
@@ -13,8 +12,6 @@ from torch import Tensor
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.rotations import facing
-
-log = logging.getLogger(__name__)
 
 SH_C0 = 0.28209479177387814
 """The constant real spherical harmonic."""
@@ -104,7 +101,6 @@ def surfels_from_points(
     if len(xyz) == 0:
         xyz, rgb = _random_points(config.random_points, centers, box, generator)
         report.random = len(xyz)
-        log.warning("no usable sparse points: %d surfels are placed at random", len(xyz))
     cap = config.densify.max_surfels
     if 0 < cap < len(xyz):
         report.over_cap = len(xyz) - cap

@@ -295,10 +295,19 @@ def without_points(room: Path, folder: Path) -> Path:
     return capture
 
 
+def with_an_empty_cloud(room: Path, folder: Path) -> Path:
+    capture = Path(shutil.copytree(room, folder / "empty"))
+    cloud = capture / "sparse_pc.ply"
+    header = cloud.read_bytes().partition(b"end_header\n")[0]
+    cloud.write_bytes(header.replace(b"vertex 200", b"vertex 0") + b"end_header\n")
+    return capture
+
+
+@pytest.mark.parametrize("pointless", [without_points, with_an_empty_cloud])
 def test_a_capture_without_points_starts_at_random(
-    room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str], pointless: Callable[..., Path]
 ) -> None:
-    config = start(data=without_points(room, tmp_path))
+    config = start(data=pointless(room, tmp_path))
     config.max_num_iterations, config.pipeline.model.train.random_points = 2, 300
     ns_train.main(config)
     assert "starts from 300 random ones" in " ".join(capsys.readouterr().out.split())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -94,3 +95,29 @@ def test_surfels_of_different_numbers(saved: Path) -> None:
     other["pipeline"]["_model.scene.surfels.quats"] = torch.ones(4, 4)
     torch.save(other, saved)
     refused(saved, r"altered: .*5 means, 4 quats")
+
+
+@pytest.mark.parametrize(
+    ("error", "detail"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 9 vs 8"), "took only a part of it"),
+    ],
+)
+@pytest.mark.parametrize("earlier", [True, False])
+def test_a_full_disk(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, detail: str, earlier: bool
+) -> None:
+    def full(state: Any, file: Any) -> None:
+        file.write(b"half")
+        raise error
+
+    monkeypatch.setattr(torch, "save", full)
+    whole = saved.read_bytes()
+    if not earlier:
+        saved.unlink()
+    then = "resume with --load-dir .*intact" if earlier else "train again"
+    with pytest.raises(InputError, match=f"(?s)could not be written: .*{detail}.*Free some disk space and {then}"):
+        checkpoints.save({}, checkpoints.path_of(saved.parent, 9), scratch=saved.parent)
+    assert [p.name for p in saved.parent.iterdir()] == ([saved.name] if earlier else [])
+    assert not earlier or saved.read_bytes() == whole

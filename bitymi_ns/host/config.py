@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
@@ -45,17 +46,19 @@ class BitymiTrainerConfig(TrainerConfig):
     ] = "viewer"
     """Which visualizer to use; none = no viewer and no log but the training curve."""
     max_num_iterations: int | None = None
-    """Length of the run in steps; all schedules scale with it. Not given: `default_iterations`, or on a machine without
-    a supported GPU `default_iterations_cpu`. A resumed run ends at this step in total, by default where the interrupted
-    run would have ended."""
+    """Length of the run in steps; schedules scale. Not given: --default-iterations; a resumed run: as before."""
     default_iterations: int = 30_000
     """Steps of a run on a GPU when --max-num-iterations is not given."""
     default_iterations_cpu: int = 3_000
-    """Steps of a run on a CPU when --max-num-iterations is not given."""
+    """Steps of a run without a supported GPU when --max-num-iterations is not given."""
     steps_per_save: int | None = None
-    """Number of steps between checkpoints; not given: `default_saves` over the run."""
+    """Number of steps between checkpoints; not given: see --default-saves."""
     default_saves: int = 5
     """Checkpoints written over a run when --steps-per-save is not given."""
+    prompt: tyro.conf.Suppress[str | None] = None
+    """Of nerfstudio's text-to-scene methods."""
+    optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+    """By parameter group. Not in the help: the rates come from --pipeline.model.train.lr."""
 
     def set_timestamp(self) -> None:
         """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
@@ -65,12 +68,13 @@ class BitymiTrainerConfig(TrainerConfig):
             CONSOLE.print(f"[bold yellow]Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
         self._make_paths_absolute()
-        check_capture(self.pipeline.datamanager)  # before anything is written
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
 
     def save_config(self) -> None:
-        """Write config.yml; this is the first that a run writes, so a folder that cannot be used shows here."""
+        """Write config.yml. This is the first that a run writes, so a folder that cannot be used shows here. What
+        can be checked before anything is written is checked now."""
+        check_capture(self.pipeline.datamanager)
         try:
             super().save_config()
         except OSError as error:

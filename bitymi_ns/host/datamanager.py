@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -35,6 +36,16 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: BitymiDataManager)
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type that is kept in memory; uint8 takes a quarter of the space."""
+    train_cameras_sampling_seed: int = 42
+    """Decides the order of the training views."""
+    # options of nerfstudio's other data managers, which nothing reads here, are left out of the help
+    train_cameras_sampling_strategy: tyro.conf.Suppress[Literal["random", "fps"]] = "random"
+    fps_reset_every: tyro.conf.Suppress[int] = 100
+    eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
+    eval_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
+    eval_image_indices: tyro.conf.Suppress[tuple[int, ...] | None] = (0,)
+    images_on_gpu: tyro.conf.Suppress[bool] = False
+    masks_on_gpu: tyro.conf.Suppress[bool] = False
 
 
 class BitymiDataManager(FullImageDatamanager[BitymiDataset]):

@@ -10,13 +10,12 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
-from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.host.checkpoints import STATE_VERSION, SURFELS
 from bitymi_ns.host.errors import fail
-from bitymi_ns.host.surfel_model import SurfelModel
+from bitymi_ns.host.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
@@ -42,11 +41,10 @@ PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
 
 
 @dataclass
-class BitymiModelConfig(ModelConfig):
+class BitymiModelConfig(SurfelModelConfig):
     """Configuration of the model."""
 
     _target: type = field(default_factory=lambda: BitymiModel)
-    enable_collider: bool = False
     scene: SceneConfig = field(default_factory=SceneConfig)
     """What the scene is made of."""
     train: TrainConfig = field(default_factory=TrainConfig)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.models.base_model import Model
+from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -20,6 +22,17 @@ from bitymi_ns.train.views import as_float, over_background, reduce_image, reduc
 
 OVERDRAW_SCALE = 32.0
 """Blended surfels at a pixel that the end of a colour map stands for."""
+
+
+@dataclass
+class SurfelModelConfig(ModelConfig):
+    """Options of nerfstudio's models of rays, which mean nothing here, are left out of the help."""
+
+    enable_collider: tyro.conf.Suppress[bool] = False
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: tyro.conf.Suppress[int] = 4096
+    prompt: tyro.conf.Suppress[str | None] = None
 
 
 class SurfelModel(Model):

@@ -11,8 +11,7 @@ class SceneConfig:
     """Representation of the scene: surfels, view colour and residual colour field."""
 
     view_color: Literal["sv", "sh", "sb", "sg"] = "sv"
-    """View-dependent colour of a surfel: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta,
-    sg = spherical Gaussians."""
+    """View colour: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta, sg = spherical Gaussians."""
     sv_sites: int = 7
     """Number of Spherical Voronoi sites a surfel (the paper's K), 1 to 32."""
     sh_degree: int = 3
@@ -26,11 +25,9 @@ class SceneConfig:
     min_resolution: int = 256
     """Cells along an edge of the coarsest hash grid level, 2 to 2^20."""
     log2_table_size: int | None = None
-    """Entries a hash level, as a power of two, 1 to 24; not given: chosen so that the table fits the scene and the
-    cache."""
+    """Entries a hash level, as a power of two, 1 to 24; not given: as the photographs and the cache ask for."""
     contraction: Literal["auto", "on", "off"] = "auto"
-    """mip-NeRF 360 contraction of space outside the unit ball of the cameras; auto: off for images with alpha, and for
-    captures that declare a box around their scene, unless it is more than twice as large as that ball."""
+    """Contraction of space beyond the cameras; auto: off for images with alpha, and where a small box is declared."""
     near: float = 0.2
     """Nearest depth that is drawn, in scene units (camera z), above 0."""
     weight_bound: float = 0.02
@@ -38,4 +35,4 @@ class SceneConfig:
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels."""
     rim: float = 1e-3
-    """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1."""
+    """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""

@@ -20,7 +20,7 @@ class LossConfig:
     falloff_gamma: float = 25.0
     """How sharply the falloff loss fades with the photometric error: omega = exp(-gamma e)."""
     falloff_error: Literal["l1_sum", "mse"] = "l1_sum"
-    """e of the line above: L1 summed over rgb, or the mean squared error."""
+    """The error e in omega: L1 summed over rgb, or the mean squared error."""
     falloff_gradient: Literal["full", "beta_only"] = "full"
     """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
 
@@ -62,7 +62,7 @@ class DensifyConfig:
     min_reset_interval: int = 1500
     """Fewest steps between opacity resets, however short the run."""
     reset_opacity: float = 0.01
-    """Opacity after a reset, at most. Very short runs reset to a higher one (`Schedule`)."""
+    """Opacity after a reset, at most. Very short runs reset to a higher one."""
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
     """Steps of the final multi-view prunes."""
     final_prune_opacity: float = 0.1
@@ -86,9 +86,9 @@ class LearningRates:
     short_run_power: float = 0.35
     """Runs of n < 30,000 steps multiply the rates of the surfels, not of the field, by (30,000 / n) to this power."""
     short_run_max: float = 4.0
-    """... but by no more than this: at 7 times the rates the held-out error grows again."""
+    """The largest such factor: at 7 times the rates the held-out error grows again."""
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
-    """Times the scene extent."""
+    """Positions, times the scene extent."""
     quats: float = 1e-3
     """Rotations."""
     log_scales: float = 5e-3
@@ -104,7 +104,7 @@ class LearningRates:
     field_table: tuple[float, float] = (1e-2, 1e-3)
     """Hash table of the texture field."""
     field_mlp: tuple[float, float] = (1e-2, 1e-3)
-    """Its MLP."""
+    """MLP of the texture field."""
 
 
 @dataclass
@@ -129,7 +129,7 @@ class TrainConfig:
     freeze_after: int = 5000
     """From this step on the texture field learns on one step in `freeze_every` only."""
     freeze_every: int = 10
-    """1 = no freezing."""
+    """How rarely the texture field learns after `freeze_after`; 1 = on every step."""
     freeze_min_updates: int = 300
     """Short runs freeze less, so that the field still learns on about this many steps after `freeze_after`."""
     field_warmup: int = 500

@@ -1,6 +1,7 @@
 """The registry entries, what they do on a machine without a GPU, and that they never break nerfstudio."""
 
 import importlib
+import re
 import sys
 import warnings
 
@@ -42,6 +43,23 @@ def test_a_method_parses_from_the_command_line() -> None:
     assert parsed.pipeline.model.scene.levels == 3
     assert parsed.vis == "none" and not parsed.is_viewer_enabled()
     assert parsed.max_num_iterations is None
+
+
+def test_the_help_explains_every_option_that_does_something(capsys: pytest.CaptureFixture[str]) -> None:
+    default = methods.bitymi.config
+    with pytest.raises(SystemExit):
+        tyro.cli(type(default), default=default, args=["--help"])
+    text = capsys.readouterr().out
+    # an option is a line of its own, what it means the indented lines below it
+    lines = [line.strip("│| ") for line in text.splitlines()]
+    options = [i for i, line in enumerate(lines) if re.match("--[a-z]", line)]
+    assert len(options) > 100
+    for i in options:
+        following = " ".join(lines[i + 1 : i + 3])
+        assert len(following.split("(default")[0]) > 10, lines[i]
+    # these are nerfstudio's and have no effect here
+    for dead in ("--optimizers.", "collider", "fps", "loss-coefficients", "eval-num-rays", "prompt"):
+        assert dead not in text
 
 
 def test_the_protocol_is_that_of_3dgs() -> None:

@@ -71,8 +71,30 @@ class Report:
         print(f"Wrote {page}")
 
 
+@dataclass
+class Stability:
+    """Measure what float32 costs on extreme scenes and write the page of it, with a plot beside it."""
+
+    output: Path = Path("docs/stability.md")
+    """Markdown file to write; the plot gets its name with .png."""
+    backend: str = "cpu"
+    """Kernels to measure."""
+
+    def run(self) -> None:
+        from bitymi_ns.stability import page
+        from bitymi_ns.stability.backends import BACKENDS
+
+        if self.backend not in BACKENDS:
+            raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")
+        rows = page.write(self.output, BACKENDS[self.backend], lambda text: print(text, file=sys.stderr))
+        worse = [row.label for row in rows if "**" in row.verdict]
+        print(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
+
+
 Command = (
-    Annotated[Sample, tyro.conf.subcommand(name="sample")] | Annotated[Report, tyro.conf.subcommand(name="report")]
+    Annotated[Sample, tyro.conf.subcommand(name="sample")]
+    | Annotated[Report, tyro.conf.subcommand(name="report")]
+    | Annotated[Stability, tyro.conf.subcommand(name="stability")]
 )
 
 

@@ -13,7 +13,7 @@ import pytest
 import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
-ORDER = ["ops", "scene", "train", "bake", "report", "host"]
+ORDER = ["ops", "scene", "stability", "train", "bake", "report", "host"]
 """Innermost first. `report` reads files alone; it stands where nothing but `cli` is above it."""
 
 

@@ -107,6 +107,7 @@ def write_bundle(
     mean_residual: Tensor | None = None,
     near: float = 0.2,
     weight_bound: float = 0.0,
+    prefilter: str = "low_pass",
     background: Sequence[float] = (0.0, 0.0, 0.0),
     world: World | None = None,
     statistics: Mapping[str, Any] | None = None,
@@ -126,6 +127,7 @@ def write_bundle(
             other viewers show. None = 0.
         near: nearest drawn depth.
         weight_bound: fragments of smaller blending weight get no residual.
+        prefilter: low_pass or pixel (`SceneConfig.prefilter`).
         background: colour behind the surfels.
         world: place in the capture's own frame.
         statistics: anything worth knowing about the bake, for people and reports.
@@ -145,7 +147,7 @@ def write_bundle(
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS):
             raise BundleError(f"extra_files may not replace {name}")
-    info = _describe(surfels, atlas, near, weight_bound, background, world or World(), statistics)
+    info = _describe(surfels, atlas, near, weight_bound, prefilter, background, world or World(), statistics)
     try:
         with complete_folder(folder, overwrite) as new:
             columns = to_columns(surfels, tiles, mean_residual, extent)
@@ -209,6 +211,7 @@ def _describe(
     atlas: EncodedAtlas | None,
     near: float,
     weight_bound: float,
+    prefilter: str,
     background: Sequence[float],
     world: World,
     statistics: Mapping[str, Any] | None,
@@ -239,6 +242,7 @@ def _describe(
             "near": near,
             "weight_bound": weight_bound,
             "low_pass": 1.0,
+            "prefilter": prefilter,
             "background": list(background),
         },
         "world": {"transform": np.asarray(world.transform, dtype=np.float64)[:3], "scale": float(world.scale)},

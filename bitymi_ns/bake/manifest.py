@@ -105,6 +105,8 @@ def parse(data: bytes, source: str = MANIFEST) -> dict[str, Any]:
     fields.number("color_bias")
     for name in ("alpha_max", "alpha_min", "t_min", "near", "weight_bound", "low_pass"):
         fields.number(f"render.{name}")
+    if "prefilter" in info["render"]:  # bundles of earlier versions have the low pass
+        fields.text("render.prefilter", "low_pass", "pixel")
     fields.numbers("render.background", 3)
     fields.numbers("world.transform", 3, 4)
     fields.number("world.scale")

@@ -45,7 +45,7 @@ class BakeableScene(Protocol):
 
     surfels: Mapping[str, Tensor]
     field: Field | None
-    config: Any  # near, weight_bound
+    config: Any  # near, weight_bound, prefilter
 
 
 @dataclass
@@ -105,6 +105,7 @@ class Baked:
         weight_bound: fragments of smaller blending weight get no residual.
         options: what it was baked with.
         statistics: what was left out, what it cost, and the error of the quantisation.
+        prefilter: as the scene was drawn.
     """
 
     surfels: dict[str, Tensor]
@@ -118,6 +119,7 @@ class Baked:
     weight_bound: float
     options: BakeOptions
     statistics: dict[str, Any] = field(default_factory=dict)
+    prefilter: str = "low_pass"
 
     def with_texels(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
         """The same bake with other residual colours (fine-tuned ones, say), quantised and encoded anew."""
@@ -201,7 +203,18 @@ def bake(
     surfels = {name: value.cpu() for name, value in surfels.items()}
     extent = torch.full((len(kept),), options.extent)
     return Baked(
-        surfels, kept.cpu(), packing, extent, texels, mean_residual, atlas, near, weight_bound, options, statistics
+        surfels,
+        kept.cpu(),
+        packing,
+        extent,
+        texels,
+        mean_residual,
+        atlas,
+        near,
+        weight_bound,
+        options,
+        statistics,
+        str(getattr(scene.config, "prefilter", "low_pass")),
     )
 
 
@@ -229,6 +242,7 @@ def export(
         mean_residual=baked.mean_residual,
         near=baked.near,
         weight_bound=baked.weight_bound,
+        prefilter=baked.prefilter,
         background=background,
         world=world,
         statistics={**baked.statistics, **(statistics or {})},

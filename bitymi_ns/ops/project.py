@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.camera import Camera
 
 GEOM = 16
-"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), unused."""
+"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), area (prefilter)."""
 FRAME = 9
 
 
@@ -58,12 +58,12 @@ class Projection:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, width, height, near):
+    def forward(ctx, means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, width, height, near, prefilter):
         n = means.shape[0]
         inputs = [dense(t, means) for t in (means, quats, log_scales, opacity_logits, beta_raw, viewmat, K)]
         geom, frames, radii = (means.new_empty(n, k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
-        kernel("project_forward", means)(*inputs, width, height, near, geom, frames, radii, broken)
+        kernel("project_forward", means)(*inputs, width, height, near, prefilter, geom, frames, radii, broken)
         ctx.save_for_backward(*inputs, geom)
         ctx.mark_non_differentiable(radii, broken)
         ctx.set_materialize_grads(False)
@@ -76,7 +76,7 @@ class _Project(torch.autograd.Function):
         dframes = None if dframes is None else dense(dframes, geom)
         out = [torch.empty_like(t) for t in inputs[:5]]
         kernel("project_backward", geom)(*inputs, geom, dgeom, dframes, *out)
-        return *out, None, None, None, None, None
+        return *out, None, None, None, None, None, None
 
 
 def project(
@@ -87,17 +87,20 @@ def project(
     beta_raw: Tensor,
     camera: Camera,
     near: float = 0.2,
+    prefilter: bool = False,
 ) -> Projection:
     """Projects surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
 
     Args:
         means: [N, 3] world positions.
         quats: [N, 4] wxyz of any length.
-        log_scales: [N, 2] natural logarithm of the tangent scales, world units.
+        log_scales: [N, 2] natural logarithm of the tangent scales, world units; clamped to +-30.
         opacity_logits: [N], opacity = sigmoid.
         beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
         camera: OpenCV axes.
         near: surfels with a centre nearer than this (camera z) are not seen.
+        prefilter: the kernel is seen through a pixel (csrc/core/prefilter.h) instead of being united with a low pass;
+            column 15 of geom then holds n = fx fy s_u s_v / z^2 and tells all later operations.
 
     Raises:
         ValueError: shapes do not agree, or the camera has skew.
@@ -110,7 +113,8 @@ def project(
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    view = (camera.viewmat, camera.K, camera.width, camera.height)
     geom, frames, radii, broken = _Project.apply(
-        means, quats, log_scales, opacity_logits, beta_raw, camera.viewmat, camera.K, camera.width, camera.height, near
+        means, quats, log_scales, opacity_logits, beta_raw, *view, near, prefilter
     )
     return Projection(geom, frames, radii, camera, near, broken)

@@ -23,7 +23,7 @@ class _ViewColor(torch.autograd.Function):
     def forward(ctx, kind, terms, active, center, means, *params):
         inputs = [dense(p, means) for p in params]
         a, b, c = (*inputs, None) if len(inputs) == 2 else inputs
-        x, o = dense(means, means), dense(center, means)
+        x, o = dense(means, means), dense(center, center.double()).to(means.device)
         out = means.new_empty(means.shape[0], 3)
         kernel("view_color_forward", means)(kind, terms, a, b, c, x, o, active, out)
         ctx.save_for_backward(x, o, active, *inputs)
@@ -50,7 +50,7 @@ def view_color(
         kind: sv (Spherical Voronoi, the paper's), sh, sb or sg.
         params: the parameters named in VIEW_COLORS[kind]; more are ignored.
         means: [N, 3] world positions.
-        center: [3] camera centre, world.
+        center: [3] camera centre, world; used in float64 (`Camera.exact_center`).
         active: [N] bool; rows that are not active give 0 and get no gradient. None = all.
 
     Returns:

@@ -45,6 +45,7 @@ class BakedScene:
         mean_residual: [N, 3] float32 mean residual of every tile; a surfel without a tile has this residual. None = 0.
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
+        prefilter: low_pass or pixel, as in `SceneConfig`.
     """
 
     surfels: Mapping[str, Tensor]
@@ -57,6 +58,7 @@ class BakedScene:
     mean_residual: Tensor | None = None
     near: float = 0.2
     weight_bound: float = 0.0
+    prefilter: str = "low_pass"
     _patches: tuple | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
@@ -74,6 +76,7 @@ class BakedScene:
             mean_residual=bundle.mean_residual,
             near=info["render"]["near"],
             weight_bound=info["render"]["weight_bound"],
+            prefilter=info["render"].get("prefilter", "low_pass"),
         )
 
     def __len__(self) -> int:
@@ -90,8 +93,9 @@ class BakedScene:
         """
         p = self.surfels
         means = p["means"]
-        projection = project(means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"], camera, self.near)
-        base = view_color(self.view_color, p, means, camera.center.to(means), projection.visible)
+        geometry = (means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
+        projection = project(*geometry, camera, self.near, self.prefilter == "pixel")
+        base = view_color(self.view_color, p, means, camera.exact_center, projection.visible)
         size = (camera.width, camera.height)
         image = means.new_empty(camera.height, camera.width, 9 if maps else 4)
         overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None

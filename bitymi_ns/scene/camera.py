@@ -35,9 +35,15 @@ class Camera:
             raise ValueError(f"a camera needs a positive image size, not {self.width} x {self.height}")
 
     @property
+    def exact_center(self) -> Tensor:
+        """[3] float64, camera centre in the world frame: far from the origin float32 would not place it."""
+        viewmat = self.viewmat.double()
+        return -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+    @property
     def center(self) -> Tensor:
         """[3] camera centre in the world frame."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        return self.exact_center.to(self.viewmat)
 
     @cached_property
     def skewed(self) -> bool:

@@ -34,5 +34,8 @@ class SceneConfig:
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels."""
+    prefilter: Literal["low_pass", "pixel"] = "low_pass"
+    """How discs of a pixel or less are drawn: low_pass = never less than a fixed blob around their centre; pixel = as
+    much as they cover of a pixel, moments kept (docs/numerics.md)."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""

@@ -91,7 +91,7 @@ class Scene(nn.Module):
     def base_color(self, projection: Projection) -> Tensor:
         """[N, 3] f_view(d) of the surfels that the camera sees, 0 elsewhere."""
         means = self.surfels["means"]
-        center = projection.camera.center.to(means)
+        center = projection.camera.exact_center
         return view_color(self.config.view_color, self.surfels, means, center, projection.visible)
 
     def render(
@@ -113,7 +113,7 @@ class Scene(nn.Module):
         """
         p = self.surfels
         projection = project(
-            p["means"], p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"], camera, self.config.near
+            *(p[name] for name in GEOMETRY), camera, self.config.near, self.config.prefilter == "pixel"
         )
         fragments = trace(projection, self.config.rim)
         geometry, weights = None, ()

@@ -112,7 +112,7 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(
       name("project_forward").c_str(),
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, int width, int height,
-         double near, Out geom, Out frames, Out radii, Array<int32_t> broken) {
+         double near, bool prefilter, Out geom, Out frames, Out radii, Array<int32_t> broken) {
         const int64_t n = int64_t(opacity_logits.size());
         const Surfels<S> in = surfels<S>(n, means, quats, log_scales, opacity_logits, beta_raw);
         S *g = data(geom, n * kGeom, "geom"), *f = data(frames, n * kFrame, "frames");
@@ -120,11 +120,11 @@ void bind(nb::module_& m, const char* suffix) {
         const Pinhole<S> cam = camera<S>(viewmat, K);
         int32_t* count = data(broken, 1, "broken");
         nb::gil_scoped_release release;
-        *count += int32_t(project_forward(cam, width, height, S(near), in, g, f, r));
+        *count += int32_t(project_forward(cam, width, height, S(near), prefilter, in, g, f, r));
       },
       "means"_a.noconvert(), "quats"_a.noconvert(), "log_scales"_a.noconvert(), "opacity_logits"_a.noconvert(),
       "beta_raw"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a,
-      "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert());
+      "prefilter"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert());
 
   m.def(
       name("project_backward").c_str(),
@@ -252,11 +252,12 @@ void bind(nb::module_& m, const char* suffix) {
 
   m.def(
       name("view_color_forward").c_str(),
-      [](const std::string& kind, int terms, In a, In b, Maybe<const S> c, In means, In center,
+      [](const std::string& kind, int terms, In a, In b, Maybe<const S> c, In means, Array<const double> center,
          Array<const uint8_t> active, Out out) {
         const int64_t n = int64_t(active.size());
         const ViewColorArrays<const S> p = {kind_number(kind), terms, a.data(), b.data(), c ? c->data() : nullptr};
-        const S *x = data(means, 3 * n, "means"), *o = data(center, 3, "center");
+        const S* x = data(means, 3 * n, "means");
+        const double* o = data(center, 3, "center");
         S* to = data(out, 3 * n, "out");
         nb::gil_scoped_release release;
         view_color_forward(n, p, x, o, active.data(), to);
@@ -266,12 +267,13 @@ void bind(nb::module_& m, const char* suffix) {
 
   m.def(
       name("view_color_backward").c_str(),
-      [](const std::string& kind, int terms, In a, In b, Maybe<const S> c, In means, In center,
+      [](const std::string& kind, int terms, In a, In b, Maybe<const S> c, In means, Array<const double> center,
          Array<const uint8_t> active, In dout, Out da, Out db, Maybe<S> dc, Out dmeans) {
         const int64_t n = int64_t(active.size());
         const ViewColorArrays<const S> p = {kind_number(kind), terms, a.data(), b.data(), c ? c->data() : nullptr};
         const ViewColorArrays<S> d = {p.kind, terms, da.data(), db.data(), dc ? dc->data() : nullptr};
-        const S *x = data(means, 3 * n, "means"), *o = data(center, 3, "center");
+        const S* x = data(means, 3 * n, "means");
+        const double* o = data(center, 3, "center");
         const S* g = data(dout, 3 * n, "dout");
         S* dx = data(dmeans, 3 * n, "dmeans");
         nb::gil_scoped_release release;

@@ -7,7 +7,7 @@
 // axis ratio k loses k^2 in its determinant, and a bound that misses a pixel is a hole in the picture.
 #pragma once
 
-#include "core/surfel.h"
+#include "core/prefilter.h"
 
 namespace bt {
 
@@ -22,11 +22,45 @@ struct Extent {
   bool thin;                 // the conic is too flat to intersect: use the box
 };
 
+// With the prefilter the level set lies in the ellipse q <= r_c^2 of the largest blur and magnification that any pixel
+// can have: omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
+BT_HD Extent filtered_extent(const double* g) {
+  using S = double;
+  Extent e = {};
+  const S n = g[kArea], w0 = g[kW0], c = filter_variance(g[kBeta]);
+  if (!(w0 > S(0)) || !(g[kOpacity] * S(255) > S(1))) return e;  // exactly edge-on: nothing to see
+  const S e1 = g[kW1] * g[kV2] - g[kW2] * g[kV1], e2 = g[kU1] * g[kW2] - g[kU2] * g[kW1];
+  const S eta = S(kSupport) * sqrt_(e1 * e1 + e2 * e2) * n / w0 * S(1.0001);
+  e.whole = !(eta < S(0.9));
+  e.visible = true;
+  if (e.whole) {
+    e.x0 = e.y0 = S(-1e9), e.x1 = e.y1 = S(1e9);
+    return e;
+  }
+  const S w = S(1) / (S(1) - eta), w2 = w * w * n * n;
+  const S xx = w2 * (g[kU2] * g[kU2] + g[kV2] * g[kV2]) + c, yy = w2 * (g[kU1] * g[kU1] + g[kV1] * g[kV1]) + c;
+  const S xy = -w2 * (g[kU1] * g[kU2] + g[kV1] * g[kV2]), area = w * w * n * w0;
+  // the determinant without cancellation, and not below what rounding the coefficients leaves of it
+  const S det = max_(area * area + c * (xx + yy - c), S(1e-12) * xx * yy);
+  const S level = log_(S(255) * g[kOpacity] * area / sqrt_(det)) + S(1e-4);
+  e.visible = level >= S(0);
+  if (!e.visible) return e;
+  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
+  const S rc2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(1e-6));
+  e.qa = yy / det, e.qb = -xy / det, e.qc = xx / det, e.qd = e.qe = S(0), e.qf = -rc2;
+  const S hx = sqrt_(rc2 * xx) * S(1.0001) + S(0.01), hy = sqrt_(rc2 * yy) * S(1.0001) + S(0.01);
+  e.ex0 = -hx, e.ex1 = hx, e.ey0 = -hy, e.ey1 = hy;
+  e.x0 = -hx, e.x1 = hx, e.y0 = -hy, e.y1 = hy;
+  e.thin = !(e.qa * e.qc - e.qb * e.qb > S(1e-10) * e.qa * e.qc);
+  return e;
+}
+
 template <class F>
 BT_HD Extent extent(const F* geom) {
   using S = double;
   S g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = S(geom[i]);
+  if (g[kArea] > S(0)) return filtered_extent(g);
   Extent e;
   const S o255 = S(255) * g[kOpacity];
   e.visible = o255 >= S(1);

@@ -1,24 +1,18 @@
 // Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel) with a
-// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))).
+// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or, where a row's kArea is
+// set, with the prefilter of core/prefilter.h.
 #pragma once
 
-#include "core/surfel.h"
+#include "core/prefilter.h"
 
 namespace bt {
-
-template <class T>
-struct Fragment {
-  T u, v;      // surfel coordinates in scale units; clamped to the support in the low-pass branch, 0 without a hit
-  T depth;     // camera z of the hit; of the centre in the low-pass branch
-  T sigma;     // effective opacity
-  T low_pass;  // 1 in the low-pass branch, else 0
-};
 
 // S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected centre. Without kBlur the low
 // pass is left out, for pixels so far from the centre that it cannot reach alpha 1/255.
 template <class S, class T, bool kBlur = true>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
+  if (g[kArea] > S(0)) return filtered_fragment<S, T>(g, near, filtered_place<S, T>(g, dx, dy));
   const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
   const S q = g[kW0] * g[kZ];
   const auto hit = (W > zero) & (T(q) > T(near) * W);
@@ -49,6 +43,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
 template <class S, class T>
 BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
                         T& ddy) {
+  if (g[kArea] > S(0)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
   const T zero = T(S(0)), one = T(S(1)), two = T(S(2));
   const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
   const S q = g[kW0] * g[kZ];

@@ -18,9 +18,12 @@ constexpr double kAlphaMax = 0.99;       // sigma is clamped to this
 constexpr double kAlphaMin = 1.0 / 255;  // fragments below this are skipped
 constexpr double kTransmittanceMin = 1e-4;
 constexpr double kBetaMax = 4.0;
+constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their squares stay finite in float32
 
 // Columns of a row of `geom` [N, kGeom].
-enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kGeom = 16 };
+enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kArea, kGeom = 16 };
+// kArea: 0, or with the prefilter n = fx fy s_u s_v / z^2, for which n w0 is the area of the projected scale ellipse
+// over pi (core/prefilter.h).
 // Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
@@ -65,17 +68,27 @@ BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec3<S> dv, Vec3<S> dn
   dq[2] = (gy - along * y) * r.inv, dq[3] = (gz - along * z) * r.inv;
 }
 
+// s = exp of the clamped log scale; ds/dlog is s inside the range and 0 beyond.
+template <class S>
+BT_HD S surfel_scale(S log_scale) {
+  return exp_(clamp_(log_scale, S(-kLogScaleMax), S(kLogScaleMax)));
+}
+template <class S>
+BT_HD bool scale_moves(S log_scale) {
+  return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
+}
+
 // Fills a row of geom and frames; false (and untouched rows) when the surfel is not finite or its centre is nearer than
 // `near` (camera z).
 template <class S>
 BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
-                   S beta_raw, S near, S* geom, S* frame) {
+                   S beta_raw, S near, bool prefilter, S* geom, S* frame) {
   const Rotation<S> rot = rotation(quat);
   const Vec3<S> m = load3(mean);
-  const S su = exp_(log_scales[0]), sv = exp_(log_scales[1]);
-  const Vec3<S> p = rotate(cam.R, m) + load3(cam.t);
+  const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
+  const Vec3<S> p = to_camera(cam, mean);
   if (!rot.ok || !finite_(p.x) || !finite_(p.y) || !finite_(p.z) || !(p.z > near)) return false;
-  if (!finite_(su) || !finite_(sv) || !(su > S(0)) || !(sv > S(0))) return false;
+  if (!finite_(log_scales[0]) || !finite_(log_scales[1])) return false;
   if (!finite_(opacity_logit) || !finite_(beta_raw)) return false;
   const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
   const Vec3<S> pa = cross(p, a), pb = cross(p, b);
@@ -92,7 +105,9 @@ BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S*
   g[kOpacity] = sigmoid(opacity_logit);
   g[kBeta] = S(kBetaMax) * sigmoid(beta_raw);
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
-  g[15] = S(0);
+  // discs of a million pixels need no filter, and their squared areas would overflow
+  const S area = cam.fx * cam.fy * su * sv * iz * iz;
+  g[kArea] = prefilter && area < S(1e12) ? area : S(0);
   for (int i = 0; i < kGeom; ++i)
     if (!finite_(g[i])) return false;
   for (int i = 0; i < kGeom; ++i) geom[i] = g[i];
@@ -102,14 +117,15 @@ BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S*
   return true;
 }
 
-// Gradients of the parameters of one projected surfel; they are written, not added.
+// Gradients of the parameters of one projected surfel; they are written, not added. The slope of a sigmoid is taken
+// from its argument, sigmoid(x) sigmoid(-x): at o -> 1 nothing is left of 1 - o in float32.
 template <class S>
-BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, const S* geom,
-                       const S* dgeom, const S* dframe, S* dmean, S* dquat, S* dlog_scales, S* dopacity_logit,
-                       S* dbeta_raw) {
+BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
+                       S beta_raw, const S* geom, const S* dgeom, const S* dframe, S* dmean, S* dquat, S* dlog_scales,
+                       S* dopacity_logit, S* dbeta_raw) {
   const Rotation<S> rot = rotation(quat);
-  const S su = exp_(log_scales[0]), sv = exp_(log_scales[1]);
-  const Vec3<S> p = rotate(cam.R, load3(mean)) + load3(cam.t);
+  const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
+  const Vec3<S> p = to_camera(cam, mean);
   const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
   const S np = dot(n, p);
   const S sign = np < S(0) ? S(-1) : S(1);
@@ -128,16 +144,21 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, cons
   dp.y += cam.fy * iz * dgeom[kCy];
   dp.z += dgeom[kZ] - iz * (dgeom[kW0] * geom[kW0] + iz * (cam.fx * p.x * dgeom[kCx] + cam.fy * p.y * dgeom[kCy]));
 
+  const S darea = dgeom[kArea] * geom[kArea];  // towards log n
+  dp.z -= S(2) * iz * darea;
+
   store3(dmean, rotate_transposed(cam.R, dp) + load3(dframe));
   const Vec3<S> dtu = load3(dframe + 3), dtv = load3(dframe + 6);
   const Vec3<S> gu = rotate_transposed(cam.R, da) + su * dtu;
   const Vec3<S> gv = rotate_transposed(cam.R, db) + sv * dtv;
   rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
   // u1, u2 scale with 1/s_u and the frame with s_u
-  dlog_scales[0] = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu);
-  dlog_scales[1] = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv);
-  *dopacity_logit = dgeom[kOpacity] * geom[kOpacity] * (S(1) - geom[kOpacity]);
-  *dbeta_raw = dgeom[kBeta] * geom[kBeta] * (S(1) - geom[kBeta] / S(kBetaMax));
+  const S gsu = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu) + darea;
+  const S gsv = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv) + darea;
+  dlog_scales[0] = scale_moves(log_scales[0]) ? gsu : S(0);
+  dlog_scales[1] = scale_moves(log_scales[1]) ? gsv : S(0);
+  *dopacity_logit = dgeom[kOpacity] * geom[kOpacity] * sigmoid(-opacity_logit);
+  *dbeta_raw = dgeom[kBeta] * geom[kBeta] * sigmoid(-beta_raw);
 }
 
 }  // namespace bt

@@ -10,6 +10,14 @@ namespace bt {
 constexpr int kMaxTerms = 32;
 constexpr double kLogTauMax = 16;  // temperatures end at 9e6: finite in, finite out
 
+// Direction from the camera's centre, given in double: far from the origin its rounding to float32 would turn the
+// direction, while the difference is as exact as the surfel's own position.
+template <class S>
+BT_HD Unit<S> view_direction(const S* mean, const double* center) {
+  return normalize(
+      Vec3<S>{S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])});
+}
+
 // c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
 template <class S>
 BT_HD Vec3<S> sv_color(int K, const S* sites, const S* log_tau, const S* rgb, Vec3<S> d) {
@@ -27,30 +35,34 @@ BT_HD Vec3<S> sv_color(int K, const S* sites, const S* log_tau, const S* rgb, Ve
   }
   return (S(1) / total) * c;
 }
-// Adds to dd; writes the rest.
+// Adds to dd; writes the rest. dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the
+// heaviest site: where one site takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not
+// the difference of two equal colours, whose rounding a temperature of 1e4 would multiply.
 template <class S>
 BT_HD void sv_color_vjp(int K, const S* sites, const S* log_tau, const S* rgb, Vec3<S> d, Vec3<S> dc, S* dsites,
                         S* dlog_tau, S* drgb, Vec3<S>& dd) {
   S w[kMaxTerms], tau[kMaxTerms], top = S(-1e30), total = S(0);
   Unit<S> site[kMaxTerms];
-  Vec3<S> c = {S(0), S(0), S(0)};
+  Vec3<S> c = {S(0), S(0), S(0)};  // relative to the pivot
+  int first = 0;
   for (int k = 0; k < K; ++k) {
     site[k] = normalize(load3(sites + 3 * k));
     tau[k] = exp_(min_(log_tau[k], S(kLogTauMax)));
     w[k] = tau[k] * dot(site[k].n, d);
-    top = max_(top, w[k]);
+    if (w[k] > top) top = w[k], first = k;
   }
+  const Vec3<S> pivot = load3(rgb + 3 * first);
   for (int k = 0; k < K; ++k) {
     w[k] = exp_(w[k] - top);
     total += w[k];
   }
   for (int k = 0; k < K; ++k) {
     w[k] /= total;
-    c = c + w[k] * load3(rgb + 3 * k);
+    c = c + w[k] * (load3(rgb + 3 * k) - pivot);
   }
   for (int k = 0; k < K; ++k) {
     store3(drgb + 3 * k, w[k] * dc);
-    const S dlogit = w[k] * dot(dc, load3(rgb + 3 * k) - c);
+    const S dlogit = w[k] * dot(dc, (load3(rgb + 3 * k) - pivot) - c);
     const S along = dot(site[k].n, d);
     dlog_tau[k] = log_tau[k] < S(kLogTauMax) ? dlogit * tau[k] * along : S(0);
     store3(dsites + 3 * k, normalize_vjp(site[k], (dlogit * tau[k]) * d));

@@ -26,8 +26,8 @@ struct SurfelGradients {
 // geom [n, kGeom], frames [n, kFrame], radii [n, 2] (half extents of the level-set box in pixels, 0 where not visible),
 // rows of surfels that are not visible are zero. Returns how many rows are not finite.
 template <class S>
-int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in, S* geom, S* frames,
-                        S* radii);
+int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bool prefilter, const Surfels<S>& in,
+                        S* geom, S* frames, S* radii);
 template <class S>
 void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
                       const SurfelGradients<S>& out);
@@ -91,17 +91,18 @@ void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixe
 
 // View colours; kind: 0 sv, 1 sh, 2 sb, 3 sg; `terms` = sites, coefficients (with dc) or lobes.
 // Parameters: sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
-// sb, sg a = base [n,3], b = lobes [n,K,6 or 7]. Rows where active is 0 give 0 and get gradient 0.
+// sb, sg a = base [n,3], b = lobes [n,K,6 or 7]. center [3]: of the camera. Rows where active is 0 give 0 and get
+// gradient 0.
 template <class S>
 struct ViewColorArrays {
   int kind, terms;
   S *a, *b, *c;
 };
 template <class S>
-void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const S* center,
+void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                         const uint8_t* active, S* out);
 template <class S>
-void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const S* center,
+void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                          const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans);
 
 // Residual colour field.

@@ -23,15 +23,15 @@ int num_threads() {
 void set_num_threads(int n) { g_threads = n; }
 
 template <class S>
-int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in, S* geom, S* frames,
-                        S* radii) {
+int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bool prefilter, const Surfels<S>& in,
+                        S* geom, S* frames, S* radii) {
   std::vector<int64_t> broken(num_threads(), 0);
   parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       S *g = geom + i * kGeom, *f = frames + i * kFrame, *r = radii + 2 * i;
       r[0] = r[1] = S(0);
       bool seen = project(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                          in.beta_raw[i], near, g, f);
+                          in.beta_raw[i], near, prefilter, g, f);
       if (seen) {
         const Extent e = extent(g);
         seen =
@@ -71,9 +71,9 @@ void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom
         out.opacity_logits[i] = out.beta_raw[i] = S(0);
         continue;
       }
-      project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, g, dgeom + i * kGeom,
-                  dframes ? dframes + i * kFrame : none, out.means + 3 * i, out.quats + 4 * i, out.log_scales + 2 * i,
-                  out.opacity_logits + i, out.beta_raw + i);
+      project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i],
+                  g, dgeom + i * kGeom, dframes ? dframes + i * kFrame : none, out.means + 3 * i, out.quats + 4 * i,
+                  out.log_scales + 2 * i, out.opacity_logits + i, out.beta_raw + i);
     }
   });
 }
@@ -141,10 +141,10 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
   }
 }
 
-#define BT_INSTANTIATE(S)                                                                               \
-  template int64_t project_forward<S>(const Pinhole<S>&, int, int, S, const Surfels<S>&, S*, S*, S*);   \
-  template void project_backward<S>(const Pinhole<S>&, const Surfels<S>&, const S*, const S*, const S*, \
-                                    const SurfelGradients<S>&);                                         \
+#define BT_INSTANTIATE(S)                                                                                   \
+  template int64_t project_forward<S>(const Pinhole<S>&, int, int, S, bool, const Surfels<S>&, S*, S*, S*); \
+  template void project_backward<S>(const Pinhole<S>&, const Surfels<S>&, const S*, const S*, const S*,     \
+                                    const SurfelGradients<S>&);                                             \
   template void bin<S>(int64_t, const S*, const S*, int, int, Bins&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

@@ -47,31 +47,41 @@ struct TileState {
         const int pack = py * kPacksAcross + px;
         if (!bits(open[pack])) continue;
         const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
+        if (g[kArea] > S(0)) {
+          const FilteredPlace<P> at = filtered_place<S, P>(g, dx, dy);
+          if (bits(open[pack] & (at.q < P(S(kSupport * kSupport)))))
+            take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
+          continue;
+        }
         // a cheap look first: does any lane lie in the support or near the centre?
         const P W = P(g[kW0]) + P(g[kW1]) * dx + P(g[kW2]) * dy;
         const P U = P(g[kU1]) * dx + P(g[kU2]) * dy, V = P(g[kV1]) * dx + P(g[kV2]) * dy;
         const P reach = P(S(kSupport * kSupport)) * W * W;
         const M near_centre = dx * dx + dy * dy < P(blur2);
         if (!bits(open[pack] & ((U * U + V * V < reach) | near_centre))) continue;
-        const Fragment<P> f =
-            bits(near_centre) ? fragment<S, P, true>(g, near, dx, dy) : fragment<S, P, false>(g, near, dx, dy);
-        M take = open[pack] & (f.sigma >= P(S(kAlphaMin)));
-        if (!bits(take)) continue;
-        const P weight = f.sigma * transmittance[pack];
-        const P next = transmittance[pack] - weight;
-        // the surfel that would take a pixel below the bound is not blended and ends it
-        const M ends = take & (next < P(S(kTransmittanceMin)));
-        open[pack] = open[pack] & ~ends;
-        take = take & ~ends;
-        transmittance[pack] = select(take, next, transmittance[pack]);
-        const uint32_t lanes = bits(take);
-        if (lanes) fn(pack, lanes, f, weight);
-        if (!bits(open[pack])) --open_packs;
+        take_fragment(
+            pack, bits(near_centre) ? fragment<S, P, true>(g, near, dx, dy) : fragment<S, P, false>(g, near, dx, dy),
+            fn);
       }
     }
   }
 
  private:
+  template <class F>
+  void take_fragment(int pack, const Fragment<P>& f, F& fn) {
+    M take = open[pack] & (f.sigma >= P(S(kAlphaMin)));
+    if (!bits(take)) return;
+    const P weight = f.sigma * transmittance[pack];
+    const P next = transmittance[pack] - weight;
+    // the surfel that would take a pixel below the bound is not blended and ends it
+    const M ends = take & (next < P(S(kTransmittanceMin)));
+    open[pack] = open[pack] & ~ends;
+    take = take & ~ends;
+    transmittance[pack] = select(take, next, transmittance[pack]);
+    const uint32_t lanes = bits(take);
+    if (lanes) fn(pack, lanes, f, weight);
+    if (!bits(open[pack])) --open_packs;
+  }
   static int first(S offset) {  // pack that holds the pixel at this offset, at least 0
     return offset <= S(0) ? 0 : int(offset) / kPackSide;
   }

@@ -96,8 +96,8 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
-  // a part's own sums: 14 numbers a surfel (12 columns of geom and the two absolute gradients)
-  constexpr int kColumns = kBeta + 1, kSums = kColumns + 2;
+  // a part's own sums: 15 numbers a surfel (12 columns of geom, the area, and the two absolute gradients)
+  constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
   const int parts = parallel_tiles(tile_start, tiles, most, [&](int part, int64_t first_tile, int64_t last_tile) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
@@ -132,6 +132,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
         for (int k = m; k % kLanes; ++k) dsigma[k] = du[k] = dv[k] = dz[k] = dx[k] = dy[k] = S(0), low[k] = S(1);
         P d[kGeom], ax = P(S(0)), ay = P(S(0));
         for (int k = 0; k < kColumns; ++k) d[k] = P(S(0));
+        d[kArea] = P(S(0));
         for (int k = 0; k < m; k += kLanes) {
           P ddx, ddy;
           fragment_vjp<S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k), load(du + k),
@@ -141,6 +142,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
         S* to = sums.data() + int64_t(id) * kSums;
         for (int k = 0; k < kColumns; ++k) to[k] += sum(d[k]);
         to[kColumns] += sum(ax), to[kColumns + 1] += sum(ay);
+        to[kColumns + 2] += sum(d[kArea]);
       }
     }
   });
@@ -150,6 +152,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
         const S* from = partial[p].data() + i * kSums;
         for (int k = 0; k < kColumns; ++k) dgeom[i * kGeom + k] += from[k];
         absgrad[2 * i] += from[kColumns], absgrad[2 * i + 1] += from[kColumns + 1];
+        dgeom[i * kGeom + kArea] += from[kColumns + 2];
       }
     }
   });

@@ -8,22 +8,17 @@ namespace bt {
 
 namespace {
 enum Kind { kSv, kSh, kSb, kSg };
-
-template <class S>
-Unit<S> direction(const S* mean, const S* center) {
-  return normalize(load3(mean) - load3(center));
-}
 }  // namespace
 
 template <class S>
-void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const S* center,
+void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                         const uint8_t* active, S* out) {
   const int K = p.terms;
   parallel_parts(n, 256, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       Vec3<S> c = {S(0), S(0), S(0)};
       if (active[i]) {
-        const Vec3<S> d = direction(means + 3 * i, center).n;
+        const Vec3<S> d = view_direction(means + 3 * i, center).n;
         if (p.kind == kSv) c = sv_color(K, p.a + 3 * K * i, p.b + K * i, p.c + 3 * K * i, d);
         if (p.kind == kSh) c = sh_color(K, p.a + 3 * i, p.b + 3 * (K - 1) * i, d);
         if (p.kind == kSb) c = sb_color(K, p.a + 3 * i, p.b + 6 * K * i, d);
@@ -35,7 +30,7 @@ void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* m
 }
 
 template <class S>
-void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const S* center,
+void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                          const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans) {
   const int K = p.terms;
   const int64_t na = p.kind == kSv ? 3 * K : 3;
@@ -50,7 +45,7 @@ void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* 
         store3(dmeans + 3 * i, Vec3<S>{S(0), S(0), S(0)});
         continue;
       }
-      const Unit<S> d = direction(means + 3 * i, center);
+      const Unit<S> d = view_direction(means + 3 * i, center);
       const Vec3<S> g = load3(dout + 3 * i);
       Vec3<S> dd = {S(0), S(0), S(0)};
       if (p.kind == kSv)
@@ -64,11 +59,11 @@ void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* 
   });
 }
 
-#define BT_INSTANTIATE(S)                                                                                            \
-  template void view_color_forward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const S*, const uint8_t*,  \
-                                      S*);                                                                           \
-  template void view_color_backward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const S*, const uint8_t*, \
-                                       const S*, const ViewColorArrays<S>&, S*);
+#define BT_INSTANTIATE(S)                                                                                 \
+  template void view_color_forward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*,  \
+                                      const uint8_t*, S*);                                                \
+  template void view_color_backward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*, \
+                                       const uint8_t*, const S*, const ViewColorArrays<S>&, S*);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

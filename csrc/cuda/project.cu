@@ -20,14 +20,14 @@ __device__ Pinhole<S> pinhole(const S* viewmat, const S* K) {
 
 template <class S>
 __global__ void __launch_bounds__(kThreads)
-    forward_kernel(const S* viewmat, const S* K, int width, int height, S near, Surfels<S> in, S* geom, S* frames,
+    forward_kernel(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, Surfels<S> in, S* geom, S* frames,
                    S* radii, int32_t* broken) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.n) return;
   const Pinhole<S> cam = pinhole(viewmat, K);
   S g[kGeom], f[kFrame], r[2] = {S(0), S(0)};
   bool seen = project(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                      in.beta_raw[i], near, g, f);
+                      in.beta_raw[i], near, prefilter, g, f);
   if (seen) {
     const Extent e = extent(g);
     seen = e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
@@ -58,7 +58,7 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(const S* viewmat, co
   if (g[kZ] != S(0)) {
     const Pinhole<S> cam = pinhole(viewmat, K);
     const S none[kFrame] = {};
-    project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, g, dgeom + i * kGeom,
+    project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i], g, dgeom + i * kGeom,
                 dframes ? dframes + i * kFrame : none, dmean, dquat, dscales, &dopacity, &dbeta);
   }
   for (int k = 0; k < 3; ++k) out.means[3 * i + k] = dmean[k];
@@ -69,11 +69,11 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(const S* viewmat, co
 }  // namespace
 
 template <class S>
-void project_forward(const S* viewmat, const S* K, int width, int height, S near, const Surfels<S>& in, S* geom,
+void project_forward(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, const Surfels<S>& in, S* geom,
                      S* frames, S* radii, int32_t* broken, Stream stream) {
   if (!in.n) return;
   BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(in.n, kThreads))), dim3(kThreads), 0, stream, viewmat, K, width,
-            height, near, in, geom, frames, radii, broken);
+            height, near, prefilter, in, geom, frames, radii, broken);
 }
 template <class S>
 void project_backward(const S* viewmat, const S* K, const Surfels<S>& in, const S* geom, const S* dgeom,
@@ -84,7 +84,7 @@ void project_backward(const S* viewmat, const S* K, const Surfels<S>& in, const 
 }
 
 #define BT_INSTANTIATE(S)                                                                                             \
-  template void project_forward<S>(const S*, const S*, int, int, S, const Surfels<S>&, S*, S*, S*, int32_t*, Stream); \
+  template void project_forward<S>(const S*, const S*, int, int, S, bool, const Surfels<S>&, S*, S*, S*, int32_t*, Stream); \
   template void project_backward<S>(const S*, const S*, const Surfels<S>&, const S*, const S*, const S*,              \
                                     const SurfelGradients<S>&, Stream);
 BT_INSTANTIATE(float)

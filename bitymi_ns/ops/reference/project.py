@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 BETA_MAX = 4.0
+LOG_SCALE_MAX = 30.0
 NORM_FLOOR = 1e-12
 
 
@@ -60,7 +61,7 @@ def project(
     Args:
         means: [N, 3] world.
         quats: [N, 4] wxyz, any length; a surfel whose quaternion is 0 is not valid.
-        log_scales: [N, 2] natural logarithm of the world-space tangent scales.
+        log_scales: [N, 2] natural logarithm of the world-space tangent scales, clamped to +-30.
         opacity_logits: [N], opacity = sigmoid.
         beta_raw: [N], beta = 4 sigmoid.
         viewmat: [4, 4] world to camera, OpenCV axes.
@@ -68,7 +69,7 @@ def project(
         near: surfels whose centre has camera z <= near are not valid.
     """
     R = rotation(quats)  # [N, 3, 3]
-    tangents = R[:, :, :2] * log_scales.exp()[:, None, :]  # [N, 3, 2] world
+    tangents = R[:, :, :2] * log_scales.clamp(-LOG_SCALE_MAX, LOG_SCALE_MAX).exp()[:, None, :]  # [N, 3, 2] world
     view_R, view_t = viewmat[:3, :3], viewmat[:3, 3]
     center = means @ view_R.T + view_t  # [N, 3] camera
     H = torch.cat([view_R @ tangents, center[:, :, None]], dim=-1)  # [N, 3, 3]

@@ -46,18 +46,21 @@ def render(
     tiles: Sequence[Tensor] | None = None,
     residual: Callable[[Tensor], Tensor] | None = None,
     near: float = 0.2,
+    rim: float = 0.0,
+    prefilter: bool = False,
 ) -> Render:
     """Render surfels; colour of a fragment: ReLU(f_view + 0.5), then ReLU(that + texture) where there is a texture.
 
     Args:
         means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near: see `project`.
+        rim, prefilter: see `trace`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
         background: [3], black if not given.
         tiles: one texture tile [r_v, r_u, 3] a surfel.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
     """
     p = project(means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near)
-    t = trace(p, width, height, near)
+    t = trace(p, width, height, near, rim, prefilter)
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]
     if tiles is not None:

@@ -36,7 +36,54 @@ def pixel_centers(width: int, height: int) -> Tensor:
     return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
 
 
-def trace(projection: Projection, width: int, height: int, near: float = 0.2) -> Trace:
+def _power(base: Tensor, exponent: Tensor, floor: float) -> Tensor:
+    """base ** exponent; its derivative with respect to the base has max(base, floor) in the denominator."""
+    if floor <= 0:
+        return base**exponent
+    fixed = base.detach()
+    return torch.exp(exponent * (fixed.log() + (base - fixed) / fixed.clamp(min=floor)))
+
+
+PIXEL_VARIANCE = 0.25  # pixels^2, along each axis
+
+
+def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Kernel times area share [P, N], uv [P, N, 2] and depth [P, N] with the prefilter (docs/numerics.md).
+
+    J = d pixel / d (u, v) at the centre; at a pixel with offset d the affine coordinate is a = J^-1 d, and the disc's
+    perspective there is omega = z / depth = 1 - e.a, with the disc's depth z (1 + e.(u, v)). Outside of the disc's
+    image, omega is taken at the rim in the direction of a. Then Sigma = omega^2 J J^T + c, c = 2 (beta + 2) / 9 / 12.
+    """
+    M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
+    J = (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None]  # [N, 2, 2]
+    area = torch.linalg.det(J)
+    flat = area == 0  # exactly edge-on
+    safe = torch.where((flat | ~projection.valid)[:, None, None], torch.eye(2, dtype=J.dtype), J)
+    d = pixels[:, None] - projection.mean2d  # [P, N, 2]
+    a = torch.linalg.solve(safe, d[..., None])[..., 0]
+    e = M[:, 2, :2] / z[:, None]  # [N, 2]
+    tilt = (a * e).sum(-1)  # [P, N]
+    length = torch.where(
+        (a == 0).all(-1), 0.0, (torch.where((a == 0).all(-1, keepdim=True), 1.0, a) ** 2).sum(-1).sqrt()
+    )
+    outside = length > SUPPORT * (1 - tilt)
+    omega = torch.where(outside, length / torch.where(outside, length + SUPPORT * tilt, 1.0), 1 - tilt)
+    sigma = safe @ safe.transpose(-1, -2)
+    blur = 2 * (projection.beta + 2) / SUPPORT**2 * PIXEL_VARIANCE
+    wide = omega[..., None, None] ** 2 * sigma + blur[:, None, None] * torch.eye(2, dtype=J.dtype)  # [P, N, 2, 2]
+    det = wide[..., 0, 0] * wide[..., 1, 1] - wide[..., 0, 1] ** 2
+    x, y = d.unbind(-1)
+    q = (wide[..., 1, 1] * x * x - 2 * wide[..., 0, 1] * x * y + wide[..., 0, 0] * y * y) / det
+    depth = projection.depth / omega
+    rest = 1 - q / SUPPORT**2
+    inside = (rest > 0) & (depth > near) & ~flat
+    kernel = torch.where(inside, torch.where(inside, rest, 1.0) ** projection.beta, 0.0)
+    return kernel * omega**2 * area.abs() / det.sqrt(), (a / omega[..., None]).clamp(-SUPPORT, SUPPORT), depth
+
+
+def trace(
+    projection: Projection, width: int, height: int, near: float = 0.2, rim: float = 0.0, prefilter: bool = False
+) -> Trace:
     """Intersections, effective opacities and front-to-back weights of all surfels in all pixels.
 
     With k = x M2 - M0, l = y M2 - M1 and c = k x l, the ray of pixel (x, y) meets the surfel at (u, v) = (c.x, c.y) /
@@ -45,7 +92,8 @@ def trace(projection: Projection, width: int, height: int, near: float = 0.2) ->
     the surfel, or meeting it at a depth <= near, has no hit: the first term is 0 there and u = v = 0.
     A fragment is skipped when sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
     centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
-    ends the pixel.
+    ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative, as the kernels do; values do not change.
+    With `prefilter`, G is the kernel seen through a pixel instead (`_filtered`), without a bound at the rim.
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M
@@ -60,9 +108,12 @@ def trace(projection: Projection, width: int, height: int, near: float = 0.2) ->
 
     rest = 1 - (uv**2).sum(-1) / SUPPORT**2
     inside = hit & (rest > 0)
-    kernel = torch.where(inside, torch.where(inside, rest, 1.0) ** projection.beta, 0.0)
+    kernel = torch.where(inside, _power(torch.where(inside, rest, 1.0), projection.beta, rim), 0.0)
     blur = torch.exp(-((pixels[:, None] - projection.mean2d[None]) ** 2).sum(-1))
     low_pass = blur > kernel
+    if prefilter:
+        kernel, uv, depth = _filtered(projection, pixels, near)
+        low_pass = torch.zeros_like(low_pass)
     sigma = (projection.opacity * torch.where(low_pass, blur, kernel)).clamp(max=ALPHA_MAX)
 
     covered = projection.valid & (sigma >= ALPHA_MIN)

@@ -1,0 +1,168 @@
+"""The kernel seen through a pixel: against the reference, its moments, no holes, no jumps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.reference import project as reference_project
+from bitymi_ns.ops.reference import trace as reference_trace
+from bitymi_ns.scene import Camera
+from bitymi_ns.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
+from bitymi_ns.stability.sweeps import SWEEPS
+
+
+def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
+    return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+
+
+def traced(case: SceneCase, values: list[Tensor], rim: float = 0.0) -> tuple[ops.Fragments, ops.Projection]:
+    projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=True)
+    return ops.trace(projection, rim), projection
+
+
+def reference(case: SceneCase, values: list[Tensor]) -> reference_trace.Trace:
+    projected = reference_project.project(*values, case.viewmat, case.K)
+    return reference_trace.trace(projected, case.width, case.height, prefilter=True)
+
+
+def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
+    """[P, N] of one number a fragment."""
+    out = values.new_zeros(fragments.width * fragments.height, n)
+    return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)
+
+
+@pytest.mark.parametrize("scale", [2.0, 0.25, 0.03, 0.002])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: torch.dtype) -> None:
+    case = random_scene(40, 3, scale=scale)
+    values = [case.params[name].to(dtype).requires_grad_() for name in SURFEL_KEYS]
+    fragments, _ = traced(case, values)
+    exact = [value.detach().double().requires_grad_() for value in values]
+    want = reference(case, exact)
+    generator = torch.Generator().manual_seed(1)
+    loss, wanted = 0.0, 0.0
+    kept = want.blended & (dense(fragments, torch.ones(len(fragments)), 40) > 0)
+    assert (kept != want.blended).double().mean() < 1e-4 and kept.any()
+    pairs = [
+        (dense(fragments, fragments.weight, 40), want.weight),
+        *((dense(fragments, fragments.uv[i], 40), want.uv[..., i]) for i in (0, 1)),
+        (dense(fragments, fragments.depth, 40), want.depth),
+    ]
+    for got, expected in pairs:
+        got, expected = torch.where(kept, got, 0.0), torch.where(kept, expected, 0.0)
+        tolerance = 1e-11 if dtype == torch.float64 else 2e-4
+        assert (got.double() - expected).abs().max() < tolerance * expected.abs().max()
+        weight = torch.rand(got.shape, generator=generator, dtype=torch.float64)
+        loss = loss + (got * weight.to(got)).sum()
+        wanted = wanted + (expected * weight).sum()
+    loss.backward()
+    wanted.backward()
+    for name, value, reference_value in zip(SURFEL_KEYS, values, exact, strict=True):
+        scale_of = reference_value.grad.abs().max()
+        error = (value.grad.double() - reference_value.grad).abs().max() / scale_of
+        assert error < (1e-9 if dtype == torch.float64 else 5e-3), (name, error)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    scale=st.floats(-8.0, 2.0),
+    ratio=st.floats(0.0, 12.0),
+    opacity=st.floats(-3.0, 8.0),
+    beta=st.floats(-8.0, 6.0),
+    closer=st.floats(0.15, 1.0),
+)
+def test_bounds_lose_no_fragment(
+    seed: int, scale: float, ratio: float, opacity: float, beta: float, closer: float
+) -> None:
+    case = random_scene(1, seed, width=70, height=50)
+    p = case.params
+    position = -case.viewmat[:3, :3].T @ case.viewmat[:3, 3]
+    p["means"] = position + closer * (p["means"] - position)
+    p["log_scales"] = torch.tensor([[scale, scale - ratio]], dtype=torch.float64)
+    p["opacity_logits"] = torch.tensor([opacity], dtype=torch.float64)
+    p["beta_raw"] = torch.tensor([beta], dtype=torch.float64)
+    values = [p[name] for name in SURFEL_KEYS]
+    fragments, _ = traced(case, values)
+    want = reference(case, values)
+    torch.testing.assert_close(dense(fragments, fragments.weight, 1), want.weight, rtol=1e-8, atol=1e-10)
+
+
+def disc(
+    scale: tuple[float, float], tilt: float, beta: float, at: tuple[float, float]
+) -> tuple[SceneCase, list[Tensor]]:
+    """One disc at depth 10 in a 32 x 32 view of focal length 100, its centre at the given pixel position."""
+    case = random_scene(1, 0, 32, 32)
+    case.viewmat = torch.eye(4, dtype=torch.float64)
+    case.K = torch.tensor([[100.0, 0, 16], [0, 100.0, 16], [0, 0, 1]], dtype=torch.float64)
+    mean = torch.tensor([[(at[0] - 16) / 10, (at[1] - 16) / 10, 10.0]], dtype=torch.float64)
+    quat = torch.tensor([[math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0]], dtype=torch.float64)
+    logs = torch.tensor([[math.log(s) for s in scale]], dtype=torch.float64)
+    raw = math.log(beta) - math.log(4 - beta)
+    return case, [mean, quat, logs, *(torch.tensor([x], dtype=torch.float64) for x in (20.0, raw))]
+
+
+@pytest.mark.parametrize("beta", [0.2, 1.0, 3.5])
+@pytest.mark.parametrize("size", [0.3, 0.1, 0.02])
+def test_small_discs_cover_their_area_wherever_they_lie(size: float, beta: float) -> None:
+    """Over all places in a pixel, the mean of the sum of the kernel is the projected area 9 pi s_u s_v f^2 / z^2 /
+    (beta + 1) and its centre the disc's; at none of them is it lost."""
+    area = math.pi * 9 * size**2 / (beta + 1)
+    pixels = reference_trace.pixel_centers(32, 32)
+    sums, centers = [], []
+    for k in range(36):
+        at = (15 + (k % 6) / 6, 15 + (k // 6) / 6)
+        case, values = disc((size / 10, size / 10), 0.0, beta, at)
+        projected = reference_project.project(*values, case.viewmat, case.K)
+        kernel, _, _ = reference_trace._filtered(projected, pixels, 0.2)  # without the threshold of 1/255
+        sums.append(float(kernel.sum()))
+        centers.append((kernel * pixels).sum(0) / kernel.sum() - torch.tensor(at))
+    assert sum(sums) / len(sums) == pytest.approx(area, rel=0.02)
+    assert min(sums) > 0.6 * area and max(sums) < 1.25 * area
+    assert torch.stack(centers).mean(0).abs().max() < 0.02
+
+
+def test_large_discs_are_as_without_the_filter() -> None:
+    case, values = disc((0.8, 0.5), 0.7, 2.0, (16.2, 15.7))
+    plain = ops.trace(ops.project(*values, camera_of(case)))
+    fragments, _ = traced(case, values)
+    a, b = dense(plain, plain.weight, 1), dense(fragments, fragments.weight, 1)
+    assert (a - b).abs().max() < 0.02
+    inside = (a > 0.05) & (b > 0.05)
+    for i in (0, 1):
+        u, v = dense(plain, plain.uv[i], 1), dense(fragments, fragments.uv[i], 1)
+        torch.testing.assert_close(u[inside], v[inside], rtol=1e-12, atol=1e-12)
+
+
+def test_discs_that_turn_edge_on_fade_with_the_cosine() -> None:
+    """The low pass leaves a blob of three pixels' worth at any angle."""
+    angles = (60.0, 85.0, 89.0, 89.5, 89.9, 89.99)
+    covered, blob = [], []
+    for degrees in angles:
+        case, values = disc((0.5, 0.5), math.radians(degrees), 2.0, (16.0, 16.0))
+        covered.append(float(traced(case, values)[0].weight.sum()) / math.cos(math.radians(degrees)))
+        blob.append(float(ops.trace(ops.project(*values, camera_of(case))).weight.sum()))
+    assert covered[0] == pytest.approx(9 * math.pi * 25 / 3, rel=0.03)
+    assert max(covered[:4]) < 1.1 * covered[0] and min(covered[:4]) > 0.8 * covered[0]
+    assert covered[4] * math.cos(math.radians(89.9)) < 0.6 and covered[5] == 0  # below 1/255
+    assert blob[-1] > 2.5
+
+
+def test_thin_needles_stay_well_conditioned() -> None:
+    """Axis ratio 1e4, edge-on to 1e-4: with the low pass, rounding the inputs moves single pixels by 1e-3."""
+    for name, value in (("axis ratio", 1e4), ("edge-on", 1e-4)):
+        sweep = next(sweep for sweep in SWEEPS if sweep.name == name)
+        case = sweep.make(value)
+        single = [case.params[key].float() for key in SURFEL_KEYS]
+        fragments, _ = traced(case, single)
+        want = reference(case, [value.double() for value in single])
+        n = len(single[0])
+        error = (dense(fragments, fragments.weight.double(), n) - want.weight).abs()
+        assert error.max() < 2e-5 + 1.01 / 255 * (~want.blended).any(), (name, error.max())

@@ -1,0 +1,16 @@
+"""Every test that takes `backend` runs on all of them; a new one is one entry of BACKENDS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from bitymi_ns.stability.backends import BACKENDS, Backend
+
+
+@pytest.fixture(params=sorted(BACKENDS))
+def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
+    chosen = BACKENDS[request.param]
+    with chosen.use():
+        yield chosen

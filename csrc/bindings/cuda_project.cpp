@@ -24,7 +24,8 @@ void bind(nb::module_& m, const char* forward, const char* backward) {
       },
       "means"_a.noconvert(), "quats"_a.noconvert(), "log_scales"_a.noconvert(), "opacity_logits"_a.noconvert(),
       "beta_raw"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a,
-      "prefilter"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert(), "stream"_a = 0);
+      "prefilter"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert(),
+      "stream"_a = 0);
   m.def(
       backward,
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, In geom, In dgeom,

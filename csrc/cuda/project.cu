@@ -20,8 +20,8 @@ __device__ Pinhole<S> pinhole(const S* viewmat, const S* K) {
 
 template <class S>
 __global__ void __launch_bounds__(kThreads)
-    forward_kernel(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, Surfels<S> in, S* geom, S* frames,
-                   S* radii, int32_t* broken) {
+    forward_kernel(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, Surfels<S> in, S* geom,
+                   S* frames, S* radii, int32_t* broken) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.n) return;
   const Pinhole<S> cam = pinhole(viewmat, K);
@@ -58,8 +58,8 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(const S* viewmat, co
   if (g[kZ] != S(0)) {
     const Pinhole<S> cam = pinhole(viewmat, K);
     const S none[kFrame] = {};
-    project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i], g, dgeom + i * kGeom,
-                dframes ? dframes + i * kFrame : none, dmean, dquat, dscales, &dopacity, &dbeta);
+    project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i], g,
+                dgeom + i * kGeom, dframes ? dframes + i * kFrame : none, dmean, dquat, dscales, &dopacity, &dbeta);
   }
   for (int k = 0; k < 3; ++k) out.means[3 * i + k] = dmean[k];
   for (int k = 0; k < 4; ++k) out.quats[4 * i + k] = dquat[k];
@@ -69,8 +69,8 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(const S* viewmat, co
 }  // namespace
 
 template <class S>
-void project_forward(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, const Surfels<S>& in, S* geom,
-                     S* frames, S* radii, int32_t* broken, Stream stream) {
+void project_forward(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, const Surfels<S>& in,
+                     S* geom, S* frames, S* radii, int32_t* broken, Stream stream) {
   if (!in.n) return;
   BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(in.n, kThreads))), dim3(kThreads), 0, stream, viewmat, K, width,
             height, near, prefilter, in, geom, frames, radii, broken);
@@ -83,9 +83,10 @@ void project_backward(const S* viewmat, const S* K, const Surfels<S>& in, const 
             geom, dgeom, dframes, out);
 }
 
-#define BT_INSTANTIATE(S)                                                                                             \
-  template void project_forward<S>(const S*, const S*, int, int, S, bool, const Surfels<S>&, S*, S*, S*, int32_t*, Stream); \
-  template void project_backward<S>(const S*, const S*, const Surfels<S>&, const S*, const S*, const S*,              \
+#define BT_INSTANTIATE(S)                                                                                          \
+  template void project_forward<S>(const S*, const S*, int, int, S, bool, const Surfels<S>&, S*, S*, S*, int32_t*, \
+                                   Stream);                                                                        \
+  template void project_backward<S>(const S*, const S*, const Surfels<S>&, const S*, const S*, const S*,           \
                                     const SurfelGradients<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

@@ -57,6 +57,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         "near": 0.3,
         "weight_bound": 0.02,
         "low_pass": 1.0,
+        "prefilter": "low_pass",
         "background": [1, 0.5, 0],
     }
     if format is None:

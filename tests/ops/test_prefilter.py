@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +14,9 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
-from bitymi_ns.scene import Camera
+from bitymi_ns.bake import read_bundle, write_bundle
+from bitymi_ns.scene import Camera, Scene, SceneConfig
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
 from bitymi_ns.stability.sweeps import SWEEPS
 
@@ -166,3 +169,18 @@ def test_thin_needles_stay_well_conditioned() -> None:
         n = len(single[0])
         error = (dense(fragments, fragments.weight.double(), n) - want.weight).abs()
         assert error.max() < 2e-5 + 1.01 / 255 * (~want.blended).any(), (name, error.max())
+
+
+def test_a_baked_scene_is_drawn_as_the_trained_one(tmp_path: Path) -> None:
+    case = random_scene(30, 6, scale=0.05)
+    params = {key: value.float() for key, value in case.params.items()}
+    scene = Scene(SceneConfig(texture="none", prefilter="pixel"), params, None)
+    tiles = torch.zeros(30, 5, dtype=torch.int32)
+    write_bundle(tmp_path / "bundle", params, tiles.numpy(), None, prefilter="pixel")
+    baked = BakedScene.from_bundle(read_bundle(tmp_path / "bundle"))
+    assert baked.prefilter == "pixel"
+    camera = camera_of(case, torch.float32)
+    a, b = scene.render(camera).rgb.detach(), baked.render(camera).rgb
+    torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+    baked.prefilter = "low_pass"
+    assert (baked.render(camera).rgb - a).abs().max() > 1e-2

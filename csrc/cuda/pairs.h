@@ -75,6 +75,7 @@ __device__ inline void load_shape(const S* row, S* g) {
 #else
   for (int i = 0; i < kShape; ++i) g[i] = row[i];
 #endif
+  g[kArea] = row[kArea];
 }
 
 // Visits the pairs of a tile that have a fragment in the calling warp, front to back or back to front. Every lane calls

@@ -63,14 +63,16 @@ __global__ void __launch_bounds__(kTileThreads)
     while (todo) {
       const int j = __ffs(int(todo)) - 1;
       todo &= todo - 1;
-      S g[kShape];
+      S g[kGeom];
       load_shape(geom + int64_t(__shfl_sync(kFullMask, id, j)) * kGeom, g);
       const S dx = x - g[kCx], dy = y - g[kCy];
       // a cheap look first: does any open pixel lie in the support or near the centre?
       const S W = g[kW0] + g[kW1] * dx + g[kW2] * dy;
       const S U = g[kU1] * dx + g[kU2] * dy, V = g[kV1] * dx + g[kV2] * dy;
       const bool close = near_centre(dx, dy);
-      if (!__any_sync(kFullMask, open && (close || U * U + V * V < S(kSupport * kSupport) * W * W))) continue;
+      const bool reached = g[kArea] > S(0) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
+                                           : close || U * U + V * V < S(kSupport * kSupport) * W * W;
+      if (!__any_sync(kFullMask, open && reached)) continue;
       const S sigma = fragment_at(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
       bool take = open && sigma >= S(kAlphaMin);
       const S next = transmittance - sigma * transmittance;
@@ -110,7 +112,7 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
   const int32_t pixel = int32_t(s.y * p.width + s.x);
   S transmittance = S(1);
   const auto write = [&](int64_t, int32_t id, bool mine, int64_t i) {
-    S g[kShape];
+    S g[kGeom];
     load_shape(geom + int64_t(id) * kGeom, g);
     const S dx = x - g[kCx], dy = y - g[kCy];
     const Fragment<S> f = fragment_at(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));

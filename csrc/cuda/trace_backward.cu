@@ -9,7 +9,7 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int kSums = 16;  // kShape columns of geom, two absolute gradients, two unused
+constexpr int kSums = 16;  // kShape columns of geom, two absolute gradients, one unused, kArea
 
 template <class S>
 struct Step {
@@ -45,7 +45,7 @@ __global__ void __launch_bounds__(kRunThreads)
   S d[kSums];
   for (int c = 0; c < kSums; ++c) d[c] = S(0);
   if (r.begin < r.end) {
-    S g[kShape], ax = S(0), ay = S(0);
+    S g[kGeom], ax = S(0), ay = S(0);
     load_shape(geom + int64_t(p.surfel[r.k]) * kGeom, g);
     for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
       const int32_t y = f.pixel[i] / p.width, x = f.pixel[i] - y * p.width;
@@ -65,7 +65,7 @@ template <class S>
 struct PutGeometry {
   S *dgeom, *absgrad;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
-    dgeom[surfel * kGeom + column] = column < kShape ? sum : S(0);
+    dgeom[surfel * kGeom + column] = column < kShape || column == kArea ? sum : S(0);
     if (column >= kShape && column < kShape + 2) absgrad[2 * surfel + column - kShape] = sum;
   }
 };

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.bake import read_bundle, write_bundle
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
-from bitymi_ns.bake import read_bundle, write_bundle
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import SURFEL_KEYS, SceneCase, random_scene

@@ -1,7 +1,8 @@
 # make setup   virtual environment, pinned dependencies, compiled extension
 # make demo    train, bake and evaluate the sample scene (or DATA=folder) into demo/
 # make test    the test suite
-# make bench   quality, speed and size on your captures: make bench DATA="folder folder ..." (hours; it resumes)
+# make bench   quality, speed and size on the demo scene and on your captures, with a report (hours; it resumes):
+#              make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"] [METHODS="bitymi bitymi-quality"]
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
@@ -10,6 +11,10 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip --disable-pip-version-check
 DATA   ?=
+STEPS  ?=
+SEEDS  ?=
+METHODS ?= bitymi bitymi-quality
+WORK   ?= outputs/bench
 
 TORCH       := torch==2.13.0
 TORCHVISION := torchvision==0.28.0
@@ -70,9 +75,14 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -q
 
-bench: setup
-	@test -n "$(DATA)" || { echo 'Name captures: make bench DATA="folder folder ..."' >&2; exit 1; }
-	$(BIN)/python benchmarks/captures.py --data $(DATA)
+# The demo scene as its own capture, so that the folder names the scene.
+$(WORK)/captures/room/transforms.json: | setup
+	$(BIN)/bitymi sample --output-dir $(@D)
+
+bench: setup $(WORK)/captures/room/transforms.json
+	$(BIN)/bitymi bench local --data $(WORK)/captures/room $(DATA) --methods $(METHODS) --knobs --work $(WORK) \
+	  $(if $(STEPS),--steps $(STEPS)) $(if $(SEEDS),--seeds $(SEEDS)) --output $(WORK)/captures.md
+	$(BIN)/bitymi report $(WORK) --output-dir $(WORK)/report --title "bitymi bench"
 
 lint: $(VENV)/.stamp-deps
 	$(BIN)/ruff check .

@@ -9,6 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from bitymi_ns.bench.cli import BenchRun
+from bitymi_ns.bench.process import BenchError
+
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
 
@@ -53,11 +56,14 @@ class Report:
     """Turn ns-eval results and training logs into one page: tables and plots of error against time."""
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """JSON files that ns-eval wrote, training curves, images, and folders to search for these."""
+    """JSON files that ns-eval wrote, cells and knobs of `bitymi bench`, training curves, images, and folders to search
+    for these."""
     output_dir: Path = Path("report")
     """Folder to write the page to."""
     title: str = "bitymi report"
     """Heading of the page."""
+    published: Flag = False
+    """Show the paper's tables with its published figures even when no scene of its data sets is in the input."""
 
     def run(self) -> None:
         from bitymi_ns import report
@@ -65,7 +71,7 @@ class Report:
         if not self.inputs:
             raise ValueError("nothing to report: name at least one JSON file that ns-eval wrote")
         try:
-            page = report.build(list(self.inputs), self.output_dir, title=self.title)
+            page = report.build(list(self.inputs), self.output_dir, title=self.title, published=self.published)
         except report.ReportError as error:
             raise ValueError(str(error)) from error
         print(f"Wrote {page}")
@@ -91,10 +97,75 @@ class Stability:
         print(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
 
 
+@dataclass
+class BenchKnobs:
+    """Measure what each quality knob of rendering and baking costs in error and saves in time or bytes."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    output: Path = Path("knobs.jsonl")
+    """File of JSON lines to write, one a knob and setting."""
+    knobs: tuple[str, ...] = ()
+    """Only these: weight_bound, transmittance, r_max, tolerance, format, resolution; none = all."""
+    views: int = 4
+    """Held-out views, evenly spaced; 0 = all."""
+    repeats: int = 3
+    """Timed renderings of each view; the median counts."""
+
+    def run(self) -> int:
+        from bitymi_ns.host.knobs import measure_to_file
+
+        measure_to_file(self.load_config, self.output, self.knobs, self.views, self.repeats)
+        return 0
+
+
+@dataclass
+class BenchPictures:
+    """Draw the worst held-out views of a run: photograph, render, error, f_view alone, residual, overdraw."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    output_dir: Path = Path("pictures")
+    """Folder for the PNG files and pictures.json."""
+    views: int = 2
+    """How many of the worst views."""
+
+    def run(self) -> int:
+        from bitymi_ns.host.pictures import draw_worst
+
+        draw_worst(self.load_config, self.output_dir, self.views)
+        return 0
+
+
+def _suite(name: str, description: str) -> object:
+    return tyro.conf.subcommand(name, default=BenchRun(data=tyro.MISSING, suite=name), description=description)
+
+
+Which = (
+    Annotated[BenchRun, _suite("local", "Your own captures: train, bake and evaluate a matrix of methods and seeds.")]
+    | Annotated[BenchRun, _suite("mipnerf360", "Mip-NeRF 360: images_4 outdoors, images_2 indoors.")]
+    | Annotated[BenchRun, _suite("tanksandtemples", "Tanks and Temples: train and truck.")]
+    | Annotated[BenchRun, _suite("nerf-synthetic", "NeRF-Synthetic: eight objects on white.")]
+    | Annotated[BenchKnobs, tyro.conf.subcommand("knobs")]
+    | Annotated[BenchPictures, tyro.conf.subcommand("pictures")]
+)
+
+
+@dataclass
+class Bench:
+    """Benchmarks: a matrix of scenes, methods and seeds; quality knobs; pictures of a run."""
+
+    what: Which
+
+    def run(self) -> int:
+        return self.what.run()
+
+
 Command = (
     Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Report, tyro.conf.subcommand(name="report")]
     | Annotated[Stability, tyro.conf.subcommand(name="stability")]
+    | Annotated[Bench, tyro.conf.subcommand(name="bench")]
 )
 
 
@@ -107,16 +178,16 @@ def main(args: Sequence[str] | None = None) -> int:
         args=args,
     )
     try:
-        command.run()
-    except (ValueError, OSError) as error:
+        return command.run() or 0
+    except (ValueError, OSError, BenchError) as error:
         # a full disk does not say where it is full
-        where = "" if not isinstance(error, OSError) or error.filename else f" ({command.output_dir})"
+        folder = getattr(command, "output_dir", None)
+        where = f" ({folder})" if folder and isinstance(error, OSError) and not error.filename else ""
         print(f"bitymi: {error}{where}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("bitymi: interrupted, nothing was left half-written", file=sys.stderr)
         return 130
-    return 0
 
 
 if __name__ == "__main__":

@@ -48,13 +48,14 @@ def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     seen = {}
 
-    def build(inputs: list[Path], output_dir: Path, title: str = "") -> Path:
-        seen.update(inputs=inputs, output_dir=output_dir, title=title)
+    def build(inputs: list[Path], output_dir: Path, title: str = "", published: bool = False) -> Path:
+        seen.update(inputs=inputs, output_dir=output_dir, title=title, published=published)
         return output_dir / "index.html"
 
     monkeypatch.setattr(bitymi_ns.report, "build", build, raising=False)
     assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
-    assert seen == {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two"}
+    expected = {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two", "published": False}
+    assert seen == expected
 
 
 def test_broken_report_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

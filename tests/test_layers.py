@@ -13,8 +13,8 @@ import pytest
 import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
-ORDER = ["ops", "scene", "stability", "train", "bake", "report", "host"]
-"""Innermost first. `report` reads files alone; it stands where nothing but `cli` is above it."""
+ORDER = ["ops", "scene", "stability", "train", "bake", "report", "bench", "host"]
+"""Innermost first. `report` reads files alone, `bench` runs commands; `host` takes the name of the machine from it."""
 
 
 def imports(path: Path) -> Iterator[str]:

@@ -12,6 +12,9 @@ from . import trace_cpu, trace_cuda
 from .backend import cuda_backend, dense, function
 from .project import GEOM, Projection
 
+TRANSMITTANCE_MIN = 1e-4
+"""Transmittance below which a pixel takes no more light (csrc/core/surfel.h)."""
+
 
 @dataclass
 class Fragments:

@@ -6,14 +6,17 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bitymi_ns import __version__
 from bitymi_ns.report.collect import collect
-from bitymi_ns.report.gallery import make_gallery
+from bitymi_ns.report.gallery import make_gallery, make_worst
+from bitymi_ns.report.knob_plots import knob_tables
 from bitymi_ns.report.page import GENERATOR, Content, to_page, to_report_md
-from bitymi_ns.report.plots import PLOT_NAMES, draw_plots
-from bitymi_ns.report.records import Records, ReportError
+from bitymi_ns.report.paper import paper_tables, wanted
+from bitymi_ns.report.plots import draw_plots, is_plot_name
+from bitymi_ns.report.records import Records, ReportError, over_seeds
 from bitymi_ns.report.tables import everything_table, quality_tables, summary, training_table
 
 
@@ -21,30 +24,42 @@ def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def compose(records: Records, title: str) -> Content:
-    """Everything that a report says about these records."""
+def compose(records: Records, title: str, published: bool = False) -> Content:
+    """Everything that a report says about these records.
+
+    Args:
+        records: what was read.
+        title: heading of the page.
+        published: show the paper's tables even when the input has no scene of its data sets.
+    """
     gallery, notes = make_gallery(records.images)
+    worst, more_notes = make_worst(records.worst)
     counts = [
         _counted(number, noun)
         for number, noun in (
             (len(records.evaluations), "evaluation"),
             (len(records.curves), "training run"),
             (len({row.scene for row in records.evaluations}), "scene"),
+            (len(records.knobs), "knob setting"),
         )
         if number
     ]
-    panels = len({e.scene for e in records.evaluations} | {c.scene for c in records.curves}) > 1
+    merged = over_seeds(records.evaluations)
+    shown = replace(records, evaluations=merged)
+    measured = f" Measured on: {'; '.join(records.machines)}." if records.machines else ""
     return Content(
         title=title,
-        intro=f"{', '.join(counts)}. Made by bitymi {__version__}.",
-        summary=summary(records),
-        quality=quality_tables(records),
+        intro=f"{', '.join(counts)}. Made by bitymi {__version__}.{measured}",
+        summary=summary(shown),
+        quality=quality_tables(shown),
         training=training_table(records.curves),
         everything=everything_table(records.evaluations),
         plots=draw_plots(records),
-        panels=panels,
+        knobs=knob_tables(records.knobs),
+        paper=paper_tables(records, merged) if published or wanted(records) else [],
+        worst=worst,
         gallery=gallery,
-        notes=[*records.notes, *notes],
+        notes=[*records.notes, *notes, *more_notes],
     )
 
 
@@ -72,9 +87,9 @@ def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
         output_dir.mkdir(exist_ok=True)
         for name in sorted(files, key=lambda name: name == "index.html"):
             os.replace(aside / name, output_dir / name)
-        for name in PLOT_NAMES:
-            if f"{name}.png" not in files:
-                (output_dir / f"{name}.png").unlink(missing_ok=True)
+        for path in output_dir.glob("*.png"):
+            if is_plot_name(path.stem) and path.name not in files:
+                path.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ReportError(
@@ -85,14 +100,16 @@ def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
             shutil.rmtree(aside, ignore_errors=True)
 
 
-def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
+def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report", published: bool = False) -> Path:
     """Make a report: index.html (one self-contained page), report.md and the plots as PNG.
 
     Args:
         inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
-            `fragments`, `psnr`), PNG images, and folders that are searched for all of these.
+            `fragments`, `psnr`), cells, knobs and pictures of `bitymi bench`, PNG images, and folders that are searched
+            for all of these.
         output_dir: folder of the report; made if needed. A report of an earlier call is replaced.
         title: heading of the page.
+        published: show the paper's tables even when the input has no scene of its data sets.
 
     Returns:
         The path of index.html.
@@ -102,7 +119,7 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
     """
     output_dir = Path(output_dir).expanduser().absolute()
     _check_output(output_dir)
-    content = compose(collect(list(inputs), output_dir), title)
+    content = compose(collect(list(inputs), output_dir), title, published)
     files = {f"{plot.name}.png": plot.light for plot in content.plots}
     files["report.md"] = to_report_md(content).encode("utf8")
     files["index.html"] = to_page(content).encode("utf8")

@@ -7,7 +7,17 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from bitymi_ns.report.records import Records, ReportError, disambiguate, link_curves, read_json, read_jsonl
+from bitymi_ns.report.cells import CELLS, PICTURES, is_cell, is_knob, knob_from, read_cells, read_pictures
+from bitymi_ns.report.records import (
+    Records,
+    ReportError,
+    add_training_time,
+    disambiguate,
+    link_curves,
+    read_json,
+    read_jsonl,
+    read_lines,
+)
 
 MAX_DEPTH = 8
 """Folders are searched this many levels down."""
@@ -20,10 +30,17 @@ _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
 
 
 def walk(folder: Path, skip: Path, notes: list[str]) -> Iterator[Path]:
-    """Files below `folder`, sorted, without hidden folders, links to folders, and `skip` when it lies below."""
+    """Files below `folder`, sorted, without hidden folders, links to folders, and `skip` when it lies below.
+
+    Of a benchmark's work folder only its cells: they name everything else that counts.
+    """
     seen = 0
     for root, folders, files in os.walk(folder):
         here = Path(root)
+        if CELLS in files:
+            folders[:] = []
+            yield here / CELLS
+            continue
         depth = len(here.relative_to(folder).parts)
         folders[:] = sorted(
             name
@@ -45,9 +62,22 @@ def _read(path: Path, records: Records) -> bool:
         records.images.append(path)
         return True
     if suffix == ".jsonl":
+        numbered, notes = read_lines(path)
+        if path.name == CELLS or any(is_cell(value) for _, value in numbered):
+            read_cells(numbered, path, records)
+            records.notes += notes
+            return bool(numbered)
+        if any(is_knob(value) for _, value in numbered):
+            records.knobs += [knob_from(value) for _, value in numbered if is_knob(value)]
+            records.notes += notes
+            return True
         evaluations, curves, notes = read_jsonl(path)
         records.curves += curves
         records.notes += notes
+    elif path.name == PICTURES:
+        views = read_pictures(path)
+        records.worst += views
+        return bool(views)
     else:
         evaluations, curves = read_json(path), []
     records.evaluations += evaluations
@@ -72,7 +102,8 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
     """Read all inputs.
 
     Args:
-        inputs: ns-eval JSON files, training curves (JSONL), PNG images, and folders that are searched for all three.
+        inputs: ns-eval JSON files, training curves, cells and knobs of `bitymi bench` (JSONL), pictures.json, PNG
+            images, and folders that are searched for all of these.
         output_dir: where the report goes; not searched when it lies inside one of the folders.
 
     Raises:
@@ -93,9 +124,9 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
             if not _read(path, records):
                 raise ReportError(
                     f"{path} holds neither an evaluation (a JSON object with 'results', as ns-eval writes it) "
-                    "nor a training curve (JSON lines with 'step')."
+                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench."
                 )
-    if not (records.evaluations or records.curves):
+    if not (records.evaluations or records.curves or records.knobs or records.worst):
         where = ", ".join(map(str, paths)) or "no inputs"
         more = "".join(f"\n  {note}" for note in records.notes)
         raise ReportError(
@@ -104,4 +135,5 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
         )
     records.curves = link_curves(records.curves, records.evaluations)
     disambiguate(records)
+    add_training_time(records)
     return records

@@ -9,7 +9,11 @@ from pathlib import Path
 
 from PIL import Image
 
+from bitymi_ns.report.records import WorstView
+
 VIEWS_PER_FOLDER = 4
+MAX_WORST = 16
+"""Worst views that a page shows."""
 MAX_IMAGES = 48
 MAX_WIDTH = 1200
 """Wider images are scaled down."""
@@ -115,4 +119,21 @@ def make_gallery(images: list[Path]) -> tuple[list[Group], list[str]]:
         if pictures:
             groups.append(Group(titles[folder], tuple(pictures), len(paths) - len(chosen)))
             total += len(pictures)
+    return groups, notes
+
+
+def make_worst(views: list[WorstView]) -> tuple[list[Group], list[str]]:
+    """Encode the pictures of the worst views, a group a view; and a note for each that could not be read."""
+    groups, notes = [], []
+    for view in views[:MAX_WORST]:
+        pictures = []
+        for caption, path in view.pictures:
+            try:
+                pictures.append(encode(path, caption))
+            except OSError as error:
+                notes.append(f"{path} is not an image that can be read: {error}.")
+        if pictures:
+            groups.append(Group(view.title, tuple(pictures), 0))
+    if len(views) > MAX_WORST:
+        notes.append(f"{len(views) - MAX_WORST} more worst views are not shown; the page holds {MAX_WORST}.")
     return groups, notes

@@ -6,8 +6,9 @@ import base64
 from dataclasses import dataclass
 from html import escape
 
+from bitymi_ns.report.drawing import Plot
 from bitymi_ns.report.gallery import Group
-from bitymi_ns.report.plots import Plot
+from bitymi_ns.report.knob_plots import KNOBS
 from bitymi_ns.report.tables import NOTES, Table, to_html, to_markdown
 
 GENERATOR = '<meta name="generator" content="bitymi report">'
@@ -29,6 +30,7 @@ table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabul
 th, td { padding: .3rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 th:first-child { text-align: left; padding-left: .5rem; } thead th { font-weight: 600; border-bottom-width: 2px; }
 tbody th { font-weight: 400; } tr.section th { background: var(--band); font-style: italic; color: var(--soft); }
+table.dense { font-size: .8rem; } table.dense th, table.dense td { padding: .25rem .5rem; }
 td b { color: var(--best); }
 .plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 30rem), 1fr)); gap: 1.5rem; }
 .plots.full { grid-template-columns: 1fr; }
@@ -51,7 +53,9 @@ class Content:
         summary: sentences on what baking changed.
         quality: tables of evaluations; training: of runs; everything: every recorded number.
         plots: drawn plots.
-        panels: whether plots have several panels and need the full width.
+        knobs: tables of the quality knobs.
+        paper: the paper's tables, with ours.
+        worst: the worst views with their errors and decomposition.
         gallery: rendered images.
         notes: what was skipped and why.
     """
@@ -63,7 +67,9 @@ class Content:
     training: Table | None
     everything: Table | None
     plots: list[Plot]
-    panels: bool
+    knobs: list[Table]
+    paper: list[Table]
+    worst: list[Group]
     gallery: list[Group]
     notes: list[str]
 
@@ -96,22 +102,53 @@ def _list(lines: list[str]) -> str:
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
+PAPER_NOTE = (
+    "Figures in the published rows are those that the paper prints: of other hardware, other implementations and, for "
+    "most methods, other publications. They stand beside ours for orientation; speeds cannot be compared."
+)
+TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
+KNOB_NOTE = (
+    "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views; "
+    "the thin line is one step. Milliseconds are of the renderer named, a view at full size."
+)
+
+
+def _sections(plots: list[Plot]) -> list[tuple[str, list[Plot]]]:
+    """Plots by section, in order."""
+    return [(name, [p for p in plots if p.section == name]) for name in dict.fromkeys(p.section for p in plots)]
+
+
+def _tables(tables: list[Table]) -> list[str]:
+    parts = []
+    for table in tables:
+        parts += [f"<h3>{escape(table.title)}</h3>", to_html(table)]
+        parts += [f'<p class="soft">{escape(table.note)}</p>'] if table.note else []
+    return parts
+
+
 def to_page(content: Content) -> str:
     """The report as a single HTML document that needs no other file."""
     parts = [f"<h1>{escape(content.title)}</h1>", f'<p class="soft">{escape(content.intro)}</p>']
     if content.summary:
         parts.append(_list(content.summary))
     if content.quality:
-        parts.append("<h2>Quality and speed</h2>")
-        for table in content.quality:
-            parts += [f"<h3>{escape(table.title)}</h3>", to_html(table)]
-            parts += [f'<p class="soft">{escape(table.note)}</p>'] if table.note else []
-        parts.append(f'<p class="soft">{escape(NOTES)}</p>')
+        parts += ["<h2>Quality and speed</h2>", *_tables(content.quality), f'<p class="soft">{escape(NOTES)}</p>']
     if content.training:
         parts += ["<h2>Training</h2>", to_html(content.training)]
-    if content.plots:
-        full = " full" if content.panels else ""
-        parts += ["<h2>Error against run time</h2>", f'<div class="plots{full}">', *map(_plot, content.plots), "</div>"]
+    for name, plots in _sections(content.plots):
+        note = KNOB_NOTE if name == KNOBS else TRADE_OFF
+        full = " full" if any(plot.panels > 1 for plot in plots) else ""
+        parts += [f"<h2>{escape(name)}</h2>", f'<p class="soft">{escape(note)}</p>']
+        parts += [f'<div class="plots{full}">', *map(_plot, plots), "</div>"]
+        parts += _tables(content.knobs) if name == KNOBS else []
+    if content.paper:
+        parts += [
+            "<h2>The paper\u2019s tables</h2>",
+            f'<p class="soft">{escape(PAPER_NOTE)}</p>',
+            *_tables(content.paper),
+        ]
+    if content.worst:
+        parts += ["<h2>Worst views</h2>", *map(_pictures, content.worst)]
     if content.gallery:
         parts += ["<h2>Rendered views</h2>", *map(_pictures, content.gallery)]
     if content.everything:
@@ -127,21 +164,28 @@ def to_page(content: Content) -> str:
     )
 
 
+def _markdown_tables(tables: list[Table]) -> list[str]:
+    parts = []
+    for table in tables:
+        parts += [f"### {table.title}", to_markdown(table)]
+        parts += [table.note] if table.note else []
+    return parts
+
+
 def to_report_md(content: Content) -> str:
     """The report as Markdown, its plots as files beside it."""
     parts = [f"# {content.title}", content.intro]
     if content.summary:
         parts.append("\n".join(f"- {line}" for line in content.summary))
     if content.quality:
-        parts.append("## Quality and speed")
-        for table in content.quality:
-            parts += [f"### {table.title}", to_markdown(table)]
-            parts += [table.note] if table.note else []
-        parts.append(NOTES)
+        parts += ["## Quality and speed", *_markdown_tables(content.quality), NOTES]
     if content.training:
         parts += ["## Training", to_markdown(content.training)]
-    if content.plots:
-        parts += ["## Error against run time", *(f"![{plot.title}]({plot.name}.png)" for plot in content.plots)]
+    for name, plots in _sections(content.plots):
+        parts += [f"## {name}", *(f"![{plot.title}]({plot.name}.png)" for plot in plots)]
+        parts += [*_markdown_tables(content.knobs), KNOB_NOTE] if name == KNOBS else []
+    if content.paper:
+        parts += ["## The paper's tables", PAPER_NOTE, *_markdown_tables(content.paper)]
     if content.everything:
         parts += [f"## {content.everything.title}", to_markdown(content.everything)]
     if content.notes:

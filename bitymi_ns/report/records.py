@@ -35,6 +35,14 @@ class Evaluation:
         results: finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...).
         checkpoint: path of the checkpoint as recorded, possibly empty.
         source: the file that it was read from.
+        run: what tells its training run from others, empty when unknown (a bare ns-eval file).
+        group: its label without the seed; empty = it has none.
+        series: its run without the seed.
+        seed: of its training, None when not stated.
+        preset: the method's name in ns-train, and options: what was given beside it.
+        suite: the standard data set that the scene is from, `local`, or empty when unknown.
+        atlas_format: of a bundle, empty when unknown.
+        seeds: number of runs that it is the mean of.
     """
 
     scene: str
@@ -44,6 +52,15 @@ class Evaluation:
     results: dict[str, float]
     checkpoint: str
     source: Path
+    run: str = ""
+    group: str = ""
+    series: str = ""
+    seed: int | None = None
+    preset: str = ""
+    options: tuple[str, ...] = ()
+    suite: str = ""
+    atlas_format: str = ""
+    seeds: int = 1
 
     def get(self, key: str) -> float | None:
         """The result of that name, or None when it is missing or was not finite."""
@@ -58,6 +75,7 @@ class Curve:
     label: str
     points: list[dict[str, float]]
     source: Path
+    run: str = ""
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
         """The points that have both numbers, in order of steps."""
@@ -73,6 +91,32 @@ class Curve:
         return max((p[key] for p in self.points if key in p), default=None)
 
 
+@dataclass(frozen=True)
+class KnobPoint:
+    """What one setting of a quality knob costs and saves; `figures` has finite numbers: max_steps, mean_steps (errors
+    against the exact setting in 8-bit steps), psnr_exact, psnr, ms, cpu_ms, bytes."""
+
+    scene: str
+    run: str
+    knob: str
+    value: str
+    renderer: str
+    exact: bool
+    default: bool
+    against: str
+    figures: dict[str, float]
+
+
+@dataclass(frozen=True)
+class WorstView:
+    """Pictures of one of the worst held-out views of a run: (caption, file) in order."""
+
+    scene: str
+    run: str
+    title: str
+    pictures: tuple[tuple[str, Path], ...]
+
+
 @dataclass
 class Records:
     """Everything that was read, with notes on what was skipped and why."""
@@ -80,6 +124,9 @@ class Records:
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)
+    knobs: list[KnobPoint] = field(default_factory=list)
+    worst: list[WorstView] = field(default_factory=list)
+    machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -157,6 +204,8 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
         results=results,
         checkpoint=checkpoint,
         source=source,
+        preset=method,
+        atlas_format=atlas_format[1] if baked and atlas_format else "",
     )
 
 
@@ -184,8 +233,8 @@ def read_json(path: Path) -> list[Evaluation]:
     return [evaluation_from(data, path)] if is_evaluation(data) else []
 
 
-def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
-    """Evaluations, the curve and notes of a JSONL file; all empty when it holds something else.
+def read_lines(path: Path) -> tuple[list[tuple[int, Any]], list[str]]:
+    """The values of a JSONL file with their line numbers, and notes.
 
     A last line that is cut off (a run that was killed while it wrote) is left out with a note; an earlier broken line
     is an error.
@@ -194,11 +243,18 @@ def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
     values, notes = [], []
     for position, (number, line) in enumerate(numbered):
         try:
-            values.append(parse_json(line, f"{path}, line {number},"))
+            values.append((number, parse_json(line, f"{path}, line {number},")))
         except ReportError:
             if position + 1 < len(numbered) or position == 0:
                 raise
             notes.append(f"{path}: the last line is cut off and was left out.")
+    return values, notes
+
+
+def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
+    """Evaluations, the curve and notes of a JSONL file; all empty when it holds something else."""
+    numbered, notes = read_lines(path)
+    values = [value for _, value in numbered]
     evaluations = [evaluation_from(value, path) for value in values if is_evaluation(value)]
     points = [value for value in values if is_point(value) and not is_evaluation(value)]
     return evaluations, [curve_from(points, path)] if points else [], notes
@@ -208,11 +264,47 @@ def link_curves(curves: list[Curve], evaluations: list[Evaluation]) -> list[Curv
     """Name curves after the evaluation whose checkpoint lies in the curve's folder (the run that wrote both)."""
     linked = []
     for curve in curves:
+        if curve.run:  # named by its cell
+            linked.append(curve)
+            continue
         folder = str(curve.source.resolve().parent)
         parents = (e for e in evaluations if not e.baked and e.checkpoint)
         owner = next((e for e in parents if folder in map(str, Path(e.checkpoint).parents)), None)
         linked.append(replace(curve, scene=owner.scene, label=owner.method) if owner else curve)
     return linked
+
+
+def add_training_time(records: Records) -> None:
+    """Give evaluations without it the training time of the one curve of their scene and method."""
+    for i, row in enumerate(records.evaluations):
+        curves = [c for c in records.curves if (c.scene, c.label) == (row.scene, row.method)]
+        if "train_seconds" in row.results or len(curves) != 1:
+            continue
+        times = {f"train_{key}": curves[0].last(key) for key in ("seconds", "cpu_seconds")}
+        known = {key: value for key, value in times.items() if value is not None}
+        records.evaluations[i] = replace(row, results={**row.results, **known})
+
+
+def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
+    """Means over runs that differ in their seed alone, with `psnr_seeds`, the standard deviation of their PSNR."""
+    groups: dict[tuple, list[Evaluation]] = {}
+    for i, row in enumerate(evaluations):
+        key = (row.scene, row.baked, row.group, row.series) if row.group else (i,)
+        groups.setdefault(key, []).append(row)
+    merged = []
+    for rows in groups.values():
+        if len(rows) == 1:
+            merged.append(rows[0])
+            continue
+        keys = set.intersection(*(set(row.results) for row in rows))
+        means = {key: sum(row.results[key] for row in rows) / len(rows) for key in sorted(keys)}
+        if "psnr" in means:
+            squares = sum((row.results["psnr"] - means["psnr"]) ** 2 for row in rows)
+            means["psnr_seeds"] = math.sqrt(squares / (len(rows) - 1))
+        first = rows[0]
+        label = f"{first.group} ({len(rows)} seeds)"
+        merged.append(replace(first, label=label, results=means, run=first.series, seed=None, seeds=len(rows)))
+    return merged
 
 
 def _suffixes(sources: list[Path]) -> list[str]:
@@ -240,9 +332,10 @@ def disambiguate(records: Records) -> None:
 def neural_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
     """The neural evaluation that a baked one is compared with.
 
-    Same scene and method; of several, the one whose file lies in the same folder. None when that leaves a doubt.
+    That of the same run where that is known; else of the same scene and method, and of several the one whose file lies
+    in the same folder. None when that leaves a doubt.
     """
-    same = [e for e in evaluations if not e.baked and (e.scene, e.method) == (row.scene, row.method)]
+    same = [e for e in evaluations if not e.baked and (e.scene, e.method, e.run) == (row.scene, row.method, row.run)]
     if len(same) > 1:
         same = [e for e in same if e.source.parent == row.source.parent]
     return same[0] if row.baked and len(same) == 1 else None

@@ -89,6 +89,7 @@ def _atlas_mb(row: Evaluation) -> float | None:
 
 COLUMNS = (
     Column("PSNR", _key("psnr"), "{:.2f}".format, "up"),
+    Column("± seeds", _key("psnr_seeds"), "{:.2f}".format),
     Column("SSIM", _key("ssim"), "{:.3f}".format, "up"),
     Column("LPIPS", _key("lpips"), "{:.3f}".format, "down"),
     Column("FLIP", _key("flip"), "{:.3f}".format, "down"),
@@ -97,6 +98,7 @@ COLUMNS = (
     Column("ms", _key("render_ms"), significant, "down"),
     Column("FPS", _fps, significant, "up"),
     Column("Atlas MB", _atlas_mb, significant, "down"),
+    Column("Bundle MB", _key("bundle_bytes", 1e-6), significant, "down"),
 )
 """The paper's columns and the run-time figures beside them."""
 
@@ -104,7 +106,8 @@ STAGES = {False: "Pre-baking (neural renderer)", True: "Post-baking (atlas)"}
 
 NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
-    "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus neural, in dB. Bold: best of its scene."
+    "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus neural, in dB. ± seeds: standard "
+    "deviation of the PSNR over seeds. Bold: best of its scene."
 )
 
 
@@ -281,4 +284,5 @@ def to_html(table: Table) -> str:
         cells = [f"<b>{escape(t)}</b>" if i in row.best else escape(t) for i, t in enumerate(row.cells)]
         body.append(f"<tr><th>{cells[0]}</th>" + "".join(f"<td>{c}</td>" for c in cells[1:]) + "</tr>")
     rows = "\n".join(body)
-    return f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
+    dense = ' class="dense"' if len(table.header) > 10 else ""
+    return f'<div class="wide"><table{dense}>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'

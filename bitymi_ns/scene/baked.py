@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import project, view_color
 from bitymi_ns.ops.backend import module
+from bitymi_ns.ops.trace import TRANSMITTANCE_MIN
 from bitymi_ns.ops.trace_cpu import tracers
 
 from .camera import Camera
@@ -46,6 +47,8 @@ class BakedScene:
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
         prefilter: low_pass or pixel, as in `SceneConfig`.
+        transmittance_min: a surfel that would leave a pixel less transmittance is not blended and ends the pixel, as in
+            training; 0 = every surfel is blended.
     """
 
     surfels: Mapping[str, Tensor]
@@ -59,6 +62,7 @@ class BakedScene:
     near: float = 0.2
     weight_bound: float = 0.0
     prefilter: str = "low_pass"
+    transmittance_min: float = TRANSMITTANCE_MIN
     _patches: tuple | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
@@ -108,6 +112,7 @@ class BakedScene:
             *size,
             self.near,
             self.weight_bound,
+            self.transmittance_min,
             maps,
             base,
             self._gathered(),

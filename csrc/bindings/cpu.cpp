@@ -176,9 +176,9 @@ void bind(nb::module_& m, const char* suffix) {
           "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert())
       .def(
           "baked",
-          [](const Trace<S>& t, In geom, In radii, int width, int height, double near, double weight_bound, bool maps,
-             In base, const Patches& patches, double offset, double scale, Array<const float> extent,
-             Array<const float> mean_residual, Out image, Maybe<int32_t> overdraw) {
+          [](const Trace<S>& t, In geom, In radii, int width, int height, double near, double weight_bound,
+             double transmittance_min, bool maps, In base, const Patches& patches, double offset, double scale,
+             Array<const float> extent, Array<const float> mean_residual, Out image, Maybe<int32_t> overdraw) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
             if (int64_t(patches.first.size()) != n) throw std::invalid_argument("the patches belong to other surfels");
             const Atlas atlas = {patches,
@@ -186,6 +186,7 @@ void bind(nb::module_& m, const char* suffix) {
                                  float(scale),
                                  data(extent, n, "extent"),
                                  float(weight_bound),
+                                 float(transmittance_min),
                                  data(mean_residual, 3 * n, "mean_residual")};
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data(), *b = data(base, 3 * n, "base");
             S* out = data(image, pixels * (maps ? kMapChannels : kBakedChannels), "image");
@@ -193,9 +194,10 @@ void bind(nb::module_& m, const char* suffix) {
             nb::gil_scoped_release release;
             baked_forward(g, r, S(near), t.bins, width, height, maps, b, atlas, out, o);
           },
-          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "weight_bound"_a, "maps"_a,
-          "base"_a.noconvert(), "patches"_a, "offset"_a, "scale"_a, "extent"_a.noconvert(),
-          "mean_residual"_a.noconvert(), "image"_a.noconvert(), "overdraw"_a.noconvert().none());
+          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "weight_bound"_a,
+          "transmittance_min"_a, "maps"_a, "base"_a.noconvert(), "patches"_a, "offset"_a, "scale"_a,
+          "extent"_a.noconvert(), "mean_residual"_a.noconvert(), "image"_a.noconvert(),
+          "overdraw"_a.noconvert().none());
 
   m.def(
       name("trace_backward").c_str(),

@@ -109,7 +109,7 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
 #pragma omp parallel for num_threads(num_threads()) schedule(dynamic, 2)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
-    TileState<S> state(tx, ty, width, height);
+    TileState<S> state(tx, ty, width, height, S(atlas.transmittance_min));
     // fragments with a residual sum into rgb, one by one; all the rest in packs
     Quad<S> rgb[kTile * kTile] = {};
     P sums[kMapChannels + 1][kPacks];  // rgb of the fragments without residual, alpha, beta, depth, normal, overdraw

@@ -158,6 +158,7 @@ struct Atlas {
   float offset, scale;         // residual = offset + scale * stored
   const float* extent;         // [n] half side of the tile, scale units
   float weight_bound;          // fragments of smaller weight get no residual
+  float transmittance_min;     // a pixel takes no surfel that would leave it less; 0 = all
   const float* mean_residual;  // [n, 3] of every tile; the residual of a surfel without one
 };
 // Channels of a baked image: rgb, alpha; with maps those of composite_forward.

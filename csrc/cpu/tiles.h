@@ -18,9 +18,10 @@ struct TileState {
   M open[kPacks];  // pixels inside the image that still take light
   int open_packs = 0;
   S x0, y0;  // the tile's first pixel
+  S stop;    // transmittance at which a pixel takes no more light
   P lane_x, lane_y;
 
-  TileState(int tile_x, int tile_y, int width, int height) {
+  TileState(int tile_x, int tile_y, int width, int height, S stop = S(kTransmittanceMin)) : stop(stop) {
     x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
     for (int i = 0; i < kLanes; ++i) {
       lane_x.v[i] = S(i % kPackSide) + S(0.5);
@@ -74,7 +75,7 @@ struct TileState {
     const P weight = f.sigma * transmittance[pack];
     const P next = transmittance[pack] - weight;
     // the surfel that would take a pixel below the bound is not blended and ends it
-    const M ends = take & (next < P(S(kTransmittanceMin)));
+    const M ends = take & (next < P(stop));
     open[pack] = open[pack] & ~ends;
     take = take & ~ends;
     transmittance[pack] = select(take, next, transmittance[pack]);

@@ -12,7 +12,9 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.report import ReportError, build
-from bitymi_ns.report.plots import PLOT_NAMES
+
+PLOTS = [f"{metric}_{cost}" for metric in ("psnr", "ssim", "flip") for cost in ("train_seconds", "render_ms", "bytes")]
+PLOTS += ["psnr_seconds", "psnr_cpu_seconds", "surfels_steps"]
 
 
 def pictures(page: str) -> list[Image.Image]:
@@ -28,14 +30,14 @@ def test_full_report(results: Path, tmp_path: Path):
     out = tmp_path / "report"
     page = build([results], out, title="Two <scenes>")
     assert page == out / "index.html"
-    assert {p.name for p in out.iterdir()} == {"index.html", "report.md", *(f"{name}.png" for name in PLOT_NAMES)}
+    assert {p.name for p in out.iterdir()} == {"index.html", "report.md", *(f"{name}.png" for name in PLOTS)}
     html, markdown = page.read_text("utf8"), (out / "report.md").read_text("utf8")
     assert "Two &lt;scenes&gt;" in html and not re.search(r"(?:src|srcset|href)=\"(?!data:)", html)
-    assert len(pictures(html)) == 2 * len(PLOT_NAMES) + 4 * 4
+    assert len(pictures(html)) == 2 * len(PLOTS) + 4 * 4
     for text in ("27.41", "−0.031", "Pre-baking (neural renderer)", "Mean of 2 scenes", "18,942"):
         assert text in html and text in markdown
     assert "LPIPS" not in html and "nan" not in markdown.lower()
-    for name in PLOT_NAMES:
+    for name in PLOTS:
         with Image.open(out / f"{name}.png") as image:
             assert image.width > 600
             assert image.convert("L").getextrema() != (255, 255)

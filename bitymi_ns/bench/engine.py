@@ -1,0 +1,148 @@
+"""Runs the cells of a matrix that are not finished yet."""
+
+from __future__ import annotations
+
+import fcntl
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+from bitymi_ns.bench.cells import FILE, Cells, made
+from bitymi_ns.bench.commands import prepare, read_result, stage_command
+from bitymi_ns.bench.matrix import Stage
+from bitymi_ns.bench.process import BenchError, CommandFailed, run_measured
+
+Chain = Sequence[Stage]
+"""The cells of one run; each may need those before it."""
+
+
+class Watcher(Protocol):
+    """What is told about progress."""
+
+    def started(self, stage: Stage) -> None: ...
+
+    def finished(self, stage: Stage, seconds: float) -> None: ...
+
+    def failed(self, stage: Stage, reason: str) -> None: ...
+
+
+class Silent:
+    """Tells nobody."""
+
+    def started(self, stage: Stage) -> None:
+        pass
+
+    def finished(self, stage: Stage, seconds: float) -> None:
+        pass
+
+    def failed(self, stage: Stage, reason: str) -> None:
+        pass
+
+
+def open_cells(work: Path) -> Cells:
+    """The finished cells of a work folder."""
+    return Cells(work / FILE)
+
+
+def needs(stage: Stage, other: Stage) -> bool:
+    """Whether `stage` cannot be done without `other`, of the same run."""
+    if other.kind == "train":
+        return stage.kind != "train"
+    return other.kind == "export" and stage.kind == "eval" and stage.bundle == other.bundle
+
+
+def missing(chain: Chain, cells: Cells) -> list[Stage]:
+    """The cells of a run that are to be done: those without a line, and those that need one of these.
+
+    A training that is done again makes the evaluations of the earlier one obsolete.
+    """
+    pending: list[Stage] = []
+    for stage in chain:
+        if cells.get(stage.key) is None or any(needs(stage, other) for other in pending):
+            pending.append(stage)
+    return pending
+
+
+@contextmanager
+def locked(work: Path, stage: Stage) -> Iterator[None]:
+    """Hold a run, so that no other process works in its folders.
+
+    Raises:
+        CommandFailed: another process holds it.
+    """
+    path = work / "locks" / f"{stage.run.folder.replace('/', '--')}.lock"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise CommandFailed(f"{stage.run}: another process is at work on this run ({path} is locked)") from error
+        yield
+
+
+def run_stage(work: Path, stage: Stage, cells: Cells) -> float:
+    """Do one cell and write its line; returns the seconds it took.
+
+    Raises:
+        CommandFailed: its command failed, or left no figures.
+    """
+    command = stage_command(work, stage)
+    start = time.perf_counter()
+    cost = run_measured(command, prepare(work, stage))
+    value = read_result(work, stage, cost)
+    seconds = time.perf_counter() - start
+    cells.add(stage.key, value, made(command, seconds))
+    return seconds
+
+
+def run_chain(work: Path, chain: Chain, watcher: Watcher | None = None) -> list[str]:
+    """Do the cells of a run that are not finished, in order. What needs a cell that failed is left out.
+
+    Args:
+        work: folder of runs and finished cells.
+        chain: the cells.
+        watcher: told about each.
+
+    Returns:
+        A message a cell that failed.
+    """
+    watcher = watcher or Silent()
+    cells = open_cells(work)
+    pending = missing(chain, cells)
+    if not pending:
+        return []
+    failures: list[str] = []
+    broken: list[Stage] = []
+    try:
+        with locked(work, chain[0]):
+            cells.refresh()
+            for stage in missing(chain, cells):
+                if any(needs(stage, other) for other in broken):
+                    broken.append(stage)
+                    watcher.failed(stage, "")
+                    continue
+                watcher.started(stage)
+                try:
+                    watcher.finished(stage, run_stage(work, stage, cells))
+                except CommandFailed as error:
+                    broken.append(stage)
+                    failures.append(f"{stage} failed: {error}")
+                    watcher.failed(stage, str(error))
+    except CommandFailed as error:
+        failures.append(str(error))
+        for stage in pending:
+            watcher.failed(stage, "")
+    return failures
+
+
+def run_chains(work: Path, chains: Sequence[Chain], watcher: Watcher | None = None) -> list[str]:
+    """Do run after run on this machine; returns a message a cell that failed.
+
+    Raises:
+        BenchError: there is nothing to run.
+    """
+    if not any(chains):
+        raise BenchError("the matrix is empty: no scene, or no row")
+    return [failure for chain in chains for failure in run_chain(work, chain, watcher)]

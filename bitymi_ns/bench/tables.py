@@ -1,0 +1,118 @@
+"""Finished cells as Markdown: what `bitymi bench` prints at its end."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from bitymi_ns.bench.cells import Cells
+from bitymi_ns.bench.machine import commit, machine, software
+from bitymi_ns.bench.matrix import Matrix, Run, Stage
+
+HEADER = (
+    "scene", "row", "form", "PSNR", "SSIM", "FLIP", "LPIPS", "surfels", "fragments/px", "render ms", "training s",
+    "training CPU s", "process CPU s", "peak RSS MB", "bundle bytes", "atlas bytes", "dPSNR",
+)  # fmt: skip
+TEXT_COLUMNS = 3
+NOTES = (
+    "Means over the held-out views; render ms: one view, rendering alone; dPSNR: a bundle's PSNR minus that of the "
+    "trained scene it was baked from.",
+    "Training seconds: the training steps alone; process CPU seconds and peak RSS: ns-train from start to end, with "
+    "loading, evaluation and saving.",
+)
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number for a table, with separators of thousands; nothing for None."""
+    return "" if value is None else f"{value:,.{digits}f}"
+
+
+def difference(value: float, digits: int = 3) -> str:
+    """A signed number for a table; no sign where it rounds to zero."""
+    rounded = round(value, digits)
+    return f"{rounded:+.{digits}f}" if rounded else f"{0.0:.{digits}f}"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1) -> str:
+    """A Markdown table; all columns but the first `text_columns` are flush right."""
+    rule = ["---" if i < text_columns else "---:" for i in range(len(header))]
+    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows))
+
+
+def command_line() -> str:
+    """How this program was called."""
+    program = os.path.basename(sys.argv[0])
+    start = ["python", os.path.relpath(sys.argv[0])] if program.endswith(".py") else [program]
+    return shlex.join([*start, *sys.argv[1:]])
+
+
+def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
+    """A Markdown section: title, how it was made, table, notes.
+
+    Args:
+        commits: of the cells that the table shows; none = made now, by the checkout as it is.
+    """
+    made = sorted(set(commits)) or [commit()]
+    lines = [f"## {title}", "", f"`{command_line()}`  ", f"{machine()}; {software()}  "]
+    lines += [f"{datetime.date.today():%Y-%m-%d}, commit {', '.join(c or 'unknown' for c in made)}", "", body]
+    if notes:
+        lines += ["", *(f"- {note}" for note in notes)]
+    return "\n".join(lines) + "\n"
+
+
+def _line(
+    run: Run, form: str, results: dict[str, Any], cost: dict[str, Any], size: int | None, delta: str
+) -> list[str]:
+    peak = cost.get("peak_bytes")
+    name = run.row.name if run.seed is None else f"{run.row.name}, seed {run.seed}"
+    digits = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4, "surfels": 0, "fragments_per_pixel": 2, "render_ms": 1}
+    return [
+        run.scene.name,
+        name.replace("|", "\\|"),
+        form,
+        *(number(results.get(key), count) for key, count in digits.items()),
+        number(cost.get("seconds"), 0),
+        number(cost.get("cpu_seconds"), 0),
+        number(cost.get("process_cpu_seconds"), 0),
+        number(None if peak is None else peak / 1e6, 0),
+        number(size, 0),
+        number(results.get("atlas_bytes"), 0),
+        delta,
+    ]
+
+
+def results_table(matrix: Matrix, cells: Cells) -> tuple[str, list[str]]:
+    """One line a form of each run that has been evaluated: the trained scene, then its bundles.
+
+    Returns:
+        The table without columns that no line fills, and the commits that made its cells.
+    """
+    lines, commits = [], []
+    for run in matrix.runs():
+        train = cells.get(Stage(run, "train").key)
+        neural = cells.get(Stage(run, "eval").key)
+        for bundle in (None, *matrix.bundles):
+            cell = cells.get(Stage(run, "eval", bundle).key)
+            if cell is None:
+                continue
+            results = cell["value"]["results"]
+            exported = cells.get(Stage(run, "export", bundle).key) if bundle else None
+            delta = difference(results["psnr"] - neural["value"]["results"]["psnr"]) if bundle and neural else ""
+            cost = train["value"] if train and bundle is None else {}
+            size = exported["value"]["bytes"] if exported else None
+            lines.append(_line(run, bundle.name if bundle else "neural", results, cost, size, delta))
+            commits += [c["made"]["commit"] for c in (train, cell, exported) if c]
+    kept = [j for j in range(len(HEADER)) if j < TEXT_COLUMNS or any(line[j] for line in lines)]
+    rows = [[line[j] for j in kept] for line in lines]
+    return table([HEADER[j] for j in kept], rows, TEXT_COLUMNS), commits
+
+
+def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[str] = ()) -> str:
+    """The table of a matrix with its notes."""
+    body, commits = results_table(matrix, cells)
+    failed = [f"Failed: {line.splitlines()[0]}" for line in failures]
+    return page(title, body, [*NOTES, *failed], commits)

@@ -1,0 +1,142 @@
+"""Pictures of the worst held-out views: what is wrong, and what each part of the scene contributes."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from torch import Tensor
+
+from bitymi_ns.bake.geometry import tangent_vectors
+from bitymi_ns.host.cameras import to_camera
+from bitymi_ns.host.errors import fail
+from bitymi_ns.host.export import load_trained, replace_file
+from bitymi_ns.host.metrics import image_metrics
+from bitymi_ns.ops import composite_image
+from bitymi_ns.scene import RenderOutput, Scene
+from bitymi_ns.train.views import as_float, over_background
+
+ERROR_SCALE = 0.25
+"""Error at which the error map ends: mean absolute difference of the three colours."""
+OVERDRAW_SCALE = 64
+"""Blended surfels at which the overdraw map ends: the same in every picture, so that runs compare."""
+RESIDUAL_GAIN = 2.0
+"""Residuals are small; the pictures of them are brightened by this factor."""
+FILE = "pictures.json"
+
+KINDS = {
+    "photo": "photograph",
+    "final": "render",
+    "error": f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)",
+    "view_color": "view colour alone (f_view)",
+    "residual_positive": f"positive residual, x{RESIDUAL_GAIN:g}",
+    "residual_negative": f"negative residual, x{RESIDUAL_GAIN:g}",
+    "overdraw": f"overdraw: surfels blended at a pixel, 0 (black) to {OVERDRAW_SCALE} (white)",
+}
+"""Pictures of a view in order, with their captions."""
+
+
+def heat(values: Tensor, scale: float, name: str) -> Tensor:
+    """[H, W] or [H, W, 1] values as colours [H, W, 3] of a colour map that ends at `scale`."""
+    unit = (values.reshape(*values.shape[:2]).float() / scale).clamp(0.0, 1.0).cpu().numpy()
+    return torch.from_numpy(matplotlib.colormaps[name](unit)[..., :3].astype(np.float32))
+
+
+@torch.no_grad()
+def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
+    """Blended positive and negative part of the residual: sum of w max(rho, 0) and of w max(-rho, 0), each [H, W, 3].
+
+    As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
+    of the two is the render wherever no colour had to be cut off at 0.
+    """
+    fragments, projection = output.fragments, output.projection
+    rho = fragments.weight.new_zeros(len(fragments), 3)
+    if scene.field is not None:
+        textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
+        surfel = fragments.surfel[textured].long()
+        u, v = fragments.uv[:, textured]
+        p = scene.surfels
+        axes = tangent_vectors(p["quats"][surfel])
+        size = p["log_scales"][surfel].exp()
+        x = p["means"][surfel] + (u * size[:, 0])[:, None] * axes[..., 0] + (v * size[:, 1])[:, None] * axes[..., 1]
+        rho[textured] = scene.field(x)
+    shape = (projection.camera.height, projection.camera.width, -1)
+    parts = (composite_image(fragments, projection, part.clamp(min=0.0)).view(shape)[..., :3] for part in (rho, -rho))
+    positive, negative = parts
+    return positive, negative
+
+
+@torch.no_grad()
+def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> dict[str, Tensor]:
+    """The pictures of one view, [H, W, 3] each; those of the residual are left out where there is no texture."""
+    output = scene.render(camera, background, "frozen")
+    final = output.rgb.clamp(0.0, 1.0)
+    pictures = {
+        "photo": photo,
+        "final": final,
+        "error": heat((final - photo).abs().mean(-1), ERROR_SCALE, "inferno"),
+    }
+    if scene.field is not None:
+        pictures["view_color"] = scene.render(camera, background, "off").rgb
+        positive, negative = residual_parts(scene, output)
+        pictures |= {"residual_positive": RESIDUAL_GAIN * positive, "residual_negative": RESIDUAL_GAIN * negative}
+    pictures["overdraw"] = heat(output.overdraw, OVERDRAW_SCALE, "gray")
+    return pictures
+
+
+def png(image: Tensor) -> bytes:
+    """[H, W, 3] in [0, 1] as a PNG file."""
+    pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+@torch.no_grad()
+def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
+    """Write the pictures of the held-out views with the lowest PSNR, and pictures.json, which says what they are.
+
+    Args:
+        load_config: config.yml of a trained run.
+        output_dir: folder for the files; made if needed.
+        views: how many views.
+    """
+    if views < 1:
+        fail(f"--views must be at least 1, not {views}")
+    config, pipeline = load_trained(load_config)
+    model, datamanager = pipeline.model, pipeline.datamanager
+    count = len(datamanager.eval_dataset)
+    if count == 0:
+        fail("the run has no held-out views to choose the worst of")
+    background = model.background
+    ranked = []
+    for index in range(count):
+        cameras, batch = datamanager.eval_view(index)
+        camera = to_camera(cameras, model.device)
+        photo = over_background(as_float(batch["image"].to(model.device)), background)
+        rgb = model.render(camera, background, maps=False).rgb.clamp(0.0, 1.0)
+        ranked.append((image_metrics(rgb, photo, batch.get("mask")), index, camera, photo))
+    ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
+    try:
+        output_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail(f"{output_dir} cannot be made: {error}", error)
+    listed = []
+    for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
+        files = {}
+        for kind, image in decompose(model.scene, camera, background, photo).items():
+            files[kind] = f"view{index:04d}-{kind}.png"
+            replace_file(output_dir / files[kind], png(image))
+        figures = {name: round(value, 4) for name, value in metrics.items()}
+        listed.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
+    about = {"scene": config.experiment_name, "method": config.method_name}
+    text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": listed}, indent=1)
+    replace_file(output_dir / FILE, text.encode("utf8"))
+    CONSOLE.print(f"Wrote {len(listed)} views to {output_dir}", soft_wrap=True)

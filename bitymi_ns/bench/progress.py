@@ -137,6 +137,6 @@ class Display:
         text = description if description is not None else ", ".join(map(str, self._running))
         self._progress.update(self._task, description=text, left=left)
         if line is not None:
-            self.console.print(f"{line}{'; ' + left if left else ''}", highlight=False, markup=False)
+            self.console.print(f"{line}{'; ' + left if left else ''}", highlight=False, markup=False, soft_wrap=True)
         elif not self.console.is_terminal:
-            self.console.print(f"{description} ... ", highlight=False, markup=False)
+            self.console.print(f"{description} ... ", highlight=False, markup=False, soft_wrap=True)

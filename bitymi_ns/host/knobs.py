@@ -21,11 +21,11 @@ from bitymi_ns.bench.machine import commit, machine, versions
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
-from bitymi_ns.host.metrics import psnr
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.ops.trace import TRANSMITTANCE_MIN
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import as_float, over_background
 
 WEIGHT_BOUNDS = (0.0, 1 / 255, 0.01, 0.02, 0.05, 0.1)
@@ -193,7 +193,8 @@ class Knobs:
             atlas,
             offset,
             scale,
-            baked.options.extent,
+            baked.extent,
+            baked.mean_residual,
             baked.near,
             baked.weight_bound,
         )

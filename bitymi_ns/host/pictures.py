@@ -38,7 +38,7 @@ KINDS = {
     "view_color": "view colour alone (f_view)",
     "residual_positive": f"positive residual, x{RESIDUAL_GAIN:g}",
     "residual_negative": f"negative residual, x{RESIDUAL_GAIN:g}",
-    "overdraw": f"overdraw: surfels blended at a pixel, 0 (black) to {OVERDRAW_SCALE} (white)",
+    "overdraw": f"overdraw: surfels blended at a pixel, 0 (black) to {OVERDRAW_SCALE} (yellow)",
 }
 """Pictures of a view in order, with their captions."""
 
@@ -87,7 +87,7 @@ def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> d
         pictures["view_color"] = scene.render(camera, background, "off").rgb
         positive, negative = residual_parts(scene, output)
         pictures |= {"residual_positive": RESIDUAL_GAIN * positive, "residual_negative": RESIDUAL_GAIN * negative}
-    pictures["overdraw"] = heat(output.overdraw, OVERDRAW_SCALE, "gray")
+    pictures["overdraw"] = heat(output.overdraw, OVERDRAW_SCALE, "inferno")
     return pictures
 
 

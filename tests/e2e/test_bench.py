@@ -1,0 +1,115 @@
+"""Knobs and pictures of a trained scene, and what the report makes of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bitymi_ns import cli
+from bitymi_ns.host import knobs as host_knobs
+from bitymi_ns.host.cameras import to_camera
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.export import load_trained
+from bitymi_ns.host.knobs import measure_to_file
+from bitymi_ns.host.pictures import KINDS, decompose, draw_worst, residual_parts
+
+
+@pytest.fixture(scope="session")
+def config(trained: BitymiTrainerConfig) -> Path:
+    return trained.get_base_dir() / "config.yml"
+
+
+@pytest.fixture(scope="session")
+def points(config: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
+    """All knobs of the trained room. Not to be changed."""
+    output = tmp_path_factory.mktemp("knobs") / "knobs.jsonl"
+    measure_to_file(config, output, (), 1, 1)
+    return [json.loads(line) for line in output.read_text().splitlines()]
+
+
+def test_every_knob_is_measured_against_its_exact_setting(points: list[dict]) -> None:
+    known = {"weight_bound", "transmittance", "format", "r_max", "resolution"}
+    assert known <= {p["knob"] for p in points} <= set(host_knobs.KNOBS)
+    for p in points:
+        assert p["scene"] == "room" and p["method"] == "bitymi" and p["views"] == 1 and p["made"]["machine"]
+        assert p["ms"] > 0 and 0 <= p["mean_steps"] <= p["max_steps"] < 256 and 5 < p["psnr"] < 60
+        assert (p["max_steps"] == 0.0) or not p["exact"]
+    groups = {(p["knob"], p["renderer"] if p["knob"] == "weight_bound" else "") for p in points}
+    assert len(groups) == sum(p["exact"] for p in points)
+
+
+def test_more_of_a_knob_is_more_error_and_fewer_bytes(points: list[dict]) -> None:
+    def errors(knob: str, renderer: str = "baked") -> list[float]:
+        return [p["mean_steps"] for p in points if (p["knob"], p["renderer"]) == (knob, renderer)]
+
+    for knob in ("weight_bound", "transmittance", "resolution"):
+        assert errors(knob) == sorted(errors(knob)) and errors(knob)[-1] > 0
+    of_format = {p["value"]: p for p in points if p["knob"] == "format"}
+    sizes = [of_format[name]["bytes"] for name in ("float32", "fp16", "uint8", "bc7")]
+    assert sizes == sorted(sizes, reverse=True) and sizes[1] / sizes[3] == pytest.approx(8, rel=0.2)
+    assert of_format["fp16"]["mean_steps"] < of_format["bc7"]["mean_steps"] < 1
+    sides = [p for p in points if p["knob"] == "r_max" and not p["exact"]]
+    assert sides[0]["mean_steps"] >= sides[-1]["mean_steps"] and sides[0]["bytes"] <= sides[-1]["bytes"]
+    assert {p["value"] for p in points if p["default"]} >= {0.02, 1e-4, 64, "bc7", 1.0}
+
+
+def test_some_knobs_by_the_command(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--output", str(tmp_path / "k.jsonl"), "--knobs", "resolution", "--views", "1", "--repeats", "1"]
+    assert cli.main(["bench", "knobs", "--load-config", str(config), *words]) == 0
+    lines = (tmp_path / "k.jsonl").read_text().splitlines()
+    assert {json.loads(line)["knob"] for line in lines} == {"resolution"}
+    assert cli.main(["report", str(tmp_path), "--output-dir", str(tmp_path / "report")]) == 0
+    assert "Resolution of rendering" in (tmp_path / "report" / "index.html").read_text("utf8")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"knobs": ("speed",)}, "there is no knob speed; there are weight_bound"),
+        ({"repeats": 0}, "--repeats must be at least 1"),
+        ({"output": Path("/nowhere/k.jsonl")}, "there is no folder /nowhere"),
+        ({"load_config": Path("/nowhere/config.yml")}, "there is no /nowhere/config.yml"),
+    ],
+)
+def test_mistakes_are_named(config: Path, tmp_path: Path, options: dict, reason: str) -> None:
+    given = {"load_config": config, "output": tmp_path / "k.jsonl", "knobs": (), "views": 1, "repeats": 1, **options}
+    with pytest.raises(InputError, match=reason):
+        measure_to_file(**given)
+
+
+def test_worst_views_are_drawn_in_order(config: Path, tmp_path: Path) -> None:
+    draw_worst(config, tmp_path / "pictures", 2)
+    listed = json.loads((tmp_path / "pictures" / "pictures.json").read_text())
+    first, second = listed["views"]
+    assert first["metrics"]["psnr"] <= second["metrics"]["psnr"] and first["of"] == 2
+    assert list(first["files"]) == list(KINDS)
+    for name in first["files"].values():
+        with Image.open(tmp_path / "pictures" / name) as image:
+            assert image.size == (48, 36)
+    photo, final = (np.asarray(Image.open(tmp_path / "pictures" / first["files"][k])) / 255 for k in ("photo", "final"))
+    mse = float(((photo - final) ** 2).mean())
+    assert -10 * np.log10(mse) == pytest.approx(first["metrics"]["psnr"], abs=0.1)
+    with pytest.raises(InputError, match="--views must be at least 1"):
+        draw_worst(config, tmp_path / "none", 0)
+
+
+def test_the_parts_make_the_whole(config: Path) -> None:
+    _, pipeline = load_trained(config)
+    scene = pipeline.model.scene
+    camera = to_camera(pipeline.datamanager.eval_view(0)[0], "cpu")
+    with torch.no_grad():
+        scene.field.field_w3.normal_(std=0.02, generator=torch.Generator().manual_seed(0))
+        output = scene.render(camera, None, "frozen")
+        plain = scene.render(camera, None, "off").rgb
+        positive, negative = residual_parts(scene, output)
+    assert positive.min() >= 0 and negative.min() >= 0 and positive.max() > 1e-3 and negative.max() > 1e-3
+    gap = output.rgb - (plain + positive - negative)
+    assert gap.min() > -1e-4 and gap.mean() < 0.02  # above where a colour was cut off at 0
+    pictures = decompose(scene, camera, torch.zeros(3), torch.zeros(36, 48, 3))
+    assert list(pictures) == list(KINDS)

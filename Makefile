@@ -75,12 +75,11 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -q
 
-# The demo scene as its own capture, so that the folder names the scene.
-$(WORK)/captures/room/transforms.json: | setup
+$(WORK)/captures/demo/transforms.json: | setup
 	$(BIN)/bitymi sample --output-dir $(@D)
 
-bench: setup $(WORK)/captures/room/transforms.json
-	$(BIN)/bitymi bench local --data $(WORK)/captures/room $(DATA) --methods $(METHODS) --knobs --work $(WORK) \
+bench: setup $(WORK)/captures/demo/transforms.json
+	$(BIN)/bitymi bench local --data $(WORK)/captures/demo $(DATA) --methods $(METHODS) --knobs --work $(WORK) \
 	  $(if $(STEPS),--steps $(STEPS)) $(if $(SEEDS),--seeds $(SEEDS)) --output $(WORK)/captures.md
 	$(BIN)/bitymi report $(WORK) --output-dir $(WORK)/report --title "bitymi bench"
 

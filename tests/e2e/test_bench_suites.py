@@ -1,0 +1,75 @@
+"""The command lines of `bitymi bench` are understood by nerfstudio: standard layouts, seeds and own captures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nerfstudio.scripts import train as ns_train
+from nerfstudio.utils.eval_utils import eval_setup
+from scipy.spatial.transform import Rotation
+
+from bitymi_ns.bench import Row, Run
+from bitymi_ns.bench.commands import CURVE, Layout, read_curve, train_command
+from bitymi_ns.bench.suites import local_scenes, standard_scenes, suites
+
+SMALL = (
+    "--pipeline.model.scene.log2-table-size", "10", "--pipeline.model.scene.min-resolution", "16",
+    "--logging.local-writer.enable", "False", "--pipeline.model.curve-points", "1",
+)  # fmt: skip
+
+
+def colmap_scene(room: Path, folder: Path, images: str, factor: int) -> None:
+    """The room as COLMAP would leave it, its images `factor` times smaller than those that COLMAP saw."""
+    meta = json.loads((room / "transforms.json").read_text())
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    shutil.copytree(room / "images", folder / images)
+    size = [factor * meta[key] for key in ("w", "h")]
+    intrinsics = [factor * meta[key] for key in ("fl_x", "fl_y", "cx", "cy")]
+    (sparse / "cameras.txt").write_text("1 PINHOLE " + " ".join(f"{v:g}" for v in [*size, *intrinsics]) + "\n")
+    lines = []
+    for i, frame in enumerate(meta["frames"], 1):
+        pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL to OpenCV axes
+        view = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(view[:3, :3]).as_quat()
+        numbers = " ".join(f"{v:.9f}" for v in (w, x, y, z, *view[:3, 3]))
+        lines += [f"{i} {numbers} 1 {Path(frame['file_path']).name}", ""]
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3))
+    rows = [f"{i} {x:.5f} {y:.5f} {z:.5f} 128 128 128 0.5 1 0" for i, (x, y, z) in enumerate(points, 1)]
+    (sparse / "points3D.txt").write_text("\n".join(rows) + "\n")
+
+
+def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Run the command of a training in this process; returns its config.yml."""
+    monkeypatch.setattr(sys, "argv", train_command(work, run))
+    ns_train.entrypoint()
+    return Layout(work, run).config
+
+
+def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    colmap_scene(room, tmp_path / "360" / "bonsai", "images_2", 2)
+    (scene,) = standard_scenes(suites()["mipnerf360"], tmp_path / "360", ["bonsai"])
+    run = Run(scene, Row("small", "bitymi", SMALL), seed=3, steps=2)
+    path = train(tmp_path / "work", run, monkeypatch)
+    assert read_curve(path.with_name(CURVE))[-1]["experiment_name"] == "bonsai"
+    config, pipeline, _, _ = eval_setup(path, test_mode="test")
+    assert config.machine.seed == config.pipeline.model.train.seed == 3
+    assert config.pipeline.datamanager.train_cameras_sampling_seed == 3
+    held_out = [name.name for name in pipeline.datamanager.eval_dataset.image_filenames]
+    every = sorted(p.name for p in (tmp_path / "360/bonsai/images_2").iterdir())
+    assert held_out == every[::8]
+    camera, batch = pipeline.datamanager.eval_view(0)
+    assert batch["image"].shape[:2] == (36, 48) == (int(camera.height), int(camera.width))
+
+
+def test_a_capture_of_ones_own(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (scene,) = local_scenes([room])
+    path = train(tmp_path / "work", Run(scene, Row("small", "bitymi", SMALL), steps=2), monkeypatch)
+    config, pipeline, _, _ = eval_setup(path, test_mode="test")
+    assert config.max_num_iterations == 2 and len(pipeline.datamanager.eval_dataset) == 2

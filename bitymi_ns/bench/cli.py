@@ -20,8 +20,8 @@ from bitymi_ns.bench.tables import results_page
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
 
-FAILED = 1
-"""Exit status when a cell failed."""
+FAILED, INTERRUPTED = 1, 130
+"""Exit statuses when a cell failed, and after Ctrl-C."""
 
 
 @dataclass
@@ -99,14 +99,18 @@ class BenchRun:
         matrix, work = self.matrix(), self.work.expanduser().resolve()
         chains, cells = matrix.chains(), open_cells(work)
         workers = 1 if self.cluster == "none" else len(self.gpus) or self.jobs
-        with Display(chains, cells, workers) as display:
-            if self.cluster == "none":
-                failures = run_chains(work, chains, display)
-            else:
-                from bitymi_ns.bench.spread import job_options, spread
+        try:
+            with Display(chains, cells, workers) as display:
+                if self.cluster == "none":
+                    failures = run_chains(work, chains, display)
+                else:
+                    from bitymi_ns.bench.spread import job_options, spread
 
-                options = job_options(self.job_options)
-                failures = spread(work, chains, self.cluster, display, self.jobs, self.gpus, options)
+                    options = job_options(self.job_options)
+                    failures = spread(work, chains, self.cluster, display, self.jobs, self.gpus, options)
+        except KeyboardInterrupt:
+            say(f"interrupted; {len(open_cells(work))} finished cells are in {work}, and the same command goes on")
+            return INTERRUPTED
         for failure in failures:
             say(failure)
         cells.refresh()

@@ -66,8 +66,8 @@ def missing(chain: Chain, cells: Cells) -> list[Stage]:
 
 
 @contextmanager
-def locked(work: Path, stage: Stage) -> Iterator[None]:
-    """Hold a run, so that no other process works in its folders.
+def locked(work: Path, stage: Stage) -> Iterator[int]:
+    """Hold a run, so that no other process works in its folders; yields the file descriptor that holds it.
 
     Raises:
         CommandFailed: another process holds it.
@@ -78,19 +78,21 @@ def locked(work: Path, stage: Stage) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise CommandFailed(f"{stage.run}: another process is at work on this run ({path} is locked)") from error
-        yield
+            raise CommandFailed(
+                f"{stage.run}: another process is at work on this run: wait for it or end it ({path})"
+            ) from error
+        yield file.fileno()
 
 
-def run_stage(work: Path, stage: Stage, cells: Cells) -> float:
-    """Do one cell and write its line; returns the seconds it took.
+def run_stage(work: Path, stage: Stage, cells: Cells, lock: int) -> float:
+    """Do one cell and write its line; returns the seconds it took. The command holds the lock of the run, too.
 
     Raises:
         CommandFailed: its command failed, or left no figures.
     """
     command = stage_command(work, stage)
     start = time.perf_counter()
-    cost = run_measured(command, prepare(work, stage))
+    cost = run_measured(command, prepare(work, stage), [lock])
     value = read_result(work, stage, cost)
     seconds = time.perf_counter() - start
     cells.add(stage.key, value, made(command, seconds))
@@ -116,7 +118,7 @@ def run_chain(work: Path, chain: Chain, watcher: Watcher | None = None) -> list[
     failures: list[str] = []
     broken: list[Stage] = []
     try:
-        with locked(work, chain[0]):
+        with locked(work, chain[0]) as lock:
             cells.refresh()
             for stage in missing(chain, cells):
                 if any(needs(stage, other) for other in broken):
@@ -125,7 +127,7 @@ def run_chain(work: Path, chain: Chain, watcher: Watcher | None = None) -> list[
                     continue
                 watcher.started(stage)
                 try:
-                    watcher.finished(stage, run_stage(work, stage, cells))
+                    watcher.finished(stage, run_stage(work, stage, cells, lock))
                 except CommandFailed as error:
                     broken.append(stage)
                     failures.append(f"{stage} failed: {error}")

@@ -49,10 +49,16 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_WAIT_POLICY": "passive"}
 
 
-def run_measured(command: Sequence[str], log: Path) -> Cost:
+def run_measured(command: Sequence[str], log: Path, keep_open: Sequence[int] = ()) -> Cost:
     """Run a command with its output in a file.
 
     An interrupt ends the command first, then this call.
+
+    Args:
+        command: the command.
+        log: the file for its output.
+        keep_open: file descriptors that the command inherits: a lock on them outlives this process, should it be killed
+            while the command goes on.
 
     Raises:
         CommandFailed: non-zero exit status, or the command cannot be started.
@@ -62,7 +68,12 @@ def run_measured(command: Sequence[str], log: Path) -> Cost:
     with open(log, "wb") as out:
         try:
             process = subprocess.Popen(
-                command, env=environment(), stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
+                command,
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                pass_fds=tuple(keep_open),
             )
         except OSError as error:
             raise CommandFailed(f"{shlex.join(command)} cannot be started: {error}") from error

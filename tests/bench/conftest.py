@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,8 @@ for line in pathlib.Path({plan!r}).read_text().splitlines():
     if line and all(word in call for word in line.split()):
         print("something is wrong with the capture")
         sys.exit(3)
+while any(all(word in call for word in line.split()) for line in pathlib.Path({slow!r}).read_text().splitlines()):
+    time.sleep(0.05)
 print(os.environ["OMP_WAIT_POLICY"])
 if name == "ns-train":
     run = pathlib.Path(given("--output-dir"), given("--experiment-name"), sys.argv[1], given("--timestamp"))
@@ -64,14 +67,14 @@ TOOLS = ("ns-train", "ns-export", "ns-eval", "bitymi")
 
 
 class Fakes:
-    """The stand-ins: what was called, and which calls fail."""
+    """The stand-ins: what was called, which calls fail, and (`slow`) which wait until they are no longer named."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.log, self.plan = folder / "log", folder / "fail"
-        self.log.write_text("")
-        self.plan.write_text("")
-        text = FAKE.format(python=sys.executable, log=str(self.log), plan=str(self.plan))
+        self.log, self.plan, self.slow = folder / "log", folder / "fail", folder / "slow"
+        for file in (self.log, self.plan, self.slow):
+            file.write_text("")
+        text = FAKE.format(python=sys.executable, log=str(self.log), plan=str(self.plan), slow=str(self.slow))
         for name in TOOLS:
             (folder / name).write_text(text)
             (folder / name).chmod(0o755)
@@ -85,6 +88,13 @@ class Fakes:
     def fail(self, *lines: str) -> None:
         """Calls that contain all words of one of the lines end with status 3."""
         self.plan.write_text("\n".join(lines))
+
+    def python(self, monkeypatch: pytest.MonkeyPatch) -> str:
+        """A Python that finds the stand-ins beside it, for code in other processes."""
+        link = self.folder / "python"
+        link.symlink_to(Path(sys.executable).resolve())
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+        return str(link)
 
 
 @pytest.fixture

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -60,12 +62,12 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
     work, chain = tmp_path / "work", matrix.chains()[0]
     calls = iter(range(99))
 
-    def killed(command: list[str], log: Path) -> object:
+    def killed(command: list[str], log: Path, keep_open: list[int]) -> object:
         if next(calls) == at:
             if "--output-dir" in command:  # half of its files are there
                 Path(command[command.index("--output-dir") + 1]).mkdir(parents=True, exist_ok=True)
             raise KeyboardInterrupt
-        return run_measured(command, log)
+        return run_measured(command, log, keep_open)
 
     monkeypatch.setattr(engine, "run_measured", killed)
     with pytest.raises(KeyboardInterrupt):
@@ -76,6 +78,30 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
     monkeypatch.setattr(engine, "run_measured", run_measured)
     assert run_chains(work, [chain]) == []
     assert len(fakes.calls()) == 6 - at and len(lines(work)) == 6
+
+
+def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
+    fakes, matrix: Matrix, capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work, python = tmp_path / "work", fakes.python(monkeypatch)
+    words = [python, "-m", "bitymi_ns.cli", "bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10"]
+    words += ["--formats", "bc7", "--pictures", "0", "--work", str(work)]
+    fakes.slow.write_text("ns-export")
+    process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not any(call.startswith("ns-export") for call in fakes.log.read_text().splitlines()):
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert len(lines(work)) == 2
+    again = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert again.returncode == 1 and "another process is at work" in again.stderr  # its export still runs
+    fakes.calls()
+    fakes.slow.write_text("")
+    while subprocess.run(words, capture_output=True, check=False).returncode != 0:
+        assert time.monotonic() < deadline
+    assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"] and len(lines(work)) == 4
 
 
 def test_a_line_that_was_cut_off_is_that_cell_alone(fakes, matrix: Matrix, tmp_path: Path) -> None:

@@ -30,10 +30,7 @@ class Recorder(Silent):
 def job_python(fakes, monkeypatch: pytest.MonkeyPatch) -> None:
     """Jobs run a Python that has the stand-ins beside it."""
     pytest.importorskip("submitit")
-    link = fakes.folder / "python"
-    link.symlink_to(Path(sys.executable).resolve())
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
-    monkeypatch.setattr(sys, "executable", str(link))
+    monkeypatch.setattr(sys, "executable", fakes.python(monkeypatch))
     monkeypatch.setattr("bitymi_ns.bench.spread.POLL", 0.05)
 
 

@@ -155,6 +155,17 @@ def test_failures_end_with_status_1(
     assert "- Failed: fox, bitymi: export (bc7) failed" in captured.out and "status 3" in captured.err
 
 
+def test_ctrl_c_says_how_to_go_on(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bitymi_ns.bench.engine.run_measured", interrupted)
+    assert run("local", "--data", capture("fox"), "--steps", 10, "--work", tmp_path / "w") == 130
+    assert "0 finished cells are in" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

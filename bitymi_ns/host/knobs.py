@@ -31,7 +31,7 @@ from bitymi_ns.train.views import as_float, over_background
 WEIGHT_BOUNDS = (0.0, 1 / 255, 0.01, 0.02, 0.05, 0.1)
 TRANSMITTANCES = (0.0, TRANSMITTANCE_MIN, 1e-3, 1e-2, 5e-2)
 TILE_SIDES = (8, 16, 32, 64, 128)
-TOLERANCES = (0.25, 0.5, 1.0, 2.0, 4.0)
+TOLERANCES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 FORMATS = ("fp16", "uint8", "bc7")
 SIZES = (1.0, 0.75, 0.5, 0.25)
 
@@ -39,8 +39,8 @@ KNOBS = {
     "weight_bound": "fragments of smaller blending weight get no residual; exact: all do",
     "transmittance": "a pixel takes no surfel that would leave it less; exact: it takes all",
     "format": "texels of the atlas; exact: 32-bit floats",
-    "r_max": "largest tile side; exact: the field itself at every fragment",
-    "tolerance": "error allowed to the atlas, in 8-bit steps; exact: the field itself at every fragment",
+    "r_max": "largest tile side; exact: the field at every fragment",
+    "tolerance": "error allowed to the atlas, in 8-bit steps, 0 = the whole grid; exact: the field at every fragment",
     "resolution": "share of the image's side that is rendered, enlarged bilinearly; exact: all of it",
 }
 """Knob -> what it does, and what it is measured against."""
@@ -169,7 +169,10 @@ class Knobs:
         model = pipeline.model
         self.scene = model.scene
         self.background = model.background.cpu()
-        self.options: BakeOptions = build(BakeOptions, load_preset("bitymi").bake, "bitymi.yaml", "bake.")
+        self.preset: BakeOptions = build(BakeOptions, load_preset("bitymi").bake, "bitymi.yaml", "bake.")
+        names = {f.name for f in fields(BakeOptions)}
+        whole = {"drop_unseen": False, "tolerance": 0.0}  # one knob at a time: nothing else is left out
+        self.options = replace(self.preset, **{k: v for k, v in whole.items() if k in names})
         cameras = pipeline.datamanager.undistorted_train_cameras()
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
@@ -232,7 +235,7 @@ class Knobs:
         if "r_max" in wanted and textured:
             yield self._of_the_bake("r_max", TILE_SIDES, self.options.r_max)
         if "tolerance" in wanted and textured and "tolerance" in {f.name for f in fields(BakeOptions)}:
-            yield self._of_the_bake("tolerance", TOLERANCES, getattr(self.options, "tolerance", None))
+            yield self._of_the_bake("tolerance", TOLERANCES, getattr(self.preset, "tolerance", None))
 
     def _of_one_bake(self, wanted: Sequence[str], textured: bool) -> Iterator[list[Setting]]:
         baked = self._bake()

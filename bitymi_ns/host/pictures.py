@@ -27,7 +27,7 @@ ERROR_SCALE = 0.25
 """Error at which the error map ends: mean absolute difference of the three colours."""
 OVERDRAW_SCALE = 64
 """Blended surfels at which the overdraw map ends: the same in every picture, so that runs compare."""
-RESIDUAL_GAIN = 2.0
+RESIDUAL_GAIN = 4.0
 """Residuals are small; the pictures of them are brightened by this factor."""
 FILE = "pictures.json"
 

@@ -29,7 +29,8 @@ p, ul { margin: .5rem 0; } .soft { color: var(--soft); font-size: .875rem; }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; min-width: min(100%, 34rem); }
 th, td { padding: .3rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 th:first-child { text-align: left; padding-left: .5rem; } thead th { font-weight: 600; border-bottom-width: 2px; }
-tbody th { font-weight: 400; } tr.section th { white-space: normal; background: var(--band); font-style: italic; color: var(--soft); }
+tbody th { font-weight: 400; }
+tr.section th { white-space: normal; background: var(--band); font-style: italic; color: var(--soft); }
 table.dense { font-size: .8rem; } table.dense th, table.dense td { padding: .25rem .5rem; }
 td b { color: var(--best); }
 .plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 30rem), 1fr)); gap: 1.5rem; }

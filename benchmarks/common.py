@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from pathlib import Path
+
+if importlib.util.find_spec("bitymi_ns") is None:  # not installed, or not yet: gpu.py builds it
+    sys.path.append(str(Path(__file__).resolve().parent.parent))
 
 from bitymi_ns.bench.commands import read_curve
 from bitymi_ns.bench.process import CommandFailed, say

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import os
 import subprocess
 import sys
 import time
@@ -21,16 +22,21 @@ import torch
 from common import number, page, publish, say
 
 ROOT = Path(__file__).resolve().parent.parent
+BUILT = "BITYMI_BENCHMARK_BUILT"
+"""Set in the environment once this script has built the kernels."""
 
 
 def build() -> None:
-    """Compiles and installs the package where it has no CUDA kernels.
+    """Compiles and installs the package where it has no CUDA kernels, then starts this script anew: only a Python that
+    starts after an installation finds what it installed.
 
     Raises:
         SystemExit: that failed, or the kernels are still missing.
     """
     if importlib.util.find_spec("bitymi_ns") and importlib.util.find_spec("bitymi_ns._cuda"):
         return
+    if os.environ.get(BUILT):
+        sys.exit("the build ended well and left no CUDA kernels: is nvcc on PATH?")
     start = time.perf_counter()
     say("building the CUDA kernels")
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-build-isolation", "--no-deps", "-e", str(ROOT)]
@@ -38,6 +44,8 @@ def build() -> None:
     if done.returncode:
         sys.exit(f"the build failed:\n{(done.stdout + done.stderr)[-4000:]}")
     say(f"built in {time.perf_counter() - start:.0f} s")
+    os.environ[BUILT] = "1"
+    os.execv(sys.executable, [sys.executable, *sys.argv])
 
 
 def check() -> str:
@@ -90,7 +98,6 @@ def main() -> int:
         if not torch.cuda.is_available():
             parser.error("no CUDA device is to be seen (or torch is a CPU build); --emulated tries the script without")
         build()
-    importlib.invalidate_caches()
     import gpu_training
     from gpu_common import Options, Section, copy_bandwidth, missing
 

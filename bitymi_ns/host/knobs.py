@@ -218,8 +218,15 @@ class Knobs:
         pages = pages if pages.dtype == torch.uint8 else pages.float()
         return self._scene(baked, pages.contiguous(), atlas.range.offset, atlas.range.scale)
 
-    def _draw(self, scene: BakedScene) -> Render:
-        return lambda camera: scene.render(camera.to("cpu"), background=self.background).rgb
+    def _draw(self, scene: BakedScene, bound: float | None = None, stop: float = TRANSMITTANCE_MIN) -> Render:
+        """Settings share the scene: what it keeps between views for its renderer is there once."""
+
+        def draw(camera: Camera) -> Tensor:
+            scene.weight_bound = self.bound if bound is None else bound
+            scene.transmittance_min = stop
+            return scene.render(camera.to("cpu"), background=self.background).rgb
+
+        return draw
 
     def groups(self, wanted: Sequence[str]) -> Iterator[list[Setting]]:
         """The settings of one knob and renderer after the other."""
@@ -241,20 +248,18 @@ class Knobs:
         baked = self._bake()
         stored = self.stored_texels(baked)
 
-        def group(knob: str, exact: float, default: float, scenes: dict[float, BakedScene]) -> list[Setting]:
-            return [Setting(knob, v, "baked", self._draw(s), None, v == exact, v == default) for v, s in scenes.items()]
+        def group(knob: str, exact: float, default: float, draws: dict[float, Render]) -> list[Setting]:
+            return [Setting(knob, v, "baked", draw, None, v == exact, v == default) for v, draw in draws.items()]
 
         if "weight_bound" in wanted and textured:
-            values = sorted({*WEIGHT_BOUNDS, self.bound})
-            yield group("weight_bound", 0.0, self.bound, {v: replace(stored, weight_bound=v) for v in values})
+            bounds = sorted({*WEIGHT_BOUNDS, self.bound})
+            yield group("weight_bound", 0.0, self.bound, {v: self._draw(stored, bound=v) for v in bounds})
         if "transmittance" in wanted:
-            scenes = {v: replace(stored, transmittance_min=v) for v in TRANSMITTANCES}
-            yield group("transmittance", 0.0, TRANSMITTANCE_MIN, scenes)
+            draws = {v: self._draw(stored, stop=v) for v in TRANSMITTANCES}
+            yield group("transmittance", 0.0, TRANSMITTANCE_MIN, draws)
         if "resolution" in wanted:
-            yield [
-                Setting("resolution", v, "baked", lambda c, v=v: self._enlarged(stored, c, v), None, v == 1.0, v == 1.0)
-                for v in SIZES
-            ]
+            draw = self._draw(stored)
+            yield group("resolution", 1.0, 1.0, {v: lambda c, v=v: _enlarged(draw, c, v) for v in SIZES})
         if "format" in wanted and textured:
             texels = baked.texels
             assert texels is not None
@@ -268,13 +273,6 @@ class Knobs:
                 settings.append(Setting("format", name, "baked", draw, other.atlas.nbytes, False, default))
             yield settings
 
-    def _enlarged(self, scene: BakedScene, camera: Camera, share: float) -> Tensor:
-        small = scene.render(camera.to("cpu").scaled(share), background=self.background).rgb
-        if share == 1.0:
-            return small
-        size = (camera.height, camera.width)
-        return interpolate(small.permute(2, 0, 1)[None], size=size, mode="bilinear")[0].permute(1, 2, 0)
-
     def _of_the_bake(self, knob: str, values: Sequence[float], default: float | None) -> list[Setting]:
         """Against the field itself; texels as 32-bit floats, so that the format's error is not in it."""
         settings = [Setting(knob, "field", "neural", self.neural, None, True)]
@@ -284,6 +282,15 @@ class Knobs:
             size = None if baked.atlas is None else baked.atlas.nbytes
             settings.append(Setting(knob, value, "baked", draw, size, False, value == default))
         return settings
+
+
+def _enlarged(draw: Render, camera: Camera, share: float) -> Tensor:
+    """[H, W, 3]: a view that is rendered at a share of its size, enlarged bilinearly."""
+    small = draw(camera.scaled(share))
+    if share == 1.0:
+        return small
+    size = (camera.height, camera.width)
+    return interpolate(small.permute(2, 0, 1)[None], size=size, mode="bilinear")[0].permute(1, 2, 0)
 
 
 def measure_to_file(load_config: Path, output: Path, knobs: Sequence[str], views: int, repeats: int) -> None:

@@ -200,6 +200,7 @@ class Knobs:
             baked.mean_residual,
             baked.near,
             baked.weight_bound,
+            baked.prefilter,
         )
 
     def exact_texels(self, baked: Baked) -> BakedScene:

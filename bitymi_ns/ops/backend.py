@@ -108,6 +108,17 @@ def workspace(name: str, like: Tensor, *sizes: int) -> Tensor:
     return torch.empty(size, dtype=torch.uint8, device=like.device)
 
 
+def on_same_device(like: Tensor, **tensors: Tensor) -> None:
+    """Checks that tensors lie where `like` does.
+
+    Raises:
+        ValueError: one does not; names it.
+    """
+    for name, tensor in tensors.items():
+        if tensor.device != like.device:
+            raise ValueError(f"{name} is on device '{tensor.device}', the view's fragments are on '{like.device}'")
+
+
 def dense(tensor: Tensor, like: Tensor) -> Tensor:
     """`tensor` without its graph, contiguous, with the dtype and device of `like`."""
     return tensor.detach().to(like).contiguous()

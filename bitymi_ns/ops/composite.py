@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel
+from .backend import cuda_backend, dense, kernel, on_same_device
 from .project import Projection
 from .trace import Fragments
 
@@ -46,7 +46,11 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
     Returns:
         [H * W, 5] rgb, alpha, sum w beta; with maps [H * W, 9]: also sum w z (camera z) and sum w n (unit normals in
         the camera frame, OpenCV axes, facing the camera). Nothing is divided by alpha; the background is not included.
+
+    Raises:
+        ValueError: tensors on different devices, or colours of a wrong shape.
     """
+    on_same_device(fragments.weight, colors=colors, geom=projection.geom)
     return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from . import trace_cpu, trace_cuda
-from .backend import cuda_backend, dense, function
+from .backend import cuda_backend, dense, function, on_same_device
 from .project import GEOM, Projection
 
 TRANSMITTANCE_MIN = 1e-4
@@ -110,7 +110,11 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
 
     Returns:
         [n] int32.
+
+    Raises:
+        ValueError: the mask has another number of pixels or lies on another device.
     """
+    on_same_device(fragments.surfel, mask=mask)
     if mask.numel() != fragments.width * fragments.height:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
     counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)

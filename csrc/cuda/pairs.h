@@ -156,26 +156,52 @@ __device__ inline S sum_over_run(S (&v)[kColumns], int lane) {
 }
 
 // put(surfel, column, sum) for every surfel and column of partial [pairs, kColumns], by slot. A warp a surfel: lanes
-// are columns, and groups of lanes take slots in turns.
-constexpr int kSlotThreads = 128;
+// are columns, and groups of lanes take slots in turns. A surfel with more than kLong slots, a disc before the camera,
+// say, would keep its warp long after all others: it is left to the whole block.
+constexpr int kSlotThreads = 256, kSlotWarps = kSlotThreads / kWarp, kLong = 64;
+template <int kColumns, class S>
+__device__ inline S sum_slots_of(const S* partial, int64_t begin, int64_t end, int worker, int workers) {
+  constexpr int kGroups = kWarp / kColumns;
+  const int lane = int(threadIdx.x) % kWarp;
+  S sum = S(0);
+  for (int64_t i = begin + worker * kGroups + lane / kColumns; i < end; i += workers * kGroups)
+    sum += partial[i * kColumns + lane % kColumns];
+  BT_UNROLL
+  for (int step = kWarp / 2; step >= kColumns; step /= 2) sum += __shfl_xor_sync(kFullMask, sum, step);
+  return sum;
+}
 template <int kColumns, class S, class Put>
 __global__ void __launch_bounds__(kSlotThreads) sum_slots_kernel(Pairs p, const S* partial, Put put) {
-  constexpr int kGroups = kWarp / kColumns;
-  const int lane = int(threadIdx.x) % kWarp, column = lane % kColumns;
-  const int64_t r = int64_t(blockIdx.x) * (kSlotThreads / kWarp) + threadIdx.x / kWarp;
-  if (r >= p.surfels) return;  // whole warps
-  const int64_t end = p.slot_start[r + 1];
-  S sum = S(0);
-  for (int64_t i = p.slot_start[r] + lane / kColumns; i < end; i += kGroups) sum += partial[i * kColumns + column];
-  for (int step = kWarp / 2; step >= kColumns; step /= 2) sum += __shfl_xor_sync(kFullMask, sum, step);
-  if (lane < kColumns) put(p.order[r], column, sum);
+  __shared__ S shares[kSlotWarps][kColumns];
+  const int warp = int(threadIdx.x) / kWarp, lane = int(threadIdx.x) % kWarp;
+  const int64_t first = int64_t(blockIdx.x) * kSlotWarps, own = first + warp;
+  if (own < p.surfels) {
+    const int64_t begin = p.slot_start[own], end = p.slot_start[own + 1];
+    if (end - begin <= kLong) {
+      const S sum = sum_slots_of<kColumns>(partial, begin, end, 0, 1);
+      if (lane < kColumns) put(p.order[own], lane, sum);
+    }
+  }
+  for (int64_t r = first; r < first + kSlotWarps && r < p.surfels; ++r) {
+    const int64_t begin = p.slot_start[r], end = p.slot_start[r + 1];
+    if (end - begin <= kLong) continue;
+    const S share = sum_slots_of<kColumns>(partial, begin, end, warp, kSlotWarps);
+    if (lane < kColumns) shares[warp][lane] = share;
+    __syncthreads();
+    if (warp == 0 && lane < kColumns) {
+      S sum = S(0);
+      for (int w = 0; w < kSlotWarps; ++w) sum += shares[w][lane];
+      put(p.order[r], lane, sum);
+    }
+    __syncthreads();  // before the next surfel's shares
+  }
 }
 template <int kColumns, class S, class Put>
 void sum_slots(const Pairs& p, const S* partial, Put put, Stream stream) {
   static_assert((kColumns & (kColumns - 1)) == 0 && kColumns <= kWarp);
   if (!p.surfels) return;
-  BT_LAUNCH((sum_slots_kernel<kColumns, S, Put>), dim3(unsigned(ceil_div(p.surfels, kSlotThreads / kWarp))),
-            dim3(kSlotThreads), 0, stream, p, partial, put);
+  BT_LAUNCH((sum_slots_kernel<kColumns, S, Put>), dim3(unsigned(ceil_div(p.surfels, kSlotWarps))), dim3(kSlotThreads),
+            0, stream, p, partial, put);
 }
 
 }  // namespace bt::cuda

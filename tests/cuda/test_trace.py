@@ -203,7 +203,9 @@ def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> Non
     assert ((step == 1) | (runs[1:] == 0)).all()  # 0, 1, 2, ... again in every tile
 
 
-def test_a_surfel_over_the_whole_screen_is_listed_by_its_warp(device: torch.device, cpu: CpuContext) -> None:
+def test_a_surfel_over_the_whole_screen_is_listed_by_its_warp_and_summed_by_its_block(
+    device: torch.device, cpu: CpuContext
+) -> None:
     case = random_scene(3, 0, 300, 80, scale=30.0)  # 95 tiles
     got = render(case, torch.float64, device)
     with cpu():
@@ -271,6 +273,11 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
     fragments = ops.trace(projection)
     with pytest.raises(ValueError, match="colors has"):
         ops.composite_image(fragments, projection, torch.zeros(3, 3, device=device).double())
+    elsewhere = torch.zeros(len(fragments), 3, device="meta")
+    with pytest.raises(ValueError, match="colors is on device 'meta'"):
+        ops.composite_image(fragments, projection, elsewhere)
+    with pytest.raises(ValueError, match="mask is on device 'meta'"):
+        ops.masked_counts(fragments, torch.ones(400, dtype=torch.bool, device="meta"), 10)
     shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
     with pytest.raises(ValueError, match="16 bytes"):
         ops.trace(replace(projection, geom=shifted))

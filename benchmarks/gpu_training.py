@@ -169,10 +169,13 @@ def _step(
 def _gsplat_steps(
     n: int, width: int, height: int, loss: Callable[[Tensor], Tensor], device: torch.device
 ) -> list[tuple[str, Callable[[], object], int | None]]:
+    if device.type != "cuda":
+        return []
     try:
         import gsplat
-    except ImportError as error:
-        say(f"gsplat is not there: {error}")
+        import gsplat.cuda._backend  # compiles the kernels where that was not done
+    except (ImportError, RuntimeError, OSError) as error:
+        say(f"gsplat cannot be timed: {error}")
         return []
     scene, camera = trained_like(n, width, height, device, view_color="sh", texture=False)
     q = {name: value.detach() for name, value in scene.surfels.items()}

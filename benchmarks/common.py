@@ -11,9 +11,9 @@ if importlib.util.find_spec("bitymi_ns") is None:  # not installed, or not yet: 
 
 from bitymi_ns.bench.commands import read_curve
 from bitymi_ns.bench.process import CommandFailed, say
-from bitymi_ns.bench.tables import number, page, table
+from bitymi_ns.bench.tables import difference, number, page, table
 
-__all__ = ["CommandFailed", "number", "page", "publish", "read_curve", "say", "table"]
+__all__ = ["CommandFailed", "difference", "number", "page", "publish", "read_curve", "say", "table"]
 
 
 def publish(text: str, output: Path | None) -> None:

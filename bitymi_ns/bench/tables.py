@@ -68,11 +68,9 @@ def _line(
     run: Run, form: str, results: dict[str, Any], cost: dict[str, Any], size: int | None, delta: str
 ) -> list[str]:
     peak = cost.get("peak_bytes")
-    name = run.row.name if run.seed is None else f"{run.row.name}, seed {run.seed}"
     digits = {"psnr": 2, "ssim": 4, "flip": 4, "lpips": 4, "surfels": 0, "fragments_per_pixel": 2, "render_ms": 1}
     return [
-        run.scene.name,
-        name.replace("|", "\\|"),
+        *_names(run),
         form,
         *(number(results.get(key), count) for key, count in digits.items()),
         number(cost.get("seconds"), 0),
@@ -106,13 +104,73 @@ def results_table(matrix: Matrix, cells: Cells) -> tuple[str, list[str]]:
             size = exported["value"]["bytes"] if exported else None
             lines.append(_line(run, bundle.name if bundle else "neural", results, cost, size, delta))
             commits += [c["made"]["commit"] for c in (train, cell, exported) if c]
-    kept = [j for j in range(len(HEADER)) if j < TEXT_COLUMNS or any(line[j] for line in lines)]
-    rows = [[line[j] for j in kept] for line in lines]
-    return table([HEADER[j] for j in kept], rows, TEXT_COLUMNS), commits
+    return _without_empty(HEADER, lines), commits
+
+
+BUNDLE_HEADER = (
+    "scene", "row", "bundle", "surfels", "texels a surfel", "atlas bytes", "of the first", "dPSNR", "PSNR to neural",
+    "dFLIP", "render ms", "tile error p99",
+)  # fmt: skip
+BUNDLE_NOTES = (
+    "dPSNR and dFLIP: against the photographs, bundle minus trained scene; PSNR to neural: bundle against trained "
+    "scene on the held-out views, as the exporter measures it.",
+    "Tile error: root mean square of a tile against the field as stored, in 8-bit steps, 99th percentile.",
+)
+
+
+def bundles_table(matrix: Matrix, cells: Cells) -> str:
+    """What sets the bundles of each run apart: size and error beside the first of them, and what they leave out."""
+    lines = []
+    for run in matrix.runs():
+        neural = cells.get(Stage(run, "eval").key)
+        first: float | None = None
+        for bundle in matrix.bundles:
+            exported = cells.get(Stage(run, "export", bundle).key)
+            cell = cells.get(Stage(run, "eval", bundle).key)
+            if exported is None or cell is None or neural is None:
+                continue
+            results, before = cell["value"]["results"], neural["value"]["results"]
+            statistics = exported["value"]["statistics"]
+            kept, texels = statistics["surfels"]["kept"], statistics.get("texels", {})
+            texels = texels.get("kept", texels.get("after_cap_by_views"))
+            size = results.get("atlas_bytes")
+            first = size if first is None else first
+            flips = (results.get("flip"), before.get("flip"))
+            lines.append(
+                [
+                    *_names(run),
+                    bundle.name,
+                    number(kept, 0),
+                    number(None if texels is None else texels / kept, 0),
+                    number(size, 0),
+                    number(size / first, 3) if size and first else "",
+                    difference(results["psnr"] - before["psnr"]),
+                    number(statistics.get("held_out", {}).get("psnr_baked_against_neural")),
+                    "" if None in flips else difference(flips[0] - flips[1], 4),
+                    number(results.get("render_ms"), 1),
+                    number(statistics.get("error", {}).get("rms", {}).get("p99")),
+                ]
+            )
+    return _without_empty(BUNDLE_HEADER, lines)
+
+
+def _names(run: Run) -> list[str]:
+    name = run.row.name if run.seed is None else f"{run.row.name}, seed {run.seed}"
+    return [run.scene.name, name.replace("|", "\\|")]
+
+
+def _without_empty(header: Sequence[str], lines: list[list[str]]) -> str:
+    """A table without the columns that no line fills."""
+    kept = [j for j in range(len(header)) if j < TEXT_COLUMNS or any(line[j] for line in lines)]
+    return table([header[j] for j in kept], [[line[j] for j in kept] for line in lines], TEXT_COLUMNS)
 
 
 def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[str] = ()) -> str:
-    """The table of a matrix with its notes."""
+    """The tables of a matrix with their notes."""
     body, commits = results_table(matrix, cells)
+    notes = list(NOTES)
+    if len(matrix.bundles) > 1:
+        body += "\n\n" + bundles_table(matrix, cells)
+        notes += BUNDLE_NOTES
     failed = [f"Failed: {line.splitlines()[0]}" for line in failures]
-    return page(title, body, [*NOTES, *failed], commits)
+    return page(title, body, [*notes, *failed], commits)

@@ -41,7 +41,9 @@ elif name == "ns-export":
     bundle = pathlib.Path(given("--output-dir"))
     bundle.mkdir(parents=True)
     files = dict(zip(["surfels.ply", "atlas.ktx2"], [dict(bytes=1000), dict(bytes=5000)]))
-    info = dict(files=files, atlas=dict(format=given("--format"), file="atlas.ktx2"), statistics=dict(seconds=1.0))
+    info = dict(files=files, atlas=dict(format=given("--format"), file="atlas.ktx2"), statistics=dict(
+        surfels=dict(kept=100), texels=dict(nyquist=9999, after_cap_by_views=1600),
+        held_out=dict(psnr_baked_against_neural=50.0)))
     (bundle / "bundle.json").write_text(json.dumps(info))
     (bundle / "config.yml").write_text("config")
 elif name == "ns-eval":

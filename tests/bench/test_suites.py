@@ -136,6 +136,15 @@ def test_the_command_prints_the_table_and_skips_what_is_done(
     assert fakes.calls() == [] and "4 of 4 cells are finished" in capsys.readouterr().err
 
 
+def test_several_bundles_are_compared(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7", "--pictures", 0)
+    assert run(*words, "--work", tmp_path / "w") == 0
+    out = capsys.readouterr().out
+    assert "| fox | bitymi | bc7 | 100 | 16 | 5,000 | 1.000 | -0.010 | 50.00 | 0.0000 | 4.0 |" in out
+
+
 def test_a_plan_by_the_command(
     fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

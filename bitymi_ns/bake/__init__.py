@@ -1,7 +1,8 @@
 """Trained field to texture atlas: resolution, packing, evaluation, quantisation and the files of a bundle."""
 
 from bitymi_ns.bake.bundle import Bundle, BundleError, World, check_target, read_bundle, verify_bundle, write_bundle
-from bitymi_ns.bake.pipeline import Baked, BakeOptions, bake, export
+from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.pipeline import Baked, bake, export
 from bitymi_ns.bake.progress import Progress, rich_progress
 
 __all__ = [

@@ -29,6 +29,11 @@ class Packing:
     layers: int
     occupancy: float
 
+    @property
+    def texels(self) -> int:
+        """Texels of all tiles."""
+        return int(self.tiles[:, 3:].astype(np.int64).prod(axis=1).sum())
+
 
 @dataclass
 class _Shelf:

@@ -14,30 +14,18 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.bundle import World, write_bundle
+from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
-from bitymi_ns.bake.geometry import tangent_vectors
-from bitymi_ns.bake.ktx2 import Format
+from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
+from bitymi_ns.bake.plan import Field, make_plan
 from bitymi_ns.bake.progress import Progress, no_progress
-from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, EncodedAtlas, Profile, RangeRule, bc7_encoder, choose_range, encode
-from bitymi_ns.bake.resolution import max_projected_extent, nyquist_resolution, voxel_along_axes
+from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, encode
+from bitymi_ns.bake.reduce import reduce_tiles
+from bitymi_ns.bake.visibility import largest_transmittance
 from bitymi_ns.scene.camera import Camera
 
 OPACITY_FLOOR = 1.0 / 255.0  # below it a surfel is skipped at every pixel
-
-
-class Field(Protocol):
-    """The part of the residual field that the bake uses.
-
-    A field that also has `geometry.mid`, the centre of its contraction, gets tiles that follow the direction in which
-    its voxels are stretched; without it the smaller voxel edge holds for both axes.
-    """
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """[M, 3] world positions to [M, 3] residual colours."""
-
-    def voxel_size(self, x: Tensor) -> Tensor:
-        """[M, 3] world positions to [M, 2] finest voxel edges (radial, tangential), world units."""
 
 
 class BakeableScene(Protocol):
@@ -46,47 +34,6 @@ class BakeableScene(Protocol):
     surfels: Mapping[str, Tensor]
     field: Field | None
     config: Any  # near, weight_bound, prefilter
-
-
-@dataclass
-class BakeOptions:
-    """How the trained field becomes an atlas."""
-
-    format: Format = "bc7"
-    """Texel format: bc7 = 1 byte a texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
-    bc7_profile: Profile = "veryfast"
-    """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
-    r_min: int = 4
-    """Smallest tile side in texels, a power of two of at least 4."""
-    r_max: int = 64
-    """Largest tile side in texels, a power of two."""
-    extent: float = 3.0
-    """Half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses 4."""
-    cap_by_views: bool = True
-    """Give no tile more texels than pixels it covers in the training view that sees it largest."""
-    drop_unseen: bool = False
-    """Leave out surfels that no training view sees (where views are given); off: they get the smallest tile."""
-    range: RangeRule = "sigma6"
-    """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
-    range_samples: int = 1 << 18
-    """Texels in the bootstrap sample that the range is chosen from."""
-    seed: int = 0
-    """Seed of that sample."""
-    page_width: int = 4096
-    """Width of an atlas page in texels, a power of two; small atlases get a narrower page."""
-    page_rows: int = 8192
-    """Largest height of an atlas page; phones and WebGPU stop at 8192."""
-    chunk: int = 1 << 18
-    """Texels evaluated at once."""
-
-    def check(self) -> None:
-        """Refuses values that the bake would stumble over later."""
-        if not self.extent > 0:
-            raise ValueError(f"the extent must be positive, not {self.extent}")
-        if self.format not in BYTES_PER_TEXEL:
-            raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {self.format!r}")
-        if self.format == "bc7":
-            bc7_encoder(self.bc7_profile)
 
 
 @dataclass
@@ -128,6 +75,7 @@ class Baked:
         texels = texels.detach().float().cpu().contiguous()
         atlas = _encode(texels.numpy(), self.packing, self.options, progress)
         statistics = {**self.statistics, "atlas": _atlas_statistics(self.packing, atlas)}
+        statistics.pop("error", None)  # the field is no longer what the texels are meant to hold
         tiled = torch.from_numpy(self.packing.tiles[:, 3:4] > 0)
         means = torch.where(tiled, tile_means(texels, self.packing), self.mean_residual)
         return replace(self, texels=texels, mean_residual=means, atlas=atlas, statistics=statistics)
@@ -143,11 +91,12 @@ def bake(
     """Bakes a scene's residual field into an atlas (paper, section Texture Baking).
 
     Surfels that can never be drawn (opacity below 1/255), rows that are not finite and rotations of length zero are
-    left out and counted. A scene without a field has no atlas and its tiles are zeros.
+    left out and counted; so are surfels that no training view blends. A scene without a field has no atlas and its
+    tiles are zeros; nor has one whose tiles are all constant within the tolerance.
 
     Args:
         scene: a trained scene.
-        cameras: training views, for the cap on tile sizes; with none there is no cap.
+        cameras: training views, for the cap on tile sizes and for what they see; with none nothing is left out for it.
         options: see `BakeOptions`.
         progress: called after every chunk of work.
 
@@ -161,47 +110,48 @@ def bake(
     near = float(getattr(scene.config, "near", 0.2))
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
-    axes, scales = tangent_vectors(surfels["quats"]), surfels["log_scales"].exp()
-
-    pixels = None
-    if cameras and (options.cap_by_views or options.drop_unseen):
-        pixels, views = max_projected_extent(surfels["means"], axes, scales, cameras, options.extent, near)
-        seen = views > 0
-        left_out["unseen"] = int((~seen).sum()) if options.drop_unseen else 0
+    transmittance = None
+    if cameras and (options.drop_unseen or (options.tolerance > 0 and scene.field is not None)):
+        transmittance = largest_transmittance(surfels, cameras, near, progress)
         if options.drop_unseen:
-            kept, pixels, axes, scales = kept[seen], pixels[seen], axes[seen], scales[seen]
+            seen = transmittance > 0
+            left_out["unseen"] = int((~seen).sum())
+            kept, transmittance = kept[seen], transmittance[seen]
             surfels = {name: value[seen] for name, value in surfels.items()}
     if len(kept) == 0:
         raise ValueError(f"no surfel is left to bake of {len(scene.surfels['means'])}: left out {left_out}")
     statistics: dict[str, Any] = {"surfels": {"trained": len(scene.surfels["means"]), "kept": len(kept)}}
     statistics["surfels"]["left_out"] = left_out
 
-    if scene.field is None:
-        sizes = np.zeros((len(kept), 2), dtype=np.int32)
-        packing, texels, atlas = pack(sizes), None, None
-        mean_residual = torch.zeros(len(kept), 3)
-    else:
-        means = surfels["means"]
-        voxel = torch.cat([scene.field.voxel_size(part) for part in means.split(options.chunk)])
-        delta = voxel_along_axes(voxel, axes, means, _center(scene.field))
-        bounds = (options.extent, options.r_min, options.r_max)
-        uncapped = nyquist_resolution(scales, delta, *bounds)
-        capped = nyquist_resolution(scales, delta, *bounds, pixels) if options.cap_by_views else uncapped
-        packing = pack(capped.cpu().numpy(), options.page_width, options.page_rows)
-        texels, nonfinite = evaluate_tiles(
-            scene.field, means, surfels["quats"], scales, packing, options.extent, options.chunk, progress
-        )
-        mean_residual = tile_means(texels, packing)
-        atlas = _encode(texels.numpy(), packing, options, progress)
-        statistics["atlas"] = _atlas_statistics(packing, atlas)
-        statistics["texels"] = {
-            "nyquist": int(uncapped.long().prod(1).sum()),
-            "after_cap_by_views": int(capped.long().prod(1).sum()),
-            "not_finite": nonfinite,
-        }
+    packing = pack(np.zeros((len(kept), 2), dtype=np.int32))
+    extent = torch.full((len(kept),), options.extent)
+    mean_residual = torch.zeros(len(kept), 3)
+    texels = atlas = None
+    if scene.field is not None:
+        plan = make_plan(surfels, scene.field, options, cameras, transmittance, near, weight_bound)
+        if options.tolerance > 0:
+            reduced = reduce_tiles(scene.field, plan, options.tolerance, options.r_min, options.chunk, progress)
+            packing, nonfinite = pack(reduced.sizes, options.page_width, options.page_rows), reduced.nonfinite
+            texels, mean_residual = reduced.pages(packing), reduced.constant
+            extent = torch.where(plan.extent > 0, plan.extent, extent.to(plan.extent)).cpu()
+        else:
+            packing = pack(plan.limit.cpu(), options.page_width, options.page_rows)
+            geometry = (surfels["means"], surfels["quats"], surfels["log_scales"].exp())
+            texels, nonfinite = evaluate_tiles(scene.field, *geometry, packing, options.extent, options.chunk, progress)
+        tiled = torch.from_numpy(packing.tiles[:, 3] > 0)
+        statistics["surfels"]["without_tile"] = int((~tiled).sum())
+        statistics["texels"] = {**plan.texels, "kept": packing.texels, "not_finite": nonfinite}
+        if tiled.any():
+            mean_residual = torch.where(tiled[:, None], tile_means(texels, packing), mean_residual)
+            atlas = _encode(texels.numpy(), packing, options, progress)
+            statistics["atlas"] = _atlas_statistics(packing, atlas)
+        else:
+            texels = None
+        stored = None if atlas is None else atlas.decoded()
+        errors = tile_errors(scene.field, plan, packing.tiles, mean_residual, stored, options.chunk, progress)
+        statistics["error"] = {"tolerance": options.tolerance, **errors.summary()}
     statistics["seconds"] = round(time.perf_counter() - started, 3)
     surfels = {name: value.cpu() for name, value in surfels.items()}
-    extent = torch.full((len(kept),), options.extent)
     return Baked(
         surfels,
         kept.cpu(),
@@ -250,12 +200,6 @@ def export(
         loose_files=loose_files,
         overwrite=overwrite,
     )
-
-
-def _center(field: Field) -> Tensor | None:
-    """[3] centre of the field's contraction, world frame, if it tells."""
-    geometry = getattr(field, "geometry", None)
-    return None if geometry is None else torch.tensor(geometry.mid, dtype=torch.float32)
 
 
 def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:

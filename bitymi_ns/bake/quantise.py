@@ -77,6 +77,10 @@ class EncodedAtlas:
         """Bytes of the texels."""
         return sum(len(page) for page in self.payload)
 
+    def decoded(self) -> npt.NDArray[np.float32]:
+        """Residual colours as a renderer reads them: [layers, height, width, 3]."""
+        return decode(self.payload, self.format, self.width, self.height, self.range.offset, self.range.scale)
+
 
 def sample_texels(
     texels: npt.NDArray[np.float32], packing: Packing, count: int = 1 << 18, seed: int = 0

@@ -1,0 +1,55 @@
+"""Options of the bake."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bitymi_ns.bake.ktx2 import Format
+from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Profile, RangeRule, bc7_encoder
+
+
+@dataclass
+class BakeOptions:
+    """How the trained field becomes an atlas."""
+
+    format: Format = "bc7"
+    """Texel format: bc7 = 1 byte a texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
+    bc7_profile: Profile = "veryfast"
+    """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
+    r_min: int = 4
+    """Smallest tile side in texels, a power of two of at least 4."""
+    r_max: int = 64
+    """Largest tile side in texels, a power of two."""
+    extent: float = 3.0
+    """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
+    4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
+    tolerance: float = 0.5
+    """Largest error of a tile: root mean square over its visible part, weighted by what a fragment there can contribute
+    to a pixel, in 8-bit steps. Every tile takes the smallest grid that keeps it, or none. 0: the sizes of the rule."""
+    cap_by_views: bool = True
+    """Give no tile more texels than pixels it covers in the training view that sees it largest."""
+    drop_unseen: bool = True
+    """Leave out surfels of which no training view blends a fragment (where views are given)."""
+    range: RangeRule = "sigma6"
+    """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
+    range_samples: int = 1 << 18
+    """Texels in the bootstrap sample that the range is chosen from."""
+    seed: int = 0
+    """Seed of that sample."""
+    page_width: int = 4096
+    """Width of an atlas page in texels, a power of two; small atlases get a narrower page."""
+    page_rows: int = 8192
+    """Largest height of an atlas page; phones and WebGPU stop at 8192."""
+    chunk: int = 1 << 18
+    """Texels evaluated at once."""
+
+    def check(self) -> None:
+        """Refuses values that the bake would stumble over later."""
+        if not self.extent > 0:
+            raise ValueError(f"the extent must be positive, not {self.extent}")
+        if not 0 <= self.tolerance < 255:
+            raise ValueError(f"the tolerance must be from 0 to below 255 steps, not {self.tolerance}")
+        if self.format not in BYTES_PER_TEXEL:
+            raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {self.format!r}")
+        if self.format == "bc7":
+            bc7_encoder(self.bc7_profile)

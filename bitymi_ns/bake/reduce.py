@@ -1,0 +1,132 @@
+"""The error-bounded atlas: every tile takes the smallest grid that reproduces the field within a tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.evaluate import texel_index
+from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.plan import Field, Plan, Reference, along_axes, fit, interpolation, references, weighted_rms
+from bitymi_ns.bake.progress import Progress, no_progress
+
+_FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a grid may be for it to be tried
+
+
+@dataclass
+class Reduced:
+    """The grids that were chosen, and their texels.
+
+    Attributes:
+        sizes: [N, 2] int32 (r_u, r_v), 0 for a surfel without a tile.
+        constant: [N, 3] the residual of the surfels without a tile.
+        parts: (rows [n], texels [n, 3, r_v, r_u]) of tiles of one size.
+        nonfinite: number of points at which the field was not finite (taken as 0 there).
+    """
+
+    sizes: Tensor
+    constant: Tensor
+    parts: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+    nonfinite: int = 0
+
+    def pages(self, packing: Packing) -> Tensor:
+        """The texels in their places: [layers, height, width, 3] float32 on the CPU, 0 outside the tiles."""
+        pages = torch.zeros(packing.layers * packing.height * packing.width, 3)
+        tiles = torch.from_numpy(packing.tiles)
+        for rows, texels in self.parts:
+            size = (texels.shape[3], texels.shape[2])
+            at = texel_index(tiles[rows], size, packing.width, packing.height)
+            pages[at.reshape(-1)] = texels.permute(0, 2, 3, 1).reshape(-1, 3)
+        return pages.reshape(packing.layers, packing.height, packing.width, 3)
+
+
+@torch.no_grad()
+def reduce_tiles(
+    field: Field,
+    plan: Plan,
+    tolerance: float,
+    r_min: int = 4,
+    chunk: int = 1 << 18,
+    progress: Progress = no_progress,
+) -> Reduced:
+    """Chooses every tile's grid.
+
+    The error of a grid is the root mean square, over the part of the support that gets a residual and over the colour
+    channels, of (reconstruction - field) times the largest blending weight a fragment has there, in 8-bit steps. The
+    grids are tried from none (one constant colour) by number of texels; the first within the tolerance is taken, the
+    plan's limit at the latest.
+
+    Args:
+        field: the residual field.
+        plan: what the tiles have to hold.
+        tolerance: largest error, 8-bit steps.
+        r_min: smallest side of a tile, a power of two.
+        chunk: points evaluated at once.
+        progress: called with the number of tiles done.
+    """
+    n = len(plan)
+    reduced = Reduced(torch.zeros(n, 2, dtype=torch.int32), torch.zeros(n, 3))
+    done = int((plan.extent <= 0).sum())
+    for part in references(field, plan, chunk):
+        reduced.nonfinite += part.nonfinite
+        constant, flat = _constant(part, tolerance)
+        reduced.constant[part.rows.cpu()] = constant.cpu()
+        textured = torch.nonzero(~flat).squeeze(1)
+        for size, at in _grids(part, textured, tolerance, r_min):
+            rows = part.rows[at].cpu()
+            reduced.sizes[rows] = torch.tensor(size, dtype=torch.int32)
+            texels = part.values[at] if size == part.size else _fitted(part.values[at], size)
+            reduced.parts.append((rows, texels.cpu()))
+        done += len(part.rows)
+        progress("choosing the tiles", done, n)
+    return reduced
+
+
+def _constant(part: Reference, tolerance: float) -> tuple[Tensor, Tensor]:
+    """The colour nearest to the tile, [n, 3], and whether it is near enough, [n] bool."""
+    square = part.weight.square()[:, None]
+    constant = (part.values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)
+    return constant, weighted_rms(part.values - constant[:, :, None, None], part.weight) <= tolerance
+
+
+def _grids(part: Reference, rows: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
+    """The smallest grid of each of `rows` (of `part`): pairs of size and rows.
+
+    The errors of coarsening along u alone and along v alone, added in squares, predict that of both. Only grids that
+    are promising by that are tried.
+    """
+    limit_u, limit_v = part.size
+    sides_u, sides_v = ([r for r in (r_min << i for i in range(16)) if r < side] + [side] for side in part.size)
+    values, weight = part.values[rows], part.weight[rows]
+    along_u = {limit_u: torch.zeros(len(rows), device=rows.device)}
+    along_v = {limit_v: torch.zeros(len(rows), device=rows.device)}
+    for side in sides_u[:-1]:
+        lost = torch.eye(limit_u) - interpolation(limit_u, side) @ fit(limit_u, side)
+        along_u[side] = weighted_rms(values @ lost.T.to(values), weight).square()
+    flipped = values.transpose(2, 3).contiguous()
+    for side in sides_v[:-1]:
+        lost = torch.eye(limit_v) - interpolation(limit_v, side) @ fit(limit_v, side)
+        along_v[side] = weighted_rms((flipped @ lost.T.to(values)).transpose(2, 3), weight).square()
+    found = []
+    open_ = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+    for size in sorted(((u, v) for u in sides_u for v in sides_v), key=lambda s: (s[0] * s[1], abs(s[0] - s[1]))):
+        promising = open_ & (along_u[size[0]] + along_v[size[1]] <= (_FORESIGHT * tolerance) ** 2)
+        at = torch.nonzero(promising).squeeze(1)
+        if size != part.size and len(at):
+            coarse = _fitted(values[at], size)
+            rebuilt = along_axes(
+                coarse, *(interpolation(p, r).to(coarse) for p, r in zip(part.size, size, strict=True))
+            )
+            at = at[weighted_rms(rebuilt - values[at], weight[at]) <= tolerance]
+        if len(at):
+            open_[at] = False
+            found.append((size, rows[at]))
+    return found
+
+
+def _fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Tiles [n, 3, v, u] on a coarser grid (u, v)."""
+    u, v = values.shape[3], values.shape[2]
+    return along_axes(values, fit(u, size[0]).to(values), fit(v, size[1]).to(values))

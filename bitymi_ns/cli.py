@@ -161,11 +161,41 @@ class Bench:
         return self.what.run()
 
 
+@dataclass
+class Verify:
+    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is given."""
+
+    bundle: tyro.conf.Positional[Path]
+    """Folder of the bundle."""
+    run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
+    """config.yml, folder or checkpoint of the run: also checks the error against its field, and renders of both."""
+    views: int = 4
+    """Held-out views to render."""
+
+    def run(self) -> int:
+        from rich.console import Console
+        from rich.table import Table
+
+        from bitymi_ns.bake import check_files
+
+        bundle, checks = check_files(self.bundle)
+        if bundle is not None and self.run_config is not None:
+            from bitymi_ns.host.verify import check_run
+
+            checks += check_run(bundle, self.run_config, self.views)
+        table = Table("", "check", "result", title=f"Bundle {self.bundle}")
+        for check in checks:
+            table.add_row("[green]ok[/]" if check.ok else "[bold red]FAILED[/]", check.name, check.detail)
+        Console().print(table)
+        return 0 if all(check.ok for check in checks) else 1
+
+
 Command = (
     Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Report, tyro.conf.subcommand(name="report")]
     | Annotated[Stability, tyro.conf.subcommand(name="stability")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
+    | Annotated[Verify, tyro.conf.subcommand(name="verify")]
 )
 
 

@@ -4,15 +4,19 @@ from bitymi_ns.bake.bundle import Bundle, BundleError, World, check_target, read
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, bake, export
 from bitymi_ns.bake.progress import Progress, rich_progress
+from bitymi_ns.bake.verify import Check, check_field, check_files
 
 __all__ = [
     "BakeOptions",
     "Baked",
     "Bundle",
     "BundleError",
+    "Check",
     "Progress",
     "World",
     "bake",
+    "check_field",
+    "check_files",
     "check_target",
     "export",
     "read_bundle",

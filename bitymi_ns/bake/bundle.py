@@ -181,7 +181,7 @@ def read_bundle(folder: str | Path, verify: bool = True) -> Bundle:
         BundleError: a file is missing, truncated, altered or malformed, or the version is too new.
     """
     folder = Path(folder)
-    info = _read_manifest(folder)
+    info = read_manifest(folder)
     for name, entry in info["files"].items():
         if name not in (SURFELS, ATLAS):
             _checked(folder / name, entry, verify, keep=False)
@@ -293,7 +293,8 @@ def _check_tiles(tiles: Tensor, pages: tuple[int, ...] | None, source: Path) -> 
         raise BundleError(f"{source}: the tile of surfel {int(torch.nonzero(~good)[0])} lies outside the atlas")
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """bundle.json of a bundle, checked as far as it can be without the other files."""
     path = folder / MANIFEST
     if not path.is_file():
         raise BundleError(f"{folder} is not a bundle: it has no {MANIFEST}")
@@ -332,6 +333,15 @@ def _fingerprint(path: Path) -> dict[str, Any]:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
     return {"bytes": path.stat().st_size, "sha256": digest.hexdigest()}
+
+
+def file_problem(path: Path, entry: dict[str, Any]) -> str | None:
+    """What is wrong with a file's size or hash; None when both are as bundle.json states."""
+    try:
+        _checked(path, entry, verify=True, keep=False)
+    except BundleError as error:
+        return str(error)
+    return None
 
 
 def _checked(path: Path, entry: dict[str, Any], verify: bool, keep: bool = True) -> bytes:

@@ -10,7 +10,7 @@ import io
 import os
 import pickle
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from bitymi_ns.bake import BakeOptions, BundleError, bake, export, read_bundle, 
 from bitymi_ns.bake.bundle import World
 from bitymi_ns.bake.folder import check_target
 from bitymi_ns.bake.manifest import MANIFEST, dump
+from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.host.bundle_config import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
@@ -53,6 +54,8 @@ class ExportAtlas(BakeOptions):
     """Folder of the bundle."""
     overwrite: bool = False
     """Replace a bundle that is there already."""
+    exact: bool = False
+    """Keep everything: the paper's rule for the size of every tile, no cap by views, no surfel dropped as unseen."""
     compare: bool = True
     """Render the held-out views from the bundle and from the trained scene and state the difference."""
 
@@ -81,6 +84,8 @@ class ExportAtlas(BakeOptions):
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
+        if self.exact:
+            options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
         try:
             with rich_progress() as progress:
                 baked = bake(model.scene, views, options, progress)
@@ -115,12 +120,17 @@ def default_export() -> ExportAtlas:
     return ExportAtlas(load_config=tyro.MISSING, output_dir=tyro.MISSING, **asdict(options))
 
 
-def load_trained(load_config: Path) -> tuple[Any, Any]:
-    """Configuration and pipeline of a trained scene."""
+def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
+    """Configuration and pipeline of a trained scene, at a step of which there is a checkpoint or at the last one."""
+
+    def choose(config: Any) -> Any:
+        config.load_step = step
+        return config
+
     if not load_config.is_file():
         fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
     try:
-        config, pipeline, _, _ = eval_setup(load_config, test_mode="test")
+        config, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=choose)
     except (yaml.YAMLError, AttributeError, KeyError) as error:
         fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
     except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
@@ -149,10 +159,24 @@ def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera]) -> 
 
 @torch.no_grad()
 def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> dict[str, float]:
-    """Mean PSNR in dB over the held-out views, of bundle, trained scene and photographs against each other."""
+    """PSNR in dB over the held-out views, of bundle, trained scene and photographs against each other: means, and the
+    view in which the bundle is farthest from the trained scene."""
+    rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
+    names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
+    means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
+    worst = round(min(row[0] for row in rows), 4)
+    return {"views": len(rows), **dict(zip(names, means, strict=True)), "psnr_baked_against_neural_worst": worst}
+
+
+@torch.no_grad()
+def held_out_psnr(
+    model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
+) -> list[list[float]]:
+    """Of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph, and
+    bundle against photograph."""
     rows = []
     background = model.background
-    for index in range(len(datamanager.eval_dataset)):
+    for index in range(min(views, len(datamanager.eval_dataset))):
         cameras, batch = datamanager.eval_view(index)
         camera = to_camera(cameras, model.device)
         neural = model.render(camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
@@ -161,9 +185,7 @@ def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera
         mask = batch.get("mask")
         mask = None if mask is None else mask.cpu()
         rows.append([psnr(baked, neural, mask), psnr(neural, photo, mask), psnr(baked, photo, mask)])
-    names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
-    means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
-    return {"views": len(rows), **dict(zip(names, means, strict=True))}
+    return rows
 
 
 def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> bytes:
@@ -194,21 +216,21 @@ def replace_file(path: Path, data: bytes) -> None:
 def print_summary(folder: Path, info: dict[str, Any]) -> None:
     """What was written, what was left out, and what it cost."""
     statistics = info["statistics"]
+    surfels, texels = statistics["surfels"], statistics.get("texels")
     table = Table("", "", title=f"Bundle {folder}", show_header=False)
-    table.add_row("Surfels", f"{info['surfels']['count']:,} of {statistics['surfels']['trained']:,}")
-    left_out = {k: v for k, v in statistics["surfels"]["left_out"].items() if v}
+    table.add_row("Surfels", f"{surfels['trained']:,} -> {info['surfels']['count']:,}")
+    left_out = {k: v for k, v in surfels["left_out"].items() if v}
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
+    if texels is not None:
+        print_savings(table, info)
     atlas = statistics.get("atlas")
     if atlas is None:
-        table.add_row("Atlas", "none (the scene has no texture)")
+        table.add_row("Atlas", "none (the scene has no texture)" if texels is None else "none (no tile is needed)")
     else:
         layers, height, width = atlas["pages"]
         size = info["files"][info["atlas"]["file"]]["bytes"]
         table.add_row("Atlas", f"{size / 1e6:.2f} MB {info['atlas']['format']}, {layers} x {width} x {height} texels")
         table.add_row("Occupancy", f"{100 * atlas['occupancy']:.1f} %")
-        texels = statistics["texels"]
-        saved = texels["nyquist"] - texels["after_cap_by_views"]
-        table.add_row("Texels not needed", f"{saved:,} of {texels['nyquist']:,} (finer than any training view sees)")
         if atlas.get("psnr") is not None:
             table.add_row("Quantisation", f"{atlas['psnr']:.2f} dB over the texels")
     table.add_row("Files", f"{sum(f['bytes'] for f in info['files'].values()) / 1e6:.2f} MB in total")
@@ -220,6 +242,25 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
         table.add_row("Bundle against photographs", f"{held_out['psnr_baked_against_photos']:.2f} dB")
     CONSOLE.print(table)
     CONSOLE.print(f"Evaluate it with: ns-eval --load-config {folder / 'config.yml'}", soft_wrap=True)
+
+
+def print_savings(table: Table, info: dict[str, Any]) -> None:
+    """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
+    statistics = info["statistics"]
+    texels, error = statistics["texels"], statistics["error"]
+    kept, count = texels["kept"], info["surfels"]["count"]
+    table.add_row("Tiles", f"{statistics['surfels']['trained']:,} -> {count - statistics['surfels']['without_tile']:,}")
+    table.add_row("Texels by the paper's rule", f"{texels['nyquist']:,}")
+    table.add_row("... no finer than a view sees", f"{texels['after_cap_by_views']:,}")
+    table.add_row("... only where they are seen", f"{texels['within_visible_part']:,}")
+    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels['nyquist']):.1f} %)")
+    rule = texels["nyquist"] * BYTES_PER_TEXEL[statistics["options"]["format"]]
+    stored = info["files"][info["atlas"]["file"]]["bytes"] if info["atlas"] else 0
+    table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
+    tolerance = f"tolerance {error['tolerance']:g}" if error["tolerance"] else "no tolerance"
+    rms = error["rms"]
+    table.add_row("Error of a tile", f"median {rms['p50']:.2f}, 99 % {rms['p99']:.2f}, at most {rms['p100']:.2f} steps")
+    table.add_row("", f"({tolerance}; weighted root mean square against the field, as stored)")
 
 
 def main() -> None:

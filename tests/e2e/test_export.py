@@ -17,10 +17,16 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.utils.eval_utils import eval_setup
 
+from bitymi_ns.bake import check_files
+from bitymi_ns.cli import main
 from bitymi_ns.host import export as host_export
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.export import ExportAtlas, default_export
+from bitymi_ns.host.verify import check_run
+
+
+TOLERANCE = 0.02
 
 
 def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> None:
@@ -29,9 +35,9 @@ def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> Non
 
 @pytest.fixture(scope="session")
 def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The trained room as a bundle. Not to be changed."""
+    """The trained room as a bundle. Not to be changed. After so few steps little of the residual is worth a tile."""
     folder = tmp_path_factory.mktemp("bundles") / "room-bc7"
-    run_export(trained, folder)
+    run_export(trained, folder, tolerance=TOLERANCE)
     return folder
 
 
@@ -91,9 +97,39 @@ def test_a_bundle_needs_neither_checkpoint_nor_its_old_place(
 
 @pytest.mark.parametrize("format", ["uint8", "fp16"])
 def test_other_formats(trained: BitymiTrainerConfig, tmp_path: Path, format: str) -> None:
-    run_export(trained, tmp_path / format, format=format)
+    run_export(trained, tmp_path / format, format=format, tolerance=TOLERANCE)
     info = json.loads((tmp_path / format / "bundle.json").read_text())
     assert info["atlas"]["format"] == format
+
+
+def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(
+    trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_export(trained, tmp_path / "exact", exact=True)
+    printed = capsys.readouterr().out
+    exact, default = (json.loads((f / "bundle.json").read_text())["statistics"] for f in (tmp_path / "exact", bundle))
+    assert exact["texels"]["kept"] == exact["texels"]["nyquist"] == default["texels"]["nyquist"]
+    assert 0 < default["texels"]["kept"] < exact["texels"]["kept"] / 4
+    assert exact["surfels"]["left_out"].get("unseen", 0) == 0 and exact["options"]["tolerance"] == 0
+    assert "Atlas bytes" in printed and "no tolerance" in printed
+    assert default["error"]["tolerance"] == TOLERANCE and default["error"]["rms"]["p90"] < 2 * TOLERANCE
+
+
+def test_verify_compares_a_bundle_with_its_run(
+    trained: BitymiTrainerConfig, copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained.get_base_dir()
+    assert main(["verify", str(copied), "--run", str(run / "config.yml")]) == 0
+    assert "error against the field" in capsys.readouterr().out
+    bundle, _ = check_files(copied)
+    assert bundle is not None
+    final = check_run(bundle, run, views=1)
+    assert [check.ok for check in final] == [True, True]
+    first = min((run / "nerfstudio_models").glob("*.ckpt"))
+    earlier = check_run(bundle, first, views=1)
+    assert not any(check.ok for check in earlier)  # what the bundle holds was not there yet
+    with pytest.raises(InputError, match="no checkpoint"):
+        check_run(bundle, run / "step-7.ckpt", views=1)
 
 
 def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainerConfig], tmp_path: Path) -> None:
@@ -233,4 +269,4 @@ def test_a_configuration_without_its_bundle(copied: Path, tmp_path: Path) -> Non
 
 def test_the_presets_bake_options_are_those_of_the_command() -> None:
     options = default_export()
-    assert (options.format, options.r_max, options.cap_by_views) == ("bc7", 64, True)
+    assert (options.format, options.r_max, options.cap_by_views, options.tolerance) == ("bc7", 64, True, 0.5)

@@ -1,0 +1,150 @@
+"""Tiles are as small as the tolerance allows, and no smaller."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake.geometry import tangent_vectors
+from bitymi_ns.bake.plan import fit, interpolation, kernel_parameters, make_plan, references, visible_extent
+from bitymi_ns.ops.reference.texel import texel, texel_centers
+
+OPTIONS = BakeOptions(format="fp16")
+BOUND = 0.02
+
+
+class PlaneField:
+    """A residual that depends on one coordinate alone, linearly or as a wave."""
+
+    def __init__(self, direction: torch.Tensor, frequency: float, amplitude: float = 0.2, voxel: float = 0.02) -> None:
+        self.direction, self.frequency, self.amplitude, self.voxel = direction, frequency, amplitude, voxel
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        return (self.amplitude * torch.sin(self.frequency * (x @ self.direction)))[:, None].expand(-1, 3)
+
+    def voxel_size(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.full((len(x), 2), self.voxel)
+
+
+@pytest.fixture
+def discs(scene):
+    """make(field) -> eight soft discs of one size at the origin, turned at random, with the axes of the first."""
+
+    def make(field=None):
+        made = scene(8, field=field)
+        made.surfels["means"].zero_()
+        made.surfels["log_scales"].fill_(-2.0)
+        made.surfels["quats"] = made.surfels["quats"][:1].expand(8, 4).clone()
+        made.surfels["opacity_logits"].fill_(2.0)
+        made.surfels["beta_raw"].fill_(2.0)
+        made.config.weight_bound = BOUND
+        return made, tangent_vectors(made.surfels["quats"])[0]
+
+    return make
+
+
+def test_interpolation_is_that_of_the_renderers_and_the_fit_inverts_it():
+    tile = torch.rand(1, 8, 1, dtype=torch.float64)
+    uv = torch.stack([texel_centers(32), torch.zeros(32, dtype=torch.float64)], dim=1)
+    expected = texel(tile, uv)[:, 0]
+    torch.testing.assert_close(interpolation(32, 8).double() @ tile[0, :, 0], expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(fit(32, 8).double() @ expected, tile[0, :, 0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(fit(8, 8), torch.eye(8))
+
+
+def test_the_visible_extent_is_where_the_kernel_falls_to_the_bound():
+    opacity, beta = torch.tensor([0.9, 0.3, 0.02, 0.01, 0.5]), torch.tensor([3.5, 1.0, 2.0, 2.0, 1e-3])
+    extent = visible_extent(opacity, beta, BOUND)
+    kernel = opacity * (1 - extent.square() / 9).clamp(min=1e-30) ** beta
+    torch.testing.assert_close(kernel[:2], torch.full((2,), BOUND), atol=1e-5, rtol=0)
+    assert extent[2:4].tolist() == [0, 0] and extent[4] == pytest.approx(3.0)
+    assert visible_extent(opacity, beta, 0.0).tolist() == [3.0] * 5
+
+
+def test_a_constant_residual_needs_no_tile(discs):
+    made, _ = discs(PlaneField(torch.tensor([1.0, 0.0, 0.0]), 0.0))
+    made.field = type("Flat", (PlaneField,), {"__call__": lambda self, x: torch.full((len(x), 3), 0.25)})(
+        torch.zeros(3), 0.0
+    )
+    baked = bake(made, options=OPTIONS)
+    assert baked.atlas is None and not baked.packing.tiles.any()
+    torch.testing.assert_close(baked.mean_residual, torch.full((8, 3), 0.25))
+    assert baked.statistics["error"]["rms"]["p100"] == 0 and baked.statistics["surfels"]["without_tile"] == 8
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_detail_along_one_axis_refines_that_axis_alone(discs, axis):
+    made, axes = discs()
+    made.field = PlaneField(axes[:, axis], 30.0)
+    sizes = bake(made, options=OPTIONS).packing.tiles[:, 3:]
+    assert (sizes[:, 1 - axis] == 4).all() and (sizes[:, axis] >= 16).all()
+
+
+def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(discs):
+    made, axes = discs()
+    made.field = PlaneField(axes[:, 0] + 0.3 * axes[:, 1], 25.0)
+    sizes = {}
+    for tolerance in (0.1, 0.5, 2.0, 20.0):
+        baked = bake(made, options=replace(OPTIONS, tolerance=tolerance))
+        assert baked.statistics["error"]["rms"]["p100"] <= tolerance + 0.02  # half floats
+        sizes[tolerance] = baked.packing.texels
+    assert sizes[0.1] > sizes[0.5] > sizes[2.0] > sizes[20.0] == 0
+
+
+def test_the_error_is_the_one_that_independent_points_show(discs):
+    """Random points of the disc, the reference's bilinear fetch, and the kernel written out again. The fit is to the
+    probes, so the error between them is a little larger."""
+    made, axes = discs()
+    made.field = PlaneField(axes[:, 0], 25.0)
+    baked = bake(made, options=replace(OPTIONS, tolerance=1.0))
+    x, y, layer, r_u, r_v = baked.packing.tiles[0].tolist()
+    tile = baked.texels[layer, y : y + r_v, x : x + r_u]
+    extent = float(baked.extent[0])
+    uv = (torch.rand(200_000, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1) * extent
+    uv = uv[uv.norm(dim=1) < extent]
+    opacity, beta = (value[0] for value in kernel_parameters(made.surfels))
+    weight = opacity * (1 - uv.square().sum(1) / 9) ** beta
+    exact = made.field((uv * made.surfels["log_scales"][0].exp()) @ axes.T)
+    error = 255 * weight[:, None] * (texel(tile, uv * 3 / extent) - exact)  # the reference's tiles reach to 3
+    stated = baked.statistics["error"]["rms"]["p50"]
+    assert 0.3 < stated <= float(error.square().mean().sqrt()) < 1.2 * stated
+
+
+def test_no_tolerance_gives_the_sizes_of_the_rule(discs):
+    made, axes = discs()
+    made.field = PlaneField(axes[:, 0], 1.0)
+    exact = bake(made, options=replace(OPTIONS, tolerance=0.0))
+    assert exact.statistics["texels"]["kept"] == exact.statistics["texels"]["nyquist"]
+    assert exact.extent.tolist() == [3.0] * 8
+
+
+def test_texels_out_of_sight_do_not_widen_the_range(discs):
+    made, _ = discs()
+    radius = float(visible_extent(*kernel_parameters(made.surfels), BOUND)[0]) * 0.1353353
+
+    def wild_outside(self, x):
+        inside = x.norm(dim=1, keepdim=True) < 1.001 * radius
+        return torch.where(inside, 0.2 * torch.sin(60 * x), 1000.0)
+
+    made.field = type("Wild", (PlaneField,), {"__call__": wild_outside})(torch.zeros(3), 0.0)
+    assert bake(made, options=OPTIONS).texels.abs().max() < 0.5
+
+
+def test_views_that_see_less_allow_less(discs, camera):
+    made, axes = discs()
+    made.field = PlaneField(axes[:, 0], 25.0)
+    near, far = (bake(made, [camera(d)], replace(OPTIONS, drop_unseen=False)) for d in (1.0, 60.0))
+    assert far.packing.texels < near.packing.texels
+
+
+def test_what_is_hidden_counts_less(discs):
+    made, axes = discs()
+    made.field = PlaneField(axes[:, 0], 25.0)
+    clear = make_plan(made.surfels, made.field, OPTIONS, weight_bound=BOUND)
+    hidden = make_plan(made.surfels, made.field, OPTIONS, transmittance=torch.full((8,), 0.1), weight_bound=BOUND)
+    assert (hidden.extent < clear.extent).all()
+    out_of_sight = make_plan(made.surfels, made.field, OPTIONS, transmittance=torch.zeros(8), weight_bound=BOUND)
+    assert not out_of_sight.extent.any() and not list(references(made.field, out_of_sight))

@@ -1,0 +1,136 @@
+"""A bundle that was altered is found out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, export, ply
+from bitymi_ns.cli import main
+
+
+@pytest.fixture
+def made(scene, camera, tmp_path):
+    """(folder, scene, views) of a bundle with tiles."""
+    trained, views = scene(60), [camera(3.0)]
+    options = BakeOptions(format="uint8", tolerance=0.2)
+    export(bake(trained, views, options), tmp_path / "b", statistics={"options": vars(options)})
+    return tmp_path / "b", trained, views
+
+
+def restate(folder: Path, change=None) -> None:
+    """Gives the files the hashes that they have now, after change(bundle.json)."""
+    info = json.loads((folder / "bundle.json").read_text())
+    if change is not None:
+        change(info)
+    for name, entry in info["files"].items():
+        data = (folder / name).read_bytes()
+        entry.update(bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
+    (folder / "bundle.json").write_text(json.dumps(info))
+
+
+def change_columns(folder: Path, change) -> None:
+    """Rewrites surfels.ply after change(columns), and its hash."""
+    columns = ply.parse_ply((folder / "surfels.ply").read_bytes())
+    change(columns)
+    ply.write_ply(folder / "surfels.ply", columns)
+    restate(folder)
+
+
+def failures(folder: Path) -> list[str]:
+    return [check.name for check in check_files(folder)[1] if not check.ok]
+
+
+def test_a_bundle_passes_as_it_was_written(made):
+    folder, trained, views = made
+    bundle, checks = check_files(folder)
+    assert all(check.ok for check in checks)
+    assert [check.name for check in checks] == [
+        "bundle.json", "atlas.ktx2", "surfels.ply", "contents", "tiles", "statistics"
+    ]  # fmt: skip
+    assert check_field(bundle, trained.field, views).ok
+    assert main(["verify", str(folder)]) == 0
+
+
+def test_every_damaged_file_is_named(made, capsys):
+    folder, *_ = made
+    for name in ("atlas.ktx2", "surfels.ply"):
+        data = bytearray((folder / name).read_bytes())
+        data[-5] ^= 1
+        (folder / name).write_bytes(data)
+    assert failures(folder) == ["atlas.ktx2", "surfels.ply"]
+    assert main(["verify", str(folder)]) == 1
+    assert "FAILED" in capsys.readouterr().out
+    (folder / "bundle.json").unlink()
+    assert failures(folder) == ["bundle.json"]
+
+
+def test_numbers_that_are_not_finite_are_found_behind_a_good_hash(made):
+    def change(columns):
+        columns["opacity"][3] = np.nan
+
+    change_columns(made[0], change)
+    assert failures(made[0]) == ["contents"]
+
+
+def test_tiles_that_overlap_or_break_blocks_are_found(made):
+    folder, *_ = made
+
+    def overlap(columns):
+        i, j = np.flatnonzero(columns["tile_ru"])[:2]
+        for name in ("tile_x", "tile_y"):
+            columns[name][j] = columns[name][i]
+
+    change_columns(folder, overlap)
+    assert failures(folder) == ["tiles"]
+
+    def split(columns):
+        columns["tile_ru"][np.flatnonzero(columns["tile_ru"])[0]] = 3
+
+    change_columns(folder, split)
+    assert "tiles" in failures(folder)
+
+
+def test_statistics_that_do_not_fit_the_files_are_found(made):
+    restate(made[0], lambda info: info["statistics"]["surfels"].update(kept=7))
+    assert failures(made[0]) == ["statistics"]
+
+
+def test_texels_that_do_not_hold_the_field_are_found_behind_a_good_hash(made):
+    folder, trained, views = made
+    data = bytearray((folder / "atlas.ktx2").read_bytes())
+    data[-4096:] = bytes(255 - value for value in data[-4096:])
+    (folder / "atlas.ktx2").write_bytes(data)
+    restate(folder)
+    bundle, checks = check_files(folder)
+    assert all(check.ok for check in checks)
+    assert not check_field(bundle, trained.field, views).ok
+
+
+def test_another_field_is_found(made):
+    folder, _, views = made
+    bundle, _ = check_files(folder)
+
+    class Other:
+        def __call__(self, x):
+            return torch.sin(9 * x)
+
+        def voxel_size(self, x):
+            return torch.full((len(x), 2), 0.05)
+
+    assert not check_field(bundle, Other(), views).ok
+
+
+def test_changed_texels_make_no_statement_about_the_field(scene, tmp_path):
+    trained = scene(30)
+    baked = bake(trained)
+    export(baked.with_texels(baked.texels + 0.1), tmp_path / "b")
+    bundle, checks = check_files(tmp_path / "b")
+    assert all(check.ok for check in checks)
+    check = check_field(bundle, trained.field, [])
+    assert check.ok and "not stated" in check.detail

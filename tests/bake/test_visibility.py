@@ -1,0 +1,24 @@
+import pytest
+import torch
+
+from bitymi_ns.bake.visibility import largest_transmittance
+
+
+def test_what_stands_in_front_is_counted(surfels, camera):
+    """Three discs in a row on the axis of the camera, and one beside the image."""
+    params = surfels(4)
+    params["means"] = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [90.0, 0.0, 0.0]])
+    params["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(4, 4).clone()
+    params["log_scales"] = torch.tensor([4.0, 4.0, -2.0, -2.0])[:, None].expand(4, 2).clone()  # the first two fill all
+    params["opacity_logits"] = torch.tensor([0.0, 1.0, 3.0, 3.0])
+    params["beta_raw"] = torch.full((4,), -9.0)  # hard discs: the opacity everywhere
+    first, second = torch.sigmoid(torch.tensor([0.0, 1.0])).tolist()
+    found = largest_transmittance(params, [camera(6.0)], 0.2)
+    expected = [1.0, 1 - first, (1 - first) * (1 - second), 0.0]
+    assert found.tolist() == pytest.approx(expected, abs=2e-3)
+    behind = camera(6.0)
+    behind.viewmat[:] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    behind.viewmat[2, 3] = 6.0
+    both = largest_transmittance(params, [camera(6.0), behind], 0.2)
+    assert both.tolist() == pytest.approx([1 - second, 1.0, 1.0, 0.0], abs=2e-3) or both[2] == pytest.approx(1.0)
+    assert largest_transmittance(params, [], 0.2).tolist() == [0.0] * 4

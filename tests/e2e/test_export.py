@@ -25,7 +25,6 @@ from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.export import ExportAtlas, default_export
 from bitymi_ns.host.verify import check_run
 
-
 TOLERANCE = 0.02
 
 

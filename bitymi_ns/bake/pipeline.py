@@ -109,10 +109,11 @@ def bake(
     kept, left_out = _drawable(scene.surfels)
     near = float(getattr(scene.config, "near", 0.2))
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
+    prefilter = str(getattr(scene.config, "prefilter", "low_pass"))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
     transmittance = None
     if cameras and (options.drop_unseen or (options.tolerance > 0 and scene.field is not None)):
-        transmittance = largest_transmittance(surfels, cameras, near, progress)
+        transmittance = largest_transmittance(surfels, cameras, near, prefilter, progress)
         if options.drop_unseen:
             seen = transmittance > 0
             left_out["unseen"] = int((~seen).sum())
@@ -164,7 +165,7 @@ def bake(
         weight_bound,
         options,
         statistics,
-        str(getattr(scene.config, "prefilter", "low_pass")),
+        prefilter,
     )
 
 

@@ -68,10 +68,11 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     if stated is None:
         return Check("error against the field", True, "not stated: the texels were changed after the bake")
     options = bake_options(bundle)
-    near, weight_bound = (float(bundle.info["render"][name]) for name in ("near", "weight_bound"))
+    render = bundle.info["render"]
+    near, weight_bound = float(render["near"]), float(render["weight_bound"])
     transmittance = None
     if cameras and options.tolerance > 0:
-        transmittance = largest_transmittance(bundle.surfels, cameras, near)
+        transmittance = largest_transmittance(bundle.surfels, cameras, near, render.get("prefilter", "low_pass"))
     plan = make_plan(bundle.surfels, field, options, cameras, transmittance, near, weight_bound)
     tiled = bundle.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.extent, plan.extent)

@@ -14,7 +14,11 @@ from bitymi_ns.scene.camera import Camera
 
 @torch.no_grad()
 def largest_transmittance(
-    surfels: Mapping[str, Tensor], cameras: Sequence[Camera], near: float, progress: Progress = no_progress
+    surfels: Mapping[str, Tensor],
+    cameras: Sequence[Camera],
+    near: float,
+    prefilter: str = "low_pass",
+    progress: Progress = no_progress,
 ) -> Tensor:
     """The largest transmittance in front of a blended fragment of every surfel, over all views.
 
@@ -24,6 +28,7 @@ def largest_transmittance(
         surfels: the per-surfel parameters of docs/architecture.md, N rows, all of them finite and drawable.
         cameras: the views.
         near: nearest drawn depth.
+        prefilter: as the scene is drawn, low_pass or pixel.
         progress: called after every view.
 
     Returns:
@@ -33,8 +38,8 @@ def largest_transmittance(
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
     largest = means.new_zeros(len(means))
     for done, camera in enumerate(cameras, start=1):
-        fragments = trace(project(means, *geometry, camera.to(means.device), near))
-        in_front = fragments.weight / fragments.sigma.abs()  # sigma is negative in the low-pass branch
+        fragments = trace(project(means, *geometry, camera.to(means.device), near, prefilter == "pixel"))
+        in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
         largest.scatter_reduce_(0, fragments.surfel.long(), in_front, "amax")
         progress("looking through the training views", done, len(cameras))
     return largest

@@ -6,7 +6,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -170,9 +170,7 @@ class Knobs:
         self.scene = model.scene
         self.background = model.background.cpu()
         self.preset: BakeOptions = build(BakeOptions, load_preset("bitymi").bake, "bitymi.yaml", "bake.")
-        names = {f.name for f in fields(BakeOptions)}
-        whole = {"drop_unseen": False, "tolerance": 0.0}  # one knob at a time: nothing else is left out
-        self.options = replace(self.preset, **{k: v for k, v in whole.items() if k in names})
+        self.options = replace(self.preset, drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
         cameras = pipeline.datamanager.undistorted_train_cameras()
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
@@ -242,8 +240,8 @@ class Knobs:
             yield from self._of_one_bake(wanted, textured)
         if "r_max" in wanted and textured:
             yield self._of_the_bake("r_max", TILE_SIDES, self.options.r_max)
-        if "tolerance" in wanted and textured and "tolerance" in {f.name for f in fields(BakeOptions)}:
-            yield self._of_the_bake("tolerance", TOLERANCES, getattr(self.preset, "tolerance", None))
+        if "tolerance" in wanted and textured:
+            yield self._of_the_bake("tolerance", TOLERANCES, self.preset.tolerance)
 
     def _of_one_bake(self, wanted: Sequence[str], textured: bool) -> Iterator[list[Setting]]:
         baked = self._bake()
@@ -274,10 +272,10 @@ class Knobs:
                 settings.append(Setting("format", name, "baked", draw, other.atlas.nbytes, False, default))
             yield settings
 
-    def _of_the_bake(self, knob: str, values: Sequence[float], default: float | None) -> list[Setting]:
+    def _of_the_bake(self, knob: str, values: Sequence[float], default: float) -> list[Setting]:
         """Against the field itself; texels as 32-bit floats, so that the format's error is not in it."""
         settings = [Setting(knob, "field", "neural", self.neural, None, True)]
-        for value in sorted({*values, *([] if default is None else [default])}):
+        for value in sorted({*values, default}):
             baked = self._bake(**{knob: value})
             draw = self._draw(self.exact_texels(baked))
             size = None if baked.atlas is None else baked.atlas.nbytes

@@ -84,6 +84,12 @@ def test_plans_name_methods_that_there_are(name: str) -> None:
     assert bundles == ([] if name != "paper" else None)
 
 
+def test_the_atlas_plan_compares_rules_of_one_run() -> None:
+    rows, bundles = read_plan("atlas")
+    assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "view-cap"]
+    assert all("--format bc7" in " ".join(b.options) for b in bundles)
+
+
 def test_a_plan_of_ones_own(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     path.write_text('rows: {a: {method: bitymi, options: [--x, 0.5]}}\nbundles: {small: [--r-max, "16"]}\n')

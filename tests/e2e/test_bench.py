@@ -34,8 +34,7 @@ def points(config: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dict]
 
 
 def test_every_knob_is_measured_against_its_exact_setting(points: list[dict]) -> None:
-    known = {"weight_bound", "transmittance", "format", "r_max", "resolution"}
-    assert known <= {p["knob"] for p in points} <= set(host_knobs.KNOBS)
+    assert {p["knob"] for p in points} == set(host_knobs.KNOBS)
     for p in points:
         assert p["scene"] == "room" and p["method"] == "bitymi" and p["views"] == 1 and p["made"]["machine"]
         assert p["ms"] > 0 and 0 <= p["mean_steps"] <= p["max_steps"] < 256 and 5 < p["psnr"] < 60
@@ -56,7 +55,10 @@ def test_more_of_a_knob_is_more_error_and_fewer_bytes(points: list[dict]) -> Non
     assert of_format["fp16"]["mean_steps"] < of_format["bc7"]["mean_steps"] < 1
     sides = [p for p in points if p["knob"] == "r_max" and not p["exact"]]
     assert sides[0]["mean_steps"] >= sides[-1]["mean_steps"] and sides[0]["bytes"] <= sides[-1]["bytes"]
-    assert {p["value"] for p in points if p["default"]} >= {0.02, 1e-4, 64, "bc7", 1.0}
+    tolerances = [p for p in points if p["knob"] == "tolerance" and not p["exact"]]
+    assert [p["value"] for p in tolerances] == [0.0, 0.25, 0.5, 1.0, 2.0, 4.0]
+    assert tolerances[0]["mean_steps"] <= tolerances[-1]["mean_steps"]
+    assert {p["value"] for p in points if p["default"]} >= {0.02, 1e-4, 64, "bc7", 1.0, 0.5}
 
 
 def test_some_knobs_by_the_command(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,9 +18,8 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.point_cloud import what_is_wrong_with
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
@@ -75,8 +74,8 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images
         _check_cloud(folder / points, f"remove ply_file_path from {path}")
     if points is None and dataparser.load_3D_points and (folder / "colmap/sparse/0").is_dir() and not _interactive():
         # nerfstudio would ask whether to convert the COLMAP points and wait for an answer for ever
-        CONSOLE.print(
-            f"[bold yellow]{path} has no ply_file_path: its COLMAP points are not used and training starts from "
+        warn(
+            f"{path} has no ply_file_path: its COLMAP points are not used and training starts from "
             "random points. Run once in a terminal to convert them."
         )
         dataparser.load_3D_points = False

@@ -13,14 +13,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host import checkpoints
 from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
 from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
 from bitymi_ns.host.preset import Preset, load_preset
@@ -65,7 +64,7 @@ class BitymiTrainerConfig(TrainerConfig):
         super().set_timestamp()
         if self.machine.device_type != "cpu" and not has_cuda_kernels():
             why = "there is no GPU" if not torch.cuda.is_available() else "this installation has no kernels for the GPU"
-            CONSOLE.print(f"[bold yellow]Training on the CPU instead of {self.machine.device_type}: {why}.")
+            warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
         self._make_paths_absolute()
         if self.load_dir is None and self.load_checkpoint is None:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import os
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
 
 FILE = "training_curve.jsonl"
 
@@ -59,7 +58,7 @@ class TrainingCurve:
             with open(self.path, "a", encoding="utf8") as file:
                 file.write(json.dumps(point) + "\n")
         except OSError as error:
-            warnings.warn(f"a point of the training curve {self.path} could not be written: {error}", stacklevel=2)
+            warn(f"A point of the training curve {self.path} could not be written: {error}.")
 
 
 def _points_until(path: Path, steps: int) -> list[str]:

@@ -12,7 +12,6 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host.capture import (
     check_cameras,
@@ -22,7 +21,7 @@ from bitymi_ns.host.capture import (
     reporting_input_errors,
 )
 from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.train.views import training_order
 
 FEW_VIEWS = 10
@@ -108,8 +107,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
                 "photographs from more sides."
             )
         if count < FEW_VIEWS and test_mode == "val":
-            CONSOLE.print(
-                f"[bold yellow]Only {count} training views: all of them are used for multi-view scoring, and views "
+            warn(
+                f"Only {count} training views: all of them are used for multi-view scoring, and views "
                 "from elsewhere will look poor. Twenty or more photographs are advisable."
             )
 

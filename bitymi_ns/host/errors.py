@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NoReturn
 
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
 
 class InputError(SystemExit):
     """Something about the input is wrong. Python prints the message to stderr and exits with status 1.
@@ -22,3 +25,8 @@ class InputError(SystemExit):
 def fail(message: str, cause: BaseException | None = None) -> NoReturn:
     """Raise InputError(message), remembering `cause` for debuggers."""
     raise InputError(message) from cause
+
+
+def warn(message: str) -> None:
+    """Tell the user about something that goes on without what it should have had."""
+    CONSOLE.print(f"[bold yellow]{escape(message)}", soft_wrap=True)

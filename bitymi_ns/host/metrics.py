@@ -6,7 +6,6 @@ import os
 import socket
 import time
 import urllib.error
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bitymi_ns.host.errors import warn
 from bitymi_ns.train.losses import psnr
 
 LPIPS_TIMEOUT = 30.0
@@ -58,7 +58,7 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
         from flip_evaluator import nbflip
     except ImportError:
         _flip_missing.append(True)
-        warnings.warn("flip-evaluator is not installed: FLIP is left out (pip install flip-evaluator)", stacklevel=2)
+        warn("FLIP is left out: its package is not installed (pip install flip-evaluator).")
         return None
     # LDR, sRGB input, no colour map, with mean error, default viewing conditions
     pair = (reference.cpu().contiguous().numpy(), image.cpu().contiguous().numpy())
@@ -85,13 +85,13 @@ def _build_lpips() -> Any:
     timeout = socket.getdefaulttimeout()
     try:
         if not weights.is_file() and os.environ.get("BITYMI_NO_DOWNLOAD"):
-            raise OSError(f"{weights} is not there and BITYMI_NO_DOWNLOAD is set")
+            raise OSError("BITYMI_NO_DOWNLOAD is set")
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         socket.setdefaulttimeout(LPIPS_TIMEOUT)
         return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).eval()
     except (OSError, urllib.error.URLError, ImportError, RuntimeError, ValueError) as error:
-        warnings.warn(f"LPIPS is left out: its weights cannot be had ({error}); put them at {weights}", stacklevel=2)
+        warn(f"LPIPS is left out: its weights are not at {weights} and cannot be fetched ({error}).")
         return None
     finally:
         socket.setdefaulttimeout(timeout)

@@ -9,7 +9,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TrainConfig
@@ -55,8 +55,8 @@ def new_scene(
         CONSOLE.print(f"The capture has no points: training starts from {report.random:,} random ones.")
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
-        CONSOLE.print(
-            f"[bold yellow]{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
+        warn(
+            f"{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
             f"first is point {row}); they are left out."
         )
     return scene

@@ -68,7 +68,9 @@ class Bundle:
         surfels: per-surfel parameters as in docs/architecture.md, float32 on the CPU.
         view_color: sv, sh, sb or sg.
         tiles: [N, 5] int32 (x, y, layer, r_u, r_v), zeros for a surfel without a tile.
-        atlas: [layers, height, width, 4] uint8 (bc7, uint8) or float32 (fp16); None when the scene has no texture.
+        atlas: [layers, height, width, 4] uint8 (bc7, uint8) or float32 (fp16); None when the scene has no texture, or
+            its blocks were not decoded.
+        blocks: [layers, height / 4, width / 4, 16] uint8, the atlas as it is in the file; None unless it is BC7.
         offset, scale: residual colour = offset + scale * value, value = stored / 255 for uint8, stored for float32.
         extent: [N] float32 half side of the tile in scale units.
         mean_residual: [N, 3] float32 mean of the tile; the residual of a surfel without a tile.
@@ -79,6 +81,7 @@ class Bundle:
     view_color: str
     tiles: Tensor
     atlas: Tensor | None
+    blocks: Tensor | None
     offset: float
     scale: float
     extent: Tensor
@@ -91,7 +94,7 @@ class Bundle:
     def residuals(self) -> Tensor:
         """Residual colours of the atlas: [layers, height, width, 3] float32."""
         if self.atlas is None:
-            raise BundleError("the bundle has no atlas")
+            raise BundleError("the bundle has no atlas" if self.blocks is None else "the atlas was not decoded")
         rgb = self.atlas[..., :3].float()
         unorm = rgb / 255.0 if self.atlas.dtype == torch.uint8 else rgb
         return unorm * self.scale + self.offset
@@ -170,12 +173,13 @@ def write_bundle(
     return folder
 
 
-def read_bundle(folder: str | Path, verify: bool = True) -> Bundle:
+def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) -> Bundle:
     """Loads a bundle.
 
     Args:
         folder: the bundle's folder.
         verify: compare every file with its sha256 (sizes are always compared).
+        decode: also decode a BC7 atlas, four bytes a texel; a CUDA device draws from the blocks alone.
 
     Raises:
         BundleError: a file is missing, truncated, altered or malformed, or the version is too new.
@@ -194,11 +198,12 @@ def read_bundle(folder: str | Path, verify: bool = True) -> Bundle:
         raise BundleError(f"{folder / SURFELS}: {error}") from error
     if len(tiles) != info["surfels"]["count"]:
         raise BundleError(f"{folder / SURFELS}: {len(tiles)} surfels, but {MANIFEST} says {info['surfels']['count']}")
-    atlas = _read_atlas(folder, info, verify)
-    _check_tiles(tiles, None if atlas is None else tuple(atlas.shape[:3]), folder / SURFELS)
+    pages = info["atlas"] and tuple(info["atlas"][name] for name in ("layers", "height", "width"))
+    _check_tiles(tiles, pages, folder / SURFELS)
+    atlas, blocks = _read_atlas(folder, info, verify, decode)
     offset, scale = (info["atlas"]["offset"], info["atlas"]["scale"]) if info["atlas"] else (0.0, 1.0)
     kind = info["surfels"]["view_color"]
-    return Bundle(surfels, kind, tiles, atlas, float(offset), float(scale), extent, mean_residual, info)
+    return Bundle(surfels, kind, tiles, atlas, blocks, float(offset), float(scale), extent, mean_residual, info)
 
 
 def verify_bundle(folder: str | Path) -> dict[str, Any]:
@@ -306,10 +311,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise BundleError(f"{path} cannot be read: {error}") from error
 
 
-def _read_atlas(folder: Path, info: dict[str, Any], verify: bool) -> Tensor | None:
+def _read_atlas(folder: Path, info: dict[str, Any], verify: bool, decode: bool) -> tuple[Tensor | None, Tensor | None]:
+    """The texels, and the BC7 blocks where the atlas has such."""
     stated = info["atlas"]
     if stated is None:
-        return None
+        return None, None
     path = folder / ATLAS
     try:
         image = ktx2.parse_ktx2(_checked(path, info["files"][ATLAS], verify))
@@ -318,13 +324,18 @@ def _read_atlas(folder: Path, info: dict[str, Any], verify: bool) -> Tensor | No
     found = (image.format, image.width, image.height, len(image.payload))
     if found != (stated["format"], stated["width"], stated["height"], stated["layers"]):
         raise BundleError(f"{path}: format and size {found} are not those of {MANIFEST}")
-    pages = decode_pages(image.payload, image.format, image.width, image.height)
-    texels = torch.from_numpy(pages)
+    blocks = None
+    if image.format == "bc7":
+        pages = [np.frombuffer(page, np.uint8) for page in image.payload]
+        blocks = torch.from_numpy(np.stack(pages).reshape(len(pages), image.height // 4, image.width // 4, 16))
+        if not decode:
+            return None, blocks
+    texels = torch.from_numpy(decode_pages(image.payload, image.format, image.width, image.height))
     if image.format != "fp16":
-        return texels
+        return texels, blocks
     if not torch.isfinite(texels).all():
         raise BundleError(f"{path}: a texel is not finite")
-    return texels.float()
+    return texels.float(), None
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:

@@ -41,6 +41,32 @@ class _ViewColor(torch.autograd.Function):
         return None, None, None, None, dx, *((da, db) if dc is None else (da, db, dc))
 
 
+def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
+    """The number of terms (sites, coefficients with dc, or lobes) of n surfels' view colours.
+
+    Raises:
+        ValueError: unknown kind, or a parameter has the wrong shape.
+    """
+    if kind not in VIEW_COLORS:
+        raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
+    given = [params[name] for name in VIEW_COLORS[kind]]
+    terms = given[1].shape[1] + (1 if kind == "sh" else 0)
+    shapes = {
+        "sv": [(n, terms, 3), (n, terms), (n, terms, 3)],
+        "sh": [(n, 3), (n, terms - 1, 3)],
+        "sb": [(n, 3), (n, terms, 6)],
+        "sg": [(n, 3), (n, terms, 7)],
+    }[kind]
+    for name, tensor, shape in zip(VIEW_COLORS[kind], given, shapes, strict=True):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    if kind == "sh" and terms not in (1, 4, 9, 16):
+        raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
+    if terms > 32:
+        raise ValueError(f"at most 32 sites or lobes a surfel, not {terms}")
+    return terms
+
+
 def view_color(
     kind: str, params: Mapping[str, Tensor], means: Tensor, center: Tensor, active: Tensor | None = None
 ) -> Tensor:
@@ -59,23 +85,8 @@ def view_color(
     Raises:
         ValueError: unknown kind, or a parameter has the wrong shape.
     """
-    if kind not in VIEW_COLORS:
-        raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
+    terms = check_view_color(kind, params, means.shape[0])
     given = [params[name] for name in VIEW_COLORS[kind]]
     n = means.shape[0]
-    terms = given[1].shape[1] + (1 if kind == "sh" else 0)
-    shapes = {
-        "sv": [(n, terms, 3), (n, terms), (n, terms, 3)],
-        "sh": [(n, 3), (n, terms - 1, 3)],
-        "sb": [(n, 3), (n, terms, 6)],
-        "sg": [(n, 3), (n, terms, 7)],
-    }[kind]
-    for name, tensor, shape in zip(VIEW_COLORS[kind], given, shapes, strict=True):
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
-    if kind == "sh" and terms not in (1, 4, 9, 16):
-        raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
-    if terms > 32:
-        raise ValueError(f"at most 32 sites or lobes a surfel, not {terms}")
     flags = torch.ones(n, dtype=torch.uint8) if active is None else active.to(torch.uint8)
     return _ViewColor.apply(kind, terms, flags.to(means.device), center, means, *given)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.ops import project, view_color
-from bitymi_ns.ops.backend import module
+from bitymi_ns.ops.backend import cuda_backend, module
+from bitymi_ns.ops.baked import AtlasTexture, BakedArrays, WorkspacePool, draw, empty_images
 from bitymi_ns.ops.trace import TRANSMITTANCE_MIN
 from bitymi_ns.ops.trace_cpu import tracers
 
@@ -34,13 +35,16 @@ class BakedOutput:
 
 @dataclass
 class BakedScene:
-    """Renders a bundle.
+    """Renders a bundle, on the CPU or, after `to`, on a CUDA device.
 
     Attributes:
         surfels: per-surfel parameters by name (docs/architecture.md), float32.
         view_color: sv, sh, sb or sg.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
-        atlas: [layers, height, width, 4] uint8 or float32, None = no residual.
+        atlas: [layers, height, width, 4] uint8 or float32 on the CPU, None = no residual. On a CUDA device float texels
+            become float16.
+        blocks: [layers, height / 4, width / 4, 16] uint8 on the CPU, the same atlas as BC7 blocks, which a CUDA device
+            reads as they are; None = not given. The CPU needs `atlas`.
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
         extent: [N] half side of the tile in scale units, None = 3, the kernel's support, everywhere.
         mean_residual: [N, 3] float32 mean residual of every tile; a surfel without a tile has this residual. None = 0.
@@ -63,7 +67,12 @@ class BakedScene:
     weight_bound: float = 0.0
     prefilter: str = "low_pass"
     transmittance_min: float = TRANSMITTANCE_MIN
+    blocks: Tensor | None = None
     _patches: tuple | None = field(default=None, init=False, repr=False, compare=False)
+    _texture: tuple[Tensor, torch.device, AtlasTexture] | None = field(
+        default=None, init=False, repr=False, compare=False
+    )
+    _workspaces: WorkspacePool = field(default_factory=WorkspacePool, init=False, repr=False, compare=False)
 
     @classmethod
     def from_bundle(cls, bundle: Bundle) -> BakedScene:
@@ -81,6 +90,44 @@ class BakedScene:
             near=info["render"]["near"],
             weight_bound=info["render"]["weight_bound"],
             prefilter=info["render"].get("prefilter", "low_pass"),
+            blocks=bundle.blocks,
+        )
+
+    def to(self, device: torch.device | str) -> BakedScene:
+        """The scene with its surfels on another device; texels go there, as textures, when it is first drawn."""
+
+        def moved(t: Tensor | None) -> Tensor | None:
+            return None if t is None else t.to(device)
+
+        surfels = {name: value.to(device) for name, value in self.surfels.items()}
+        optional = {"extent": moved(self.extent), "mean_residual": moved(self.mean_residual)}
+        return replace(self, surfels=surfels, tiles=self.tiles.to(device), **optional)
+
+    def arrays(self) -> BakedArrays:
+        """The scene as the CUDA kernels take it (`ops.baked`), its atlas as textures on the device of the surfels.
+
+        Raises:
+            TypeError: the surfels are not float32.
+        """
+        device = self.tiles.device
+        texels = self.blocks if self.blocks is not None and device.type == "cuda" else self.atlas
+        if texels is not None and (
+            self._texture is None or self._texture[0] is not texels or self._texture[1] != device
+        ):
+            self._texture = (texels, device, AtlasTexture(texels, texels is self.blocks, device))
+        return BakedArrays(
+            self.surfels,
+            self.view_color,
+            self.tiles,
+            None if texels is None or self._texture is None else self._texture[2],
+            self.offset,
+            self.scale,
+            self.extent,
+            self.mean_residual,
+            self.near,
+            self.weight_bound,
+            self.prefilter == "pixel",
+            self.transmittance_min,
         )
 
     def __len__(self) -> int:
@@ -90,11 +137,23 @@ class BakedScene:
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
         """Renders a view: texels are fetched bilinearly, clamped to the tile's outer texel centres.
 
+        On a CUDA device this waits for the image, to see whether its working memory was large enough;
+        `baked_renderer.BakedRenderer` does not.
+
         Args:
             camera: the view.
             background: [3] colour behind the scene; None = black.
             maps: also beta, depth, normals and overdraw.
+
+        Raises:
+            ValueError: the scene is on the CPU, and its atlas only as BC7 blocks.
         """
+        if cuda_backend(self.tiles.device):
+            names = ("rgb", "alpha", *(("beta", "depth", "normal", "overdraw") if maps else ()))
+            images = {name: image[0] for name, image in self.render_views([camera], background, names).items()}
+            return BakedOutput(*(images.get(name) for name in ("rgb", "alpha", "beta", "depth", "normal", "overdraw")))
+        if self.atlas is None and self.blocks is not None:
+            raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
         p = self.surfels
         means = p["means"]
         geometry = (means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
@@ -142,3 +201,56 @@ class BakedScene:
             )
             self._patches = (state, patches)
         return self._patches[1]
+
+    @torch.no_grad()
+    def render_views(
+        self, cameras: Sequence[Camera], background: Tensor | None = None, images: Sequence[str] = ("rgb", "alpha")
+    ) -> dict[str, Tensor]:
+        """Renders views of one size on a CUDA device, all in one go.
+
+        Args:
+            cameras: at least one.
+            background: [3] colour behind the scene; None = black.
+            images: what to draw, names of `ops.baked.IMAGES`.
+
+        Returns:
+            name -> [views, height, width, channels].
+
+        Raises:
+            ValueError: the cameras differ in size or have skew, or views times surfels is above 2^24.
+            RuntimeError: the scene is on the CPU; or the device has too little memory.
+        """
+        device = self.tiles.device
+        if not cuda_backend(device):
+            raise RuntimeError(
+                "views are drawn together on a CUDA device only: move the scene there, or render one by one"
+            )
+        viewmats, Ks, width, height = stack_cameras(cameras, device)
+        arrays = self.arrays()
+        background = None if background is None else background.to(device, torch.float32).contiguous()
+        to = empty_images(tuple(images), len(cameras), width, height, device)
+        workspace = self._workspaces.take()
+        workspace.fit(arrays, len(cameras), width, height, "normal" in to)
+        draw(arrays, viewmats, Ks, background, to, workspace)
+        if len(self) and not workspace.settle():
+            workspace.fit(arrays, len(cameras), width, height, "normal" in to)
+            draw(arrays, viewmats, Ks, background, to, workspace)
+            workspace.settle()  # waits: the next frame may use the memory on another stream
+        self._workspaces.give(workspace)
+        return to
+
+
+def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
+    """Cameras of one size as viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, with width and height.
+
+    Raises:
+        ValueError: there is none, they differ in size, or one has skew.
+    """
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) != 1:
+        raise ValueError(f"views that are drawn together need one size, not {sorted(sizes)}")
+    if any(camera.skewed for camera in cameras):
+        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    viewmats = torch.stack([camera.viewmat.to("cpu", torch.float32) for camera in cameras]).to(device)
+    Ks = torch.stack([camera.K.to("cpu", torch.float32) for camera in cameras]).to(device)
+    return viewmats, Ks, *sizes.pop()

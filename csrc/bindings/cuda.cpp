@@ -14,4 +14,5 @@ NB_MODULE(_cuda, m) {
 #endif
   bt::cuda::bind_project(m);
   bt::cuda::bind_trace(m);
+  bt::cuda::bind_baked(m);
 }

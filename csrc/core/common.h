@@ -50,6 +50,12 @@ BT_HD T clamp_(T x, T low, T high) {
   return min_(max_(x, low), high);
 }
 
+// x^y for x > 0
+template <class T>
+BT_HD T power_(T x, T y) {
+  return exp_(y * log_(x));
+}
+
 // sigmoid without overflow for any finite x
 template <class S>
 BT_HD S sigmoid(S x) {

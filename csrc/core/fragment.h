@@ -21,7 +21,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T v = select(hit, (T(g[kV1]) * dx + T(g[kV2]) * dy) * inv, zero);
   const T rest = one - (u * u + v * v) * T(S(1.0 / (kSupport * kSupport)));
   const auto inside = hit & (rest > zero);
-  const T kernel = select(inside, exp_(T(g[kBeta]) * log_(select(inside, rest, one))), zero);
+  const T kernel = select(inside, power_(select(inside, rest, one), T(g[kBeta])), zero);
   Fragment<T> f;
   f.u = u, f.v = v, f.depth = T(q) * inv, f.low_pass = zero;
   T most = kernel;

@@ -14,4 +14,10 @@ BT_HD T texel_position(T u, int r, S extent) {
   return clamp_(x, T(S(0)), T(S(r - 1)));
 }
 
+// The same for a tile of span + 1 texels, with k = 1 / (2 extent) at hand.
+template <class S, class T>
+BT_HD T texel_position_scaled(T u, S span, S k) {
+  return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
+}
+
 }  // namespace bt

@@ -28,6 +28,8 @@ inline void check(cudaError_t error, const char* what) {
   } while (0)
 
 #define BT_UNROLL _Pragma("unroll")
+#define BT_PRAGMA(text) _Pragma(#text)
+#define BT_UNROLL_BY(n) BT_PRAGMA(unroll n)
 
 #define BT_DYNAMIC_SHARED(Type, name)                               \
   extern __shared__ __align__(16) unsigned char bt_shared_memory[]; \
@@ -41,6 +43,7 @@ inline void check(cudaError_t error, const char* what) {
   ((void)(stream), ::bt::emulator::launch(#kernel, (grid), (block), (shared), [=] { kernel(__VA_ARGS__); }))
 
 #define BT_UNROLL
+#define BT_UNROLL_BY(n)
 
 #define BT_DYNAMIC_SHARED(Type, name) Type* name = static_cast<Type*>(::bt::emulator::dynamic_shared())
 

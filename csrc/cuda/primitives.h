@@ -7,7 +7,8 @@
 
 namespace bt::cuda {
 
-// Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint32_t or uint64_t; n below 2^31.
+// Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint16_t, uint32_t or uint64_t; n below
+// 2^31.
 template <class Key>
 int64_t sort_workspace(int64_t n, int bits);
 template <class Key>

@@ -1,0 +1,105 @@
+"""Frames of a baked scene on a CUDA device at the highest rate: memory that stays, no waiting, a recorded graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.ops.baked import Stage, Workspace, draw, empty_images
+
+from .baked import BakedScene, stack_cameras
+from .camera import Camera
+
+
+class BakedRenderer:
+    """Draws frames of one kind into images that are kept; each frame overwrites the one before.
+
+    Args:
+        scene: on a CUDA device.
+        width, height: of the images, pixels.
+        views: drawn together in a frame.
+        images: what to draw, names of `ops.baked.IMAGES`: fewer images cost less.
+        background: [3] colour behind the scene; None = black.
+        graph: record the frame as a CUDA graph, which costs the host one call a frame. For a card only.
+
+    Raises:
+        RuntimeError: the scene is on the CPU, or the device has too little memory.
+        ValueError: an image that does not exist, or more surfels times views than 2^24.
+    """
+
+    def __init__(
+        self,
+        scene: BakedScene,
+        width: int,
+        height: int,
+        views: int = 1,
+        images: Sequence[str] = ("rgb",),
+        background: Tensor | None = None,
+        graph: bool = False,
+    ) -> None:
+        device = scene.tiles.device
+        if not cuda_backend(device):
+            raise RuntimeError("the scene is on the CPU: move it to a CUDA device, or use BakedScene.render")
+        if graph and device.type != "cuda":
+            raise ValueError("CUDA graphs need a card")
+        self.arrays = scene.arrays()
+        self.images = empty_images(tuple(images), views, width, height, device)
+        self.workspace = Workspace()
+        self._viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
+        self._Ks = torch.eye(3, device=device).repeat(views, 1, 1)
+        self._background = None if background is None else background.to(device, torch.float32).contiguous()
+        self._size = (views, width, height)
+        self._use_graph, self._graph = graph, None
+        self._fit(0)
+
+    def draw(self, cameras: Sequence[Camera], check: bool = True) -> dict[str, Tensor]:
+        """Draws the views.
+
+        Args:
+            cameras: as many as the renderer has views, of its size.
+            check: wait for the frame and draw it again when the working memory was too small. Without, the frame is
+                only begun; ask `complete` later.
+
+        Returns:
+            name -> [views, height, width, channels]; the same memory every time.
+        """
+        viewmats, Ks, width, height = stack_cameras(cameras, self._viewmats.device)
+        if (len(cameras), width, height) != self._size:
+            raise ValueError(
+                f"the renderer draws {self._size} (views, width, height), not {(len(cameras), width, height)}"
+            )
+        self._viewmats.copy_(viewmats)
+        self._Ks.copy_(Ks)
+        self.run()
+        if check and not self.complete():
+            self._fit(self.workspace.pairs * 5 // 4)
+            self.run()
+        return self.images
+
+    def run(self, stages: Stage = Stage.ALL) -> None:
+        """Begins the frame of the latest cameras; single stages, for timing them, are never taken from the graph."""
+        if not self._use_graph or stages != Stage.ALL:
+            self._draw(stages)
+            return
+        if self._graph is None:
+            self._draw(Stage.ALL)  # before recording: first calls load kernels
+            torch.cuda.synchronize(self._viewmats.device)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._draw(Stage.ALL)
+        self._graph.replay()
+
+    def complete(self) -> bool:
+        """Whether the working memory was large enough for the latest frame; waits for it."""
+        return len(self.arrays.tiles) == 0 or self.workspace.pairs <= self.workspace.capacity
+
+    def _draw(self, stages: Stage) -> None:
+        draw(self.arrays, self._viewmats, self._Ks, self._background, self.images, self.workspace, stages)
+
+    def _fit(self, capacity: int) -> None:
+        views, width, height = self._size
+        self.workspace.fit(self.arrays, views, width, height, "normal" in self.images, capacity)
+        self._graph = None  # it points at the old memory

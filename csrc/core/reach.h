@@ -1,0 +1,142 @@
+// Which pixels a surfel can touch, like bounds.h, but in the reals of the fragments: for devices on which doubles are
+// slow. It solves the three planes of surfel.h for the pixel instead of forming a conic:
+//
+//   dx = X.q / (1 + C.q),  dy = Y.q / (1 + C.q)   with q = (u, v) / r on the unit disc,
+//
+// where r is the radius of the level set sigma = 1/255. A box and the crossings with a line then follow from sums of
+// squares; no determinant of squared coefficients is taken, so that a needle costs no digits. What does cost digits is
+// a small angle between the lines U = 0 and V = 0 on the screen; r is widened by as much.
+#pragma once
+
+#include "core/bounds.h"
+
+namespace bt {
+
+// The level set sigma = 1/255: u^2 + v^2 <= r2, or d^2 <= blur2; both a little wide.
+template <class S>
+struct LevelSet {
+  bool visible;
+  S r2;
+  S blur2;  // 0: the low pass cannot exceed the kernel anywhere
+};
+
+template <class S>
+BT_HD LevelSet<S> level_set(const S* g) {
+  LevelSet<S> l = {false, S(0), S(0)};
+  const S o255 = S(255) * g[kOpacity];
+  l.visible = o255 >= S(1) - S(1e-6);
+  if (!l.visible) return l;
+  const S level = max_(log_(o255), S(0)) + S(1e-5);
+  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
+  l.r2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(4e-6));
+  // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x),
+  // (1 - x)^beta >= exp(-d^2) holds out to d^2 = ln 255 where k >= beta + ln 255.
+  const S reach = S(2.36);  // > sqrt(ln 255)
+  const S w1 = g[kW1] < S(0) ? -g[kW1] : g[kW1], w2 = g[kW2] < S(0) ? -g[kW2] : g[kW2];
+  const S least = g[kW0] - reach * (w1 + w2);
+  const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];
+  const bool covered =
+      least > S(0) && S(kSupport * kSupport) * least * least >= (g[kBeta] + reach * reach) * S(1.001) * slope;
+  l.blur2 = covered ? S(0) : level;
+  return l;
+}
+
+template <class S>
+struct Reach {
+  bool whole;                // the disc comes near the camera plane: anything on the screen
+  bool ellipse;              // false: the low pass alone
+  S xu, xv, yu, yv, cu, cv;  // X, Y, C
+  S x0, x1, y0, y1;          // box of the ellipse, offsets from the projected centre, pixels
+  S y_left, y_right;         // where its leftmost and its rightmost point lie
+  S blur;                    // radius of the low pass, pixels; -1 without
+};
+
+// Box and outermost points from X, Y and C.
+template <class S>
+BT_HD void enclose(Reach<S>& e) {
+  const S cc = e.cu * e.cu + e.cv * e.cv, rest = S(1) - cc;
+  const S xx = e.xu * e.xu + e.xv * e.xv, yy = e.yu * e.yu + e.yv * e.yv;
+  e.whole = !(rest > S(1e-3) && xx < S(1e16) && yy < S(1e16));  // also for NaN
+  if (e.whole) return;
+  // a line x = const touches the image of the disc where |X - x C| = |x|
+  const S xc = e.xu * e.cu + e.xv * e.cv, yc = e.yu * e.cu + e.yv * e.cv;
+  const S hx = sqrt_(xc * xc + rest * xx), hy = sqrt_(yc * yc + rest * yy);
+  e.x0 = (-xc - hx) / rest, e.x1 = (hx - xc) / rest;
+  e.y0 = (-yc - hy) / rest, e.y1 = (hy - yc) / rest;
+  for (int side = 0; side < 2; ++side) {
+    const S x = side ? e.x1 : e.x0;
+    const bool point = x == S(0);
+    const S k = S(1) / select(point, S(1), x);
+    const S qu = select(point, S(0), k * (e.xu - x * e.cu)), qv = select(point, S(0), k * (e.xv - x * e.cv));
+    const S y = (e.yu * qu + e.yv * qv) / (S(1) + e.cu * qu + e.cv * qv);
+    (side ? e.y_right : e.y_left) = y;
+  }
+}
+
+// r2 and blur2 are those of level_set.
+template <class S>
+BT_HD Reach<S> reach(const S* g, S r2, S blur2) {
+  Reach<S> e;
+  e.whole = false, e.ellipse = false;
+  e.blur = blur2 > S(0) ? sqrt_(blur2) + S(0.01) : S(-1);
+  e.x0 = e.y0 = S(1), e.x1 = e.y1 = S(-1), e.y_left = e.y_right = S(0);
+  e.xu = e.xv = e.yu = e.yv = e.cu = e.cv = S(0);
+  if (!(g[kW0] > S(0))) return e;  // seen exactly edge-on: no ray hits it
+  e.ellipse = true;
+  const S a1 = g[kU1] < S(0) ? -g[kU1] : g[kU1], a2 = g[kU2] < S(0) ? -g[kU2] : g[kU2];
+  const S b1 = g[kV1] < S(0) ? -g[kV1] : g[kV1], b2 = g[kV2] < S(0) ? -g[kV2] : g[kV2];
+  const S mu = S(1) / max_(a1, a2), mv = S(1) / max_(b1, b2);
+  const S u1 = g[kU1] * mu, u2 = g[kU2] * mu, v1 = g[kV1] * mv, v2 = g[kV2] * mv;  // in [-1, 1]
+  const S det = u1 * v2 - u2 * v1, angle = det < S(0) ? -det : det;
+  const S inv = S(1) / det;
+  const S r = sqrt_(r2) * (S(1.0001) + S(1e-6) / angle);
+  const S ku = g[kW0] * mu * inv * r, kv = g[kW0] * mv * inv * r;
+  e.xu = ku * v2, e.xv = -kv * u2;
+  e.yu = -ku * v1, e.yv = kv * u1;
+  e.cu = (g[kW2] * v1 - g[kW1] * v2) * mu * inv * r;
+  e.cv = (g[kW1] * u2 - g[kW2] * u1) * mv * inv * r;
+  enclose(e);
+  e.whole = e.whole || !(angle > S(1e-6));
+  return e;
+}
+
+// With the prefilter: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
+template <class S>
+struct FilteredReach {
+  bool visible;
+  Reach<S> reach;
+};
+template <class S>
+BT_HD FilteredReach<S> filtered_reach(const S* geom) {
+  double g[kGeom];
+  for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
+  const Extent x = filtered_extent(g);
+  FilteredReach<S> f;
+  f.visible = x.visible;
+  Reach<S>& e = f.reach;
+  e.whole = x.visible && x.whole, e.ellipse = x.visible, e.blur = S(-1);
+  e.x0 = e.y0 = S(1), e.x1 = e.y1 = S(-1), e.y_left = e.y_right = S(0);
+  e.xu = e.xv = e.yu = e.yv = e.cu = e.cv = S(0);
+  if (!x.visible || x.whole) return f;
+  // d^T Q d <= r^2 is the disc's image under r L with L L^T = Q^-1
+  const double r2 = -x.qf * 1.0003, inv = r2 / (x.qa * x.qc - x.qb * x.qb), top = x.qc * inv;
+  e.xu = S(sqrt_(top)), e.yu = S(-x.qb * inv / sqrt_(top)), e.yv = S(sqrt_(r2 / x.qc));
+  enclose(e);
+  return f;
+}
+
+// Widens [x0, x1] by where the line y crosses the ellipse.
+template <class S>
+BT_HD void widen_by_crossing(const Reach<S>& e, S y, S& x0, S& x1) {
+  const S mu = e.yu - y * e.cu, mv = e.yv - y * e.cv, mm = mu * mu + mv * mv;
+  if (!(mm > S(0)) || !(y * y <= mm)) return;
+  const S k = S(1) / mm, at = y * k, half = sqrt_(max_(S(1) - y * at, S(0)) * k);
+  for (int side = 0; side < 2; ++side) {
+    const S h = side ? half : -half;
+    const S qu = at * mu - h * mv, qv = at * mv + h * mu;
+    const S x = (e.xu * qu + e.xv * qv) / (S(1) + e.cu * qu + e.cv * qv);
+    x0 = min_(x0, x), x1 = max_(x1, x);
+  }
+}
+
+}  // namespace bt

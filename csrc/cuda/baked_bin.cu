@@ -1,0 +1,205 @@
+// Second stage of the baked renderer: every tile's surfels front to back, and the host's side of a frame.
+//
+// Two sorts instead of one: n keys of 32 bits (depth), then all pairs by 16 bits (tile), in two passes of 6 bytes each
+// way. One sort of the pairs by tile and depth would take six passes of 12 bytes.
+#include <stdexcept>
+#include <string>
+
+#include "cuda/baked_stages.h"
+#include "cuda/primitives.h"
+#include "cuda/workspace.h"
+
+namespace bt::cuda {
+
+namespace {
+constexpr int kThreads = 128;
+constexpr int32_t kPairsAlone = 32;  // pairs that a thread writes by itself
+constexpr int kRestPerThread = 16;
+
+__global__ void __launch_bounds__(kThreads) order_counts_kernel(BakedFrame f) {
+  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (r < f.rows) f.memory.ordered_counts[r] = f.memory.counts[f.memory.order[r]];
+}
+
+__device__ int32_t warp_sum_before(int32_t value, int lane) {
+  int32_t sum = value;
+  for (int by = 1; by < kWarp; by *= 2) {
+    const int32_t left = __shfl_up_sync(kFullMask, sum, by);
+    if (lane >= by) sum += left;
+  }
+  return sum - value;
+}
+
+// Writes the pairs of one row of tiles from `at` on, never beyond `end`; the place after the last.
+template <class Key>
+__device__ int64_t write_pairs(const TileRow& r, uint32_t first_tile, uint32_t row, int64_t at, int64_t end, Key* keys,
+                               int32_t* values) {
+  for (int tx = r.left; tx <= r.right && at < end; ++tx, ++at) {
+    keys[at] = Key(first_tile + tx);
+    values[at] = int32_t(row << 8 | part_mask(r, tx));
+  }
+  return at;
+}
+
+// The surfels in order of depth, a thread each, a warp for the large ones; the last blocks clear what is left over.
+template <class Key, bool kPrefilter>
+__global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned surfel_blocks) {
+  Key* keys = static_cast<Key*>(f.memory.keys);
+  int32_t* values = f.memory.values;
+  if (blockIdx.x >= surfel_blocks) {
+    const int64_t total = f.memory.offsets[f.rows - 1] + f.memory.ordered_counts[f.rows - 1];
+    const int64_t me = int64_t(blockIdx.x - surfel_blocks) * kThreads + threadIdx.x;
+    const int64_t stride = int64_t(gridDim.x - surfel_blocks) * kThreads;
+    if (me == 0) *f.memory.total = total;
+    for (int64_t k = total + me; k < f.capacity; k += stride) keys[k] = Key(f.tiles);
+    for (int64_t k = me; k < 2 * f.tiles; k += stride) f.memory.ranges[k] = 0;
+    return;
+  }
+  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int lane = threadIdx.x % kWarp;
+  const bool here = r < f.rows;
+  const int32_t count = here ? f.memory.ordered_counts[r] : 0;
+  const uint32_t id = here ? uint32_t(f.memory.order[r]) : 0;
+  const int64_t from = here ? f.memory.offsets[r] : 0;
+  const int tiles_of_view = f.tiles_x * f.tiles_y;
+  if (count > 0 && count <= kPairsAlone) {
+    const int64_t end = min_(from + int64_t(count), f.capacity);
+    const Footprint area = footprint<kPrefilter>(f.memory.rows + int64_t(id) * kRow, f.height);
+    const uint32_t base = id / uint32_t(f.n) * tiles_of_view;
+    int64_t at = from;
+    for (int ty = area.top; ty <= area.bottom; ++ty)
+      at = write_pairs(tile_row(area, ty, f.width), base + ty * f.tiles_x, id, at, end, keys, values);
+    // both counts come from the same code; should they ever differ, no place may stay unwritten
+    for (; at < end; ++at) keys[at] = Key(f.tiles);
+  }
+  for (unsigned rest = __ballot_sync(kFullMask, count > kPairsAlone); rest; rest &= rest - 1) {
+    const int source = __ffs(int(rest)) - 1;
+    const uint32_t big = __shfl_sync(kFullMask, id, source);
+    const int32_t pairs = __shfl_sync(kFullMask, count, source);
+    const int64_t start = __shfl_sync(kFullMask, from, source), end = min_(start + int64_t(pairs), f.capacity);
+    const Footprint area = footprint<kPrefilter>(f.memory.rows + int64_t(big) * kRow, f.height);
+    const uint32_t base = big / uint32_t(f.n) * tiles_of_view;
+    int64_t at = start;
+    for (int top = area.top; top <= area.bottom; top += kWarp) {
+      const int ty = top + lane;
+      TileRow row;
+      row.left = 0, row.right = -1;
+      if (ty <= area.bottom) row = tile_row(area, ty, f.width);
+      const int32_t mine = row.right - row.left + 1, before = warp_sum_before(mine, lane);
+      write_pairs(row, base + ty * f.tiles_x, big, at + before, end, keys, values);
+      at += __shfl_sync(kFullMask, before + mine, kWarp - 1);
+    }
+    for (at += lane; at < end; at += kWarp) keys[at] = Key(f.tiles);
+  }
+}
+
+// Where each tile's pairs begin and end: a thread a run of keys as long as 16 bytes.
+template <class Key>
+__global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
+  constexpr int kKeys = 16 / sizeof(Key);
+  const Key* keys = static_cast<const Key*>(f.memory.keys_sorted);
+  const int64_t used = min_(*f.memory.total, f.capacity);
+  const int64_t begin = (int64_t(blockIdx.x) * kThreads + threadIdx.x) * kKeys;
+  if (begin >= used) return;
+  Key mine[kKeys];
+  memcpy(mine, __builtin_assume_aligned(keys + begin, 16), sizeof mine);
+  int64_t before = begin ? int64_t(keys[begin - 1]) : -1;
+  for (int k = 0; k < kKeys; ++k) {
+    const int64_t at = begin + k;
+    if (at >= used) break;
+    const int64_t tile = mine[k];
+    if (tile != before) {
+      if (before >= 0) f.memory.ranges[2 * before + 1] = int32_t(at);
+      if (tile < f.tiles) f.memory.ranges[2 * tile] = int32_t(at);
+    }
+    if (at == used - 1 && tile < f.tiles) f.memory.ranges[2 * tile + 1] = int32_t(at + 1);
+    before = tile;
+  }
+}
+
+template <class Key>
+void bin(const BakedFrame& f, Stream stream) {
+  const BakedMemory& m = f.memory;
+  sort_pairs(m.depth, m.depth_sorted, m.unsorted, m.order, f.rows, 32, m.scratch, m.scratch_bytes, stream);
+  const unsigned blocks = unsigned(ceil_div(f.rows, kThreads));
+  BT_LAUNCH(order_counts_kernel, dim3(blocks), dim3(kThreads), 0, stream, f);
+  exclusive_sum(m.ordered_counts, m.offsets, f.rows, m.scratch, m.scratch_bytes, stream);
+  const unsigned rest = unsigned(min_<int64_t>(1024, ceil_div(f.capacity + 2 * f.tiles, kThreads * kRestPerThread)));
+  if (f.prefilter)
+    BT_LAUNCH((pairs_kernel<Key, true>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
+  else
+    BT_LAUNCH((pairs_kernel<Key, false>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
+  sort_pairs(static_cast<const Key*>(m.keys), static_cast<Key*>(m.keys_sorted), m.values, m.values_sorted, f.capacity,
+             f.key_bits, m.scratch, m.scratch_bytes, stream);
+  const unsigned runs = unsigned(ceil_div(f.capacity, kThreads * int64_t(16 / sizeof(Key))));
+  BT_LAUNCH(ranges_kernel<Key>, dim3(runs), dim3(kThreads), 0, stream, f);
+}
+
+// Cuts the working memory into its arrays; the bytes needed. With a null base only the bytes count.
+int64_t lay_out(BakedFrame& f, void* base, bool normals) {
+  Arena arena(base);
+  BakedMemory& m = f.memory;
+  m.total = arena.take<int64_t>(1);
+  m.ranges = arena.take<int32_t>(2 * f.tiles);
+  m.rows = arena.take<float>(f.rows * kRow);
+  m.normals = normals ? arena.take<float4>(f.rows) : nullptr;
+  m.depth = arena.take<uint32_t>(f.rows), m.depth_sorted = arena.take<uint32_t>(f.rows);
+  m.unsorted = arena.take<int32_t>(f.rows), m.order = arena.take<int32_t>(f.rows);
+  m.counts = arena.take<int32_t>(f.rows), m.ordered_counts = arena.take<int32_t>(f.rows);
+  m.offsets = arena.take<int64_t>(f.rows);
+  const int64_t key_bytes = f.capacity * (f.wide ? 4 : 2);
+  m.keys = arena.take<char>(key_bytes), m.keys_sorted = arena.take<char>(key_bytes);
+  m.values = arena.take<int32_t>(f.capacity), m.values_sorted = arena.take<int32_t>(f.capacity);
+  m.scratch_bytes = 1;
+  if (f.rows) {
+    const int64_t pairs =
+        f.wide ? sort_workspace<uint32_t>(f.capacity, f.key_bits) : sort_workspace<uint16_t>(f.capacity, f.key_bits);
+    m.scratch_bytes = max_(max_(sort_workspace<uint32_t>(f.rows, 32), scan_workspace(f.rows)), pairs);
+  }
+  m.scratch = arena.take<char>(m.scratch_bytes);
+  return arena.used();
+}
+
+BakedFrame frame_of(int64_t surfels, const BakedViews& v, int64_t capacity) {
+  BakedFrame f = {};
+  f.n = surfels, f.rows = surfels * v.count;
+  f.width = v.width, f.height = v.height;
+  f.tiles_x = int(ceil_div(v.width, kTileSide)), f.tiles_y = int(ceil_div(v.height, kTileSide));
+  f.tiles = int64_t(f.tiles_x) * f.tiles_y * v.count;
+  f.capacity = ceil_div(max_<int64_t>(capacity, 1), 8) * 8;
+  while (f.tiles >> f.key_bits) ++f.key_bits;
+  f.wide = f.key_bits > 16;
+  if (f.rows > kMostRows)
+    throw std::invalid_argument("surfels times views is " + std::to_string(f.rows) + ", at most " +
+                                std::to_string(kMostRows) + " are drawn in one call: draw fewer views at once");
+  if (f.capacity > kMostPairs || f.tiles > kMostPairs || v.count > 65535)
+    throw std::invalid_argument(
+        "too many views, pixels or pairs of surfel and tile for one call: draw fewer views at "
+        "once, or smaller ones");
+  return f;
+}
+}  // namespace
+
+void baked_bin(const BakedFrame& f, Stream stream) { f.wide ? bin<uint32_t>(f, stream) : bin<uint16_t>(f, stream); }
+
+size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals) {
+  BakedFrame f = frame_of(surfels, views, capacity);
+  return lay_out(f, nullptr, normals);
+}
+
+void baked_frame(const BakedSurfels& surfels, const BakedViews& views, const BakedImages& images, int stages,
+                 void* memory, size_t bytes, int64_t capacity, Stream stream) {
+  BakedFrame f = frame_of(surfels.geometry.n, views, capacity);
+  f.prefilter = surfels.prefilter;
+  const int64_t needed = lay_out(f, memory, images.normal != nullptr);
+  if (int64_t(bytes) < needed)
+    throw std::invalid_argument("the working memory has " + std::to_string(bytes) + " bytes, the frame needs " +
+                                std::to_string(needed));
+  if (f.rows) {
+    if (stages & kPrepare) baked_prepare(surfels, views, f, stream);
+    if (stages & kBin) baked_bin(f, stream);
+  }
+  if (stages & kDraw) baked_draw(surfels, images, f, stream);
+}
+
+}  // namespace bt::cuda

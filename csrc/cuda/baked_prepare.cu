@@ -1,0 +1,167 @@
+// First stage of the baked renderer: the surfels that a view sees, each as the row that the later stages read.
+//
+// A thread a surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters a surfel with
+// seven sites) are computed for the visible ones alone, by threads that stand next to each other: a block packs them.
+#include "core/view_color.h"
+#include "cuda/baked_stages.h"
+
+namespace bt::cuda {
+
+namespace {
+constexpr int kThreads = 128;
+constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
+
+__device__ Pinhole<float> pinhole(const float* viewmat, const float* K) {
+  Pinhole<float> c;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];
+    c.t[i] = viewmat[4 * i + 3];
+  }
+  c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
+  return c;
+}
+
+// Order of floats as order of unsigned integers.
+__device__ uint32_t depth_key(float z) {
+  uint32_t bits;
+  memcpy(&bits, &z, sizeof bits);
+  return bits >> 31 ? ~bits : bits | 0x80000000u;
+}
+
+// The paper's numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
+__device__ Vec3<float> view_color(const BakedSurfels& s, int64_t i, Vec3<float> d) {
+  const int K = s.terms;
+  switch (s.kind) {
+    case 0:
+      return K == 7 ? sv_color(7, s.a + 21 * i, s.b + 7 * i, s.c + 21 * i, d)
+                    : sv_color(K, s.a + 3 * K * i, s.b + K * i, s.c + 3 * K * i, d);
+    case 1:
+      return K == 16 ? sh_color(16, s.a + 3 * i, s.b + 45 * i, d) : sh_color(K, s.a + 3 * i, s.b + 3 * (K - 1) * i, d);
+    case 2:
+      return K == 2 ? sb_color(2, s.a + 3 * i, s.b + 12 * i, d) : sb_color(K, s.a + 3 * i, s.b + 6 * K * i, d);
+    default:
+      return K == 2 ? sg_color(2, s.a + 3 * i, s.b + 14 * i, d) : sg_color(K, s.a + 3 * i, s.b + 7 * K * i, d);
+  }
+}
+
+__device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> color, float* row) {
+  const int32_t* tile = s.tiles + 5 * i;
+  float scale = 0, place[4] = {0, 0, 0, 0};
+  uint64_t page = 0;
+  if (s.pages && tile[3] != 0) {
+    scale = 0.5f / (s.extent ? s.extent[i] : float(kSupport));
+    page = s.pages[tile[2]];
+    place[0] = float(tile[0]) + 0.5f, place[1] = float(tile[1]) + 0.5f;
+    place[2] = float(tile[3] - 1), place[3] = float(tile[4] - 1);
+  } else if (s.mean_residual) {
+    const Vec3<float> flat = load3(s.mean_residual + 3 * i);
+    if (flat.x != 0 || flat.y != 0 || flat.z != 0) {
+      scale = -1;
+      place[0] = relu(color.x + flat.x), place[1] = relu(color.y + flat.y), place[2] = relu(color.z + flat.z);
+    }
+  }
+  row[kTexelScale] = scale;
+  memcpy(row + kPage, &page, sizeof page);
+  for (int k = 0; k < 4; ++k) row[kTileX + k] = place[k];
+}
+
+template <bool kPrefilter>
+__global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, BakedViews v, BakedFrame f) {
+  __shared__ int seen_count;
+  __shared__ int seen_list[kThreads];
+  const int64_t block = int64_t(blockIdx.x) * kThreads, i = block + threadIdx.x;
+  const int view = blockIdx.y, lane = threadIdx.x % kWarp;
+  const int64_t first = f.n * view, at = first + i;  // rows of the view; of the surfel
+  if (threadIdx.x == 0) seen_count = 0;
+  __syncthreads();
+
+  float row[kGeom];
+  bool seen = false;
+  Footprint area;
+  area.top = 0, area.bottom = -1, area.reach.whole = false;
+  float z = 0;
+  if (i < f.n) {
+    const Surfels<float>& in = s.geometry;
+    float geom[kGeom], frame[kFrame];
+    const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
+    seen = project(camera, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
+                   in.beta_raw[i], s.near, kPrefilter, geom, frame);
+    if (seen) {
+      LevelSet<float> level;
+      if (kPrefilter && geom[kArea] > 0)
+        level = {filtered_reach(geom).visible, 0, -geom[kArea]};
+      else
+        level = level_set(geom);
+      for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
+      row[kR2] = level.r2, row[kBlur2] = level.blur2;
+      area = footprint<kPrefilter>(row, v.height);
+      const Reach<float>& e = area.reach;
+      const float x0 = e.ellipse ? min_(e.x0, -e.blur) - area.pad : -e.blur;
+      const float x1 = e.ellipse ? max_(e.x1, e.blur) + area.pad : e.blur;
+      seen = level.visible && area.top <= area.bottom && (e.whole || (area.cx + x1 >= 0 && area.cx + x0 <= v.width));
+      z = geom[kZ];
+    }
+    if (seen) {
+      float4* to = reinterpret_cast<float4*>(f.memory.rows + at * kRow);
+      for (int k = 0; k < 3; ++k) to[k] = make_float4(row[4 * k], row[4 * k + 1], row[4 * k + 2], row[4 * k + 3]);
+      f.memory.rows[at * kRow + kR2] = row[kR2], f.memory.rows[at * kRow + kBlur2] = row[kBlur2];
+      if (f.memory.normals) f.memory.normals[at] = make_float4(geom[kNx], geom[kNy], geom[kNz], 0);
+    }
+  }
+
+  // Tiles: a large surfel's rows are shared out among the warp.
+  int32_t count = 0;
+  const int tile_rows = seen ? area.bottom - area.top + 1 : 0;
+  const bool shared = tile_rows > kRowsAlone && !area.reach.whole;
+  if (seen && area.reach.whole) count = f.tiles_x * f.tiles_y;
+  if (seen && !shared && !area.reach.whole)
+    for (int ty = area.top; ty <= area.bottom; ++ty) {
+      const TileRow r = tile_row(area, ty, v.width);
+      count += r.right - r.left + 1;
+    }
+  __syncwarp();  // the rows are seen by the whole warp
+  for (unsigned rest = __ballot_sync(kFullMask, shared); rest; rest &= rest - 1) {
+    const int source = __ffs(int(rest)) - 1;
+    const Footprint big =
+        footprint<kPrefilter>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
+    int32_t sum = 0;
+    for (int ty = big.top + lane; ty <= big.bottom; ty += kWarp) {
+      const TileRow r = tile_row(big, ty, v.width);
+      sum += r.right - r.left + 1;
+    }
+    for (int by = kWarp / 2; by; by /= 2) sum += __shfl_xor_sync(kFullMask, sum, by);
+    if (lane == source) count = sum;
+  }
+  seen = seen && count > 0;
+  if (i < f.n) {
+    f.memory.depth[at] = seen ? depth_key(z) : kNeverSeen;
+    f.memory.unsorted[at] = int32_t(at);
+    f.memory.counts[at] = count;
+  }
+
+  if (seen) seen_list[atomicAdd(&seen_count, 1)] = threadIdx.x;
+  __syncthreads();
+  if (int(threadIdx.x) >= seen_count) return;
+  const int64_t j = block + seen_list[threadIdx.x];
+  const float* m = v.viewmats + 16 * view;
+  double center[3];  // -R^T t
+  for (int k = 0; k < 3; ++k) center[k] = -(double(m[k]) * m[3] + double(m[4 + k]) * m[7] + double(m[8 + k]) * m[11]);
+  const Vec3<float> d = view_direction(s.geometry.means + 3 * j, center).n;
+  Vec3<float> color = view_color(s, j, d);
+  color = {relu(color.x + 0.5f), relu(color.y + 0.5f), relu(color.z + 0.5f)};
+  float* to = f.memory.rows + (first + j) * kRow;
+  store3(to + kRed, color);
+  write_texture(s, j, color, to);
+}
+}  // namespace
+
+void baked_prepare(const BakedSurfels& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
+  if (!f.rows) return;
+  const dim3 grid(unsigned(ceil_div(f.n, kThreads)), unsigned(v.count));
+  if (f.prefilter)
+    BT_LAUNCH(prepare_kernel<true>, grid, dim3(kThreads), 0, stream, s, v, f);
+  else
+    BT_LAUNCH(prepare_kernel<false>, grid, dim3(kThreads), 0, stream, s, v, f);
+}
+
+}  // namespace bt::cuda

@@ -1,0 +1,233 @@
+// Third stage of the baked renderer: the images.
+//
+// A warp draws 8 x 8 pixels, two a thread (four rows apart), and works for itself: no barrier of the block, no waiting
+// for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names one of
+// its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread reads the
+// same row (a broadcast, four loads of 16 bytes) for both its pixels. The three planes cost three multiply-adds for the
+// second pixel. Nine tenths of these tests fail: a hit costs one reciprocal, one logarithm, one exponential and, where
+// the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by the texture unit; memory
+// traffic is 96 bytes a row and warp, mostly from L2.
+#include "core/fragment.h"
+#include "core/texel.h"
+#include "cuda/atlas_texture.h"
+#include "cuda/baked_stages.h"
+#include "cuda/fast.h"
+
+namespace bt::cuda {
+
+namespace {
+constexpr int kWarps = 4, kThreads = kWarps * kWarp;
+constexpr int kRowQuads = kRow / 4;  // float4s of a row
+constexpr int kLook = 8;             // rows between looks whether all pixels are done
+constexpr int kPixels = 2;           // a thread
+
+struct DrawArgs {
+  const float* rows;
+  const float4* normals;
+  const int32_t* pairs;
+  const int32_t* ranges;
+  int width, height, tiles_x, tiles_of_view;
+  float near, offset, scale, weight_bound, transmittance_min;
+  BakedImages images;
+};
+
+struct Pixel {
+  float transmittance;  // negative once the pixel takes no more light
+  float red, green, blue, beta, depth, nx, ny, nz;
+  int count;
+};
+
+// A surfel as all threads of a warp read it from shared memory.
+struct Row {
+  float g[kGeom];
+  float r2, blur2, red, green;
+  const float4* rest;  // blue, texture
+  uint32_t id;
+};
+
+// How a surfel covers a pixel: the kernel alone, united with the low pass, or seen through the pixel.
+enum class Cover { kKernel, kLowPass, kFiltered };
+
+template <bool kMaps, Cover kCover>
+__device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel& p) {
+  bool near_it = p.transmittance > 0;
+  if (kCover != Cover::kFiltered) {  // the planes alone say for most pixels that the surfel is not there
+    const float W = s.g[kW0] + s.g[kW1] * dx + s.g[kW2] * dy;
+    const float U = s.g[kU1] * dx + s.g[kU2] * dy, V = s.g[kV1] * dx + s.g[kV2] * dy;
+    bool inside = U * U + V * V < s.r2 * (W * W) && W > 0;
+    if (kCover == Cover::kLowPass) inside = inside || dx * dx + dy * dy < s.blur2;
+    near_it = near_it && inside;
+  }
+  if (!near_it) return;
+  float g[kGeom];
+  BT_UNROLL
+  for (int k = 0; k < kGeom; ++k) g[k] = s.g[k];
+  g[kArea] = kCover == Cover::kFiltered ? s.g[kArea] : 0.0f;  // known to the compiler
+  const Fragment<Fast> f = fragment<float, Fast, kCover == Cover::kLowPass>(g, a.near, Fast(dx), Fast(dy));
+  const float sigma = f.sigma.v;
+  if (!(sigma >= float(kAlphaMin))) return;
+  const float weight = sigma * p.transmittance, next = p.transmittance - weight;
+  if (next < a.transmittance_min) {  // the surfel that would do that is not blended
+    p.transmittance = -p.transmittance;
+    return;
+  }
+  p.transmittance = next;
+  const float4 c = s.rest[0];
+  float red = s.red, green = s.green, blue = c.x;
+  if (weight >= a.weight_bound && c.y != 0) {
+    const float4 t = s.rest[1];
+    if (c.y > 0) {
+      const float x = t.x + texel_position_scaled(f.u.v, t.z, c.y), y = t.y + texel_position_scaled(f.v.v, t.w, c.y);
+      uint64_t page;
+      const float handle[2] = {c.z, c.w};
+      memcpy(&page, handle, sizeof page);
+      const float4 texel = fetch_texel(page, x, y);
+      red = relu(red + a.offset + a.scale * texel.x);
+      green = relu(green + a.offset + a.scale * texel.y);
+      blue = relu(blue + a.offset + a.scale * texel.z);
+    } else {
+      red = t.x, green = t.y, blue = t.z;
+    }
+  }
+  p.red += weight * red, p.green += weight * green, p.blue += weight * blue;
+  if (kMaps) {
+    p.beta += weight * s.g[kBeta];
+    const float4 n = a.normals ? a.normals[s.id] : make_float4(0, 0, 0, 0);
+    p.depth += weight * f.depth.v;
+    p.nx += weight * n.x, p.ny += weight * n.y, p.nz += weight * n.z;
+    ++p.count;
+  }
+}
+
+__device__ uint32_t to_byte(float x) { return uint32_t(clamp_(x, 0.0f, 1.0f) * 255.0f + 0.5f); }
+
+template <bool kMaps>
+__device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
+  const BakedImages& to = a.images;
+  const float t = p.transmittance < 0 ? -p.transmittance : p.transmittance;
+  float red = p.red, green = p.green, blue = p.blue;
+  if (to.background) red += t * to.background[0], green += t * to.background[1], blue += t * to.background[2];
+  if (to.rgb) to.rgb[3 * at] = red, to.rgb[3 * at + 1] = green, to.rgb[3 * at + 2] = blue;
+  if (to.alpha) to.alpha[at] = 1 - t;
+  if (to.packed) to.packed[at] = to_byte(red) | to_byte(green) << 8 | to_byte(blue) << 16 | to_byte(1 - t) << 24;
+  if (kMaps) {
+    if (to.beta) to.beta[at] = p.beta;
+    if (to.depth) to.depth[at] = p.depth;
+    if (to.normal) to.normal[3 * at] = p.nx, to.normal[3 * at + 1] = p.ny, to.normal[3 * at + 2] = p.nz;
+    if (to.overdraw) to.overdraw[at] = p.count;
+  }
+}
+
+template <bool kMaps, bool kPrefilter>
+__global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_kernel(DrawArgs a) {
+  __shared__ float4 staged[kWarps][kWarp * kRowQuads];
+  __shared__ uint32_t queues[kWarps][2 * kWarp];
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const unsigned tile = blockIdx.x;
+  const int in_view = int(tile % unsigned(a.tiles_of_view));
+  const int x = in_view % a.tiles_x * kTileSide + (warp & 1) * 8 + (lane & 7);
+  const int y = in_view / a.tiles_x * kTileSide + (warp >> 1) * 8 + (lane >> 3);
+  float4* stage = staged[warp];
+  uint32_t* queue = queues[warp];
+  Pixel p[kPixels];
+  uint32_t part[kPixels];  // bit of the part of the tile that holds the thread's pixel
+  for (int j = 0; j < kPixels; ++j) {
+    p[j] = {x < a.width && y + kBandRows * j < a.height ? 1.0f : -1.0f, 0, 0, 0, 0, 0, 0, 0, 0, 0};
+    part[j] = 1u << (2 * ((warp >> 1) * kPixels + j) + (warp & 1));
+  }
+  uint32_t wanted = 0;  // parts that still take light
+  for (int j = 0; j < kPixels; ++j) wanted |= __any_sync(kFullMask, p[j].transmittance > 0) ? part[j] : 0;
+
+  int next = a.ranges ? a.ranges[2 * int64_t(tile)] : 0;
+  const int end = a.ranges ? a.ranges[2 * int64_t(tile) + 1] : 0;
+  int waiting = 0;  // in the queue
+  while (wanted) {
+    while (waiting < kWarp && next < end) {
+      const uint32_t pair = next + lane < end ? uint32_t(__ldg(a.pairs + next + lane)) : 0;
+      const unsigned votes = __ballot_sync(kFullMask, (pair & wanted) != 0);
+      if (pair & wanted) queue[waiting + __popc(votes & ((1u << lane) - 1))] = pair;
+      waiting += __popc(votes);
+      next += kWarp;
+    }
+    __syncwarp();
+    const int taken = min_(waiting, kWarp);
+    if (taken == 0) break;
+    // three loads in flight: six at once would not fit the registers
+    BT_UNROLL_BY(3)
+    for (int k = 0; k < kRowQuads; ++k) {
+      const int quad = k * kWarp + lane, r = quad / kRowQuads;
+      if (r < taken)
+        stage[quad] =
+            __ldg(reinterpret_cast<const float4*>(a.rows) + int64_t(queue[r] >> 8) * kRowQuads + quad % kRowQuads);
+    }
+    __syncwarp();
+    const float4* q = stage;
+    for (int k = 0; k < taken; ++k, q += kRowQuads) {
+      if (k % kLook == kLook - 1 && !__any_sync(kFullMask, p[0].transmittance > 0 || p[1].transmittance > 0)) break;
+      const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
+      const uint32_t pair = queue[k];
+      const float area = kPrefilter && q3.y < 0 ? -q3.y : 0.0f;
+      const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
+                     q3.x,
+                     q3.y,
+                     q3.z,
+                     q3.w,
+                     q + 4,
+                     pair >> 8};
+      const float dx = x + 0.5f - s.g[kCx], dy = y + 0.5f - s.g[kCy];
+      BT_UNROLL
+      for (int j = 0; j < kPixels; ++j) {
+        if (!(pair & part[j])) continue;
+        const float below = dy + kBandRows * j;
+        if (kPrefilter && s.blur2 < 0)
+          blend<kMaps, Cover::kFiltered>(a, s, dx, below, p[j]);
+        else if (s.blur2 > 0)
+          blend<kMaps, Cover::kLowPass>(a, s, dx, below, p[j]);
+        else
+          blend<kMaps, Cover::kKernel>(a, s, dx, below, p[j]);
+      }
+    }
+    wanted = 0;
+    for (int j = 0; j < kPixels; ++j) wanted |= __any_sync(kFullMask, p[j].transmittance > 0) ? part[j] : 0;
+    waiting -= taken;
+    const uint32_t moved = lane < waiting ? queue[kWarp + lane] : 0;
+    __syncwarp();
+    if (lane < waiting) queue[lane] = moved;
+  }
+  const int64_t view = tile / unsigned(a.tiles_of_view);
+  for (int j = 0; j < kPixels; ++j) {
+    const int row = y + kBandRows * j;
+    if (x < a.width && row < a.height) write<kMaps>(a, p[j], (view * a.height + row) * a.width + x);
+  }
+}
+}  // namespace
+
+void baked_draw(const BakedSurfels& s, const BakedImages& images, const BakedFrame& f, Stream stream) {
+  if (!f.tiles) return;
+  const DrawArgs a = {f.memory.rows,
+                      f.memory.normals,
+                      f.memory.values_sorted,
+                      f.rows ? f.memory.ranges : nullptr,
+                      f.width,
+                      f.height,
+                      f.tiles_x,
+                      f.tiles_x * f.tiles_y,
+                      s.near,
+                      s.offset,
+                      s.scale,
+                      s.weight_bound,
+                      s.transmittance_min,
+                      images};
+  const dim3 grid(static_cast<unsigned>(f.tiles));
+  const bool maps = images.beta || images.depth || images.normal || images.overdraw;
+  if (maps && f.prefilter)
+    BT_LAUNCH((draw_kernel<true, true>), grid, dim3(kThreads), 0, stream, a);
+  else if (maps)
+    BT_LAUNCH((draw_kernel<true, false>), grid, dim3(kThreads), 0, stream, a);
+  else if (f.prefilter)
+    BT_LAUNCH((draw_kernel<false, true>), grid, dim3(kThreads), 0, stream, a);
+  else
+    BT_LAUNCH((draw_kernel<false, false>), grid, dim3(kThreads), 0, stream, a);
+}
+
+}  // namespace bt::cuda

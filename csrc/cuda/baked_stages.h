@@ -1,0 +1,143 @@
+// What the stages of the baked renderer share: working memory, a surfel's row, and the tiles it touches.
+#pragma once
+
+#include "core/reach.h"
+#include "cuda/baked.h"
+
+namespace bt::cuda {
+
+constexpr int kTileSide = 16, kBands = 4, kBandRows = kTileSide / kBands;
+constexpr uint32_t kNeverSeen = 0xffffffffu;  // depth key of a surfel that is not visible
+
+// A surfel's row: the first twelve columns are those of GeomColumn. 24 floats are three sectors of 32 bytes.
+enum RowColumn {
+  kR2 = kBeta + 1,         // level set u^2 + v^2 <= r2
+  kBlur2,                  // and d^2 <= blur2; 0: the low pass does not show; with the prefilter -kArea
+  kRed,                    // relu(view colour + 0.5), three
+  kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
+  kPage,                   // handle of the texture, 64 bits
+  kTileX = kPage + 2,      // centre of the tile's first texel, two; or three: the colour with the constant residual
+  kSpanX = kTileX + 2,     // texels of the tile less one, two
+  kRow = kSpanX + 2
+};
+static_assert(kRow == 24 && kR2 == 12);
+
+struct BakedMemory {
+  int64_t* total;                                       // [1] pairs of surfel and tile
+  float* rows;                                          // [rows, kRow]
+  float4* normals;                                      // [rows], null: not wanted
+  uint32_t *depth, *depth_sorted;                       // [rows]
+  int32_t *unsorted, *order, *counts, *ordered_counts;  // [rows] row numbers, the same by depth; tiles of a row
+  int64_t* offsets;                                     // [rows]
+  void *keys, *keys_sorted;                             // [capacity] tile of a pair, uint16 or uint32
+  int32_t *values, *values_sorted;                      // [capacity] row << 8 | mask
+  int32_t* ranges;                                      // [tiles, 2]
+  void* scratch;                                        // of the sorts and the sum
+  int64_t scratch_bytes;
+};
+
+struct BakedFrame {
+  int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs
+  int width, height, tiles_x, tiles_y;
+  int64_t tiles;   // of all views
+  int key_bits;    // tile numbers and the key of unused room
+  bool wide;       // keys of 32 bits
+  bool prefilter;  // some rows are of discs seen through a pixel
+  BakedMemory memory;
+};
+
+void baked_prepare(const BakedSurfels& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
+void baked_bin(const BakedFrame& frame, Stream stream);
+void baked_draw(const BakedSurfels& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
+
+// The pixels that a surfel can touch, by tile.
+struct Footprint {
+  Reach<float> reach;
+  float cx, cy, pad;
+  int top, bottom;  // rows of tiles, none when top > bottom
+};
+BT_HD int pixel_from(float x, int most) {  // first pixel centre right of x, 0 to most
+  const float i = ceilf(x - 0.5f);
+  return i > 0 ? (i < most ? int(i) : most) : 0;
+}
+BT_HD int pixel_to(float x, int most) {  // last pixel centre left of x, -1 to most - 1
+  const float i = floorf(x - 0.5f);
+  return i < most - 1 ? (i >= 0 ? int(i) : -1) : most - 1;
+}
+// A row's columns of geom; those that a row lacks are 0.
+BT_HD void geom_of(const float* row, float* geom) {
+  for (int k = 0; k < kGeom; ++k) geom[k] = k <= kBeta ? row[k] : 0.0f;
+  geom[kArea] = row[kBlur2] < 0 ? -row[kBlur2] : 0.0f;
+}
+template <bool kPrefilter>
+BT_HD Footprint footprint(const float* row, int height) {
+  Footprint f;
+  if (kPrefilter && row[kBlur2] < 0) {
+    float geom[kGeom];
+    geom_of(row, geom);
+    f.reach = filtered_reach<float>(geom).reach;
+  } else {
+    f.reach = reach(row, row[kR2], row[kBlur2]);
+  }
+  f.cx = row[kCx], f.cy = row[kCy];
+  const float far = (f.cx < 0 ? -f.cx : f.cx) + (f.cy < 0 ? -f.cy : f.cy);
+  f.pad = 0.01f + 1e-6f * far;
+  const Reach<float>& e = f.reach;
+  float y0 = 1, y1 = -1;
+  if (e.ellipse) y0 = e.y0 - f.pad, y1 = e.y1 + f.pad;
+  if (e.blur > 0) y0 = e.ellipse ? min_(y0, -e.blur) : -e.blur, y1 = e.ellipse ? max_(y1, e.blur) : e.blur;
+  const int first = e.whole ? 0 : pixel_from(f.cy + y0, height),
+            last = e.whole ? height - 1 : pixel_to(f.cy + y1, height);
+  f.top = first / kTileSide, f.bottom = last / kTileSide;
+  if (first > last) f.top = 0, f.bottom = -1;
+  return f;
+}
+
+// A row of tiles: the pixels that can be touched in each of its bands of four rows, and the tiles of these.
+struct TileRow {
+  int from[kBands], to[kBands];  // pixels, none when from > to
+  int left, right;               // tiles, none when left > right
+};
+BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
+  TileRow r;
+  const Reach<float>& e = f.reach;
+  int from = width, to = -1;
+  float upper0 = 1e30f, upper1 = -1e30f;  // crossings with the line above a band; below it those of the next
+  if (e.ellipse && !e.whole) widen_by_crossing(e, ty * kTileSide - f.cy, upper0, upper1);
+  for (int band = 0; band < kBands; ++band) {
+    const float lo = ty * kTileSide + band * kBandRows - f.cy, hi = lo + kBandRows;
+    float x0 = 1e30f, x1 = -1e30f;
+    if (e.whole) {
+      x0 = -1e30f, x1 = 1e30f;
+    } else if (e.ellipse) {
+      float lower0 = 1e30f, lower1 = -1e30f;
+      widen_by_crossing(e, hi, lower0, lower1);
+      x0 = min_(upper0, lower0), x1 = max_(upper1, lower1);
+      upper0 = lower0, upper1 = lower1;
+      // the outermost points count when they lie in the band, generously
+      const float slack = f.pad + 1e-3f * (e.y1 - e.y0);
+      if (e.y_left >= lo - slack && e.y_left <= hi + slack) x0 = min_(x0, e.x0), x1 = max_(x1, e.x0);
+      if (e.y_right >= lo - slack && e.y_right <= hi + slack) x0 = min_(x0, e.x1), x1 = max_(x1, e.x1);
+      x0 -= f.pad, x1 += f.pad;
+    }
+    if (!e.whole && e.blur > 0 && hi >= -e.blur && lo <= e.blur) x0 = min_(x0, -e.blur), x1 = max_(x1, e.blur);
+    r.from[band] = x0 > x1 ? width : pixel_from(f.cx + x0, width);
+    r.to[band] = x0 > x1 ? -1 : pixel_to(f.cx + x1, width);
+    if (r.from[band] <= r.to[band]) from = min_(from, r.from[band]), to = max_(to, r.to[band]);
+  }
+  r.left = from / kTileSide, r.right = to / kTileSide;
+  if (from > to) r.left = 0, r.right = -1;
+  return r;
+}
+// Bit 2 band + half is set when the surfel reaches these 8 x 4 pixels of tile tx.
+BT_HD uint32_t part_mask(const TileRow& r, int tx) {
+  uint32_t mask = 0;
+  const int x = tx * kTileSide, half = kTileSide / 2;
+  for (int band = 0; band < kBands; ++band) {
+    mask |= uint32_t(r.from[band] < x + half && r.to[band] >= x) << (2 * band);
+    mask |= uint32_t(r.from[band] < x + 2 * half && r.to[band] >= x + half) << (2 * band + 1);
+  }
+  return mask;
+}
+
+}  // namespace bt::cuda

@@ -1,0 +1,302 @@
+"""The baked renderer by the CUDA kernels against the CPU's.
+
+Colours of textured fragments differ by the texture unit's weights, which have 8 bits of fraction (the host's stand-in
+rounds them alike): 1.2e-3 was the largest difference seen.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake import bake, export, read_bundle
+from bitymi_ns.bake.pipeline import BakeOptions
+from bitymi_ns.ops.backend import emulated_cuda, module
+from bitymi_ns.ops.baked import Stage
+from bitymi_ns.scene import Camera
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked_renderer import BakedRenderer
+from tests.bake.conftest import make_surfels
+from tests.bake.test_real_scene import real_scene
+from tests.ops.golden import SceneCase, extreme_scenes, load_golden, random_scene
+
+FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
+STEP = 1 / 255
+EXTREME = extreme_scenes()
+
+
+def camera_of(case: SceneCase) -> Camera:
+    return Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
+
+
+def scene_of(case: SceneCase, **kwargs) -> BakedScene:
+    params = {name: value.float() for name, value in case.params.items()}
+    return BakedScene(params, "sv", torch.zeros(len(params["means"]), 5, dtype=torch.int32), None, **kwargs)
+
+
+def textured(count: int, seed: int, dtype: torch.dtype = torch.uint8, kind: str = "sv") -> BakedScene:
+    """Surfels about the origin, two thirds with a tile of random texels, on two pages, with random extents."""
+    g = torch.Generator().manual_seed(seed)
+    atlas = torch.rand(2, 16, 16 * count, 4, generator=g)
+    atlas = (atlas * 255).to(torch.uint8) if dtype == torch.uint8 else atlas
+    i = torch.arange(count)
+    sizes = 4 << torch.randint(0, 3, (count, 2), generator=g)
+    tiles = torch.stack([16 * i, 0 * i, i % 2, *sizes.unbind(1)], dim=1)
+    tiles[::3] = 0
+    return BakedScene(
+        make_surfels(count, kind, seed),
+        kind,
+        tiles.int(),
+        atlas,
+        offset=-0.4,
+        scale=0.9,
+        extent=1.5 + 2 * torch.rand(count, generator=g),
+        mean_residual=0.5 * torch.randn(count, 3, generator=g) * (i % 2 == 0)[:, None],
+        weight_bound=0.02,
+    )
+
+
+def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = distance
+    return Camera(viewmat, torch.tensor([[60.0, 0, width / 2], [0, 55.0, height / 2], [0, 0, 1]]), width, height)
+
+
+def check(scene: BakedScene, camera: Camera, device: torch.device, cpu, background: Tensor | None = None) -> float:
+    """Holds a view of the scene on the device against the CPU's; the largest difference of colours."""
+    got = scene.to(device).render(camera, None if background is None else background.to(device), maps=True)
+    with cpu():
+        want = scene.render(camera, background, maps=True)
+    for name in FIELDS:
+        a, b = getattr(got, name).cpu(), getattr(want, name)
+        assert a.shape == b.shape and a.dtype == b.dtype and a.isfinite().all(), name
+        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else 1e-4 * max(1.0, float(b.abs().max()))
+        assert ((a - b).abs() <= step).double().mean() >= 0.999, name
+    return float((got.rgb.cpu() - want.rgb).abs().max())
+
+
+def test_golden_textured_scene(device: torch.device, cpu) -> None:
+    golden = load_golden("textured")
+    atlas, tiles, x = torch.zeros(1, 64, 1024, 4), [], 0
+    for tile in golden.tiles:
+        rows, columns = tile.shape[:2]
+        atlas[0, :rows, x : x + columns, :3] = tile.float()
+        tiles.append((x, 0, 0, columns, rows))
+        x += columns
+    params = {name: value.float() for name, value in golden.params.items()}
+    scene = BakedScene(params, "sv", torch.tensor(tiles, dtype=torch.int32), atlas)
+    check(scene, camera_of(golden), device, cpu, golden.background.float())
+    got = scene.to(device).render(camera_of(golden), golden.background.float().to(device), maps=True)
+    assert (got.rgb.cpu().double() - golden.outputs["rgb"]).abs().max() < STEP
+    assert torch.equal(got.overdraw[..., 0].cpu().double(), golden.outputs["overdraw"].double())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_scenes(seed: int, device: torch.device, cpu) -> None:
+    case = random_scene(120, seed, width=61, height=45)
+    assert check(scene_of(case), camera_of(case), device, cpu, case.background.float()) < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, device: torch.device, cpu) -> None:
+    """The bounds in single precision (core/reach.h) against the CPU's in double: the same fragments, to the pixel."""
+    case = random_scene(150, 100 + seed, width=72, height=56)
+    g = torch.Generator().manual_seed(seed)
+    case.params["log_scales"] += 2.0 * torch.randn(150, 2, generator=g, dtype=torch.float64)
+    case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
+    scene, camera = scene_of(case), camera_of(case)
+    got = scene.to(device).render(camera, maps=True).overdraw.cpu()
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
+
+
+@pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
+def test_numbers_that_misbehave(case: SceneCase, device: torch.device, cpu) -> None:
+    if case.width * case.height > 4096:
+        case.width, case.height = min(case.width, 600), min(case.height, 600)  # see test_sizes for the long ones
+    check(scene_of(case), camera_of(case), device, cpu, case.background.float())
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
+def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: torch.device, cpu) -> None:
+    assert check(textured(60, 0, dtype), front(), device, cpu, torch.tensor([0.2, 0.4, 0.6])) < 3e-3
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+def test_view_colours(kind: str, device: torch.device, cpu) -> None:
+    check(textured(40, 1, kind=kind), front(), device, cpu)
+
+
+@pytest.mark.parametrize(
+    "kind, trim",
+    [("sv", {"sv_sites": 3, "sv_log_tau": 3, "sv_rgb": 3}), ("sh", {"sh_rest": 3}), ("sh", {"sh_rest": 0})],
+)
+def test_other_numbers_of_sites_and_coefficients(kind: str, trim: dict[str, int], device: torch.device, cpu) -> None:
+    scene = textured(20, 2, kind=kind)
+    scene.surfels = {name: v[:, : trim[name]] if name in trim else v for name, v in scene.surfels.items()}
+    with cpu():
+        plain = {name: value.contiguous() for name, value in scene.surfels.items()}
+    scene.surfels = plain
+    check(scene, front(32, 32), device, cpu)
+
+
+@pytest.mark.parametrize("format", ["bc7", "uint8", "fp16"])
+def test_bundles(format: str, device: torch.device, cpu, tmp_path) -> None:
+    with cpu():
+        made = real_scene(make_surfels, count=60)
+        export(bake(made, options=BakeOptions(format=format)), tmp_path / "b")
+        bundle = read_bundle(tmp_path / "b")
+        undecoded = read_bundle(tmp_path / "b", decode=False)
+    assert check(BakedScene.from_bundle(bundle), front(48, 40), device, cpu) < 3e-3
+    if format != "bc7":
+        assert bundle.blocks is None and torch.equal(undecoded.atlas, bundle.atlas)
+        return
+    assert undecoded.atlas is None and torch.equal(undecoded.blocks, bundle.blocks)
+    layers, height, width = bundle.atlas.shape[:3]
+    assert bundle.blocks.shape == (layers, height // 4, width // 4, 16)
+    scene = BakedScene.from_bundle(undecoded)
+    with cpu(), pytest.raises(ValueError, match="decode=True"):
+        scene.render(front(8, 8))
+    if device.type == "cuda":  # decoded by the texture unit
+        check(scene, front(48, 40), device, cpu)
+
+
+def test_the_order_of_threads_changes_nothing(device: torch.device) -> None:
+    if device.type == "cuda":
+        pytest.skip("the emulation sets the order")
+    scene, camera = textured(50, 3), front(40, 40)
+    images = []
+    for seed in range(5):
+        with emulated_cuda(seed):
+            images.append(scene.render(camera, maps=True))
+    for other in images[1:]:
+        for name in FIELDS:
+            assert torch.equal(getattr(other, name), getattr(images[0], name)), name
+
+
+def test_views_drawn_together(device: torch.device) -> None:
+    scene = textured(50, 4).to(device)
+    cameras = [front(50, 30, distance) for distance in (3.0, 4.0, 60.0)]
+    background = torch.tensor([0.1, 0.2, 0.3], device=device)
+    together = scene.render_views(cameras, background, FIELDS)
+    for i, camera in enumerate(cameras):
+        alone = scene.render(camera, background, maps=True)
+        for name in FIELDS:
+            assert torch.equal(together[name][i], getattr(alone, name)), name
+
+
+def test_packed_image(device: torch.device) -> None:
+    images = textured(50, 5).to(device).render_views([front()], None, ("rgb", "alpha", "packed"))
+    want = torch.cat([images["rgb"], images["alpha"]], dim=-1).clamp(0, 1).mul(255).add(0.5).to(torch.uint8)
+    assert torch.equal(images["packed"].view(torch.uint8), want)
+
+
+def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu) -> None:
+    case = random_scene(12, 0, width=70, height=60)
+    case.params["log_scales"] += 3.0  # every surfel on nearly every tile
+    case.params["opacity_logits"] -= 3.0
+    scene, camera = scene_of(case).to(device), camera_of(case)
+    renderer = BakedRenderer(scene, camera.width, camera.height, images=("rgb",))
+    small = renderer.workspace.capacity
+    renderer.draw([camera], check=False)
+    assert not renderer.complete() and renderer.workspace.pairs > small
+    rgb = renderer.draw([camera])["rgb"].clone()
+    assert renderer.complete() and renderer.workspace.capacity > renderer.workspace.pairs
+    again = renderer.draw([camera])["rgb"]
+    assert torch.equal(rgb, again) and again.data_ptr() == renderer.images["rgb"].data_ptr()
+    with cpu():
+        want = scene_of(case).render(camera).rgb
+    assert (rgb[0].cpu() - want).abs().max() < 1e-4
+    torch.testing.assert_close(scene.render(camera).rgb, rgb[0], atol=0, rtol=0)
+
+
+def test_stages_one_by_one(device: torch.device) -> None:
+    scene = textured(50, 6).to(device)
+    renderer = BakedRenderer(scene, 40, 30, images=("rgb", "normal"))
+    whole = {name: image.clone() for name, image in renderer.draw([front(40, 30)]).items()}
+    for image in renderer.images.values():
+        image.zero_()
+    for stage in (Stage.PREPARE, Stage.BIN, Stage.DRAW):
+        renderer.run(stage)
+    for name, image in renderer.images.items():
+        assert torch.equal(image, whole[name]), name
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_recorded_graph(views: int, device: torch.device) -> None:
+    if device.type != "cuda":
+        with pytest.raises(ValueError, match="card"):
+            BakedRenderer(textured(4, 0), 8, 8, graph=True)
+        return
+    scene = textured(50, 7).to(device)
+    renderer = BakedRenderer(scene, 40, 30, views, graph=True)
+    for distance in (3.0, 5.0):
+        cameras = [front(40, 30, distance + i) for i in range(views)]
+        assert torch.equal(renderer.draw(cameras)["rgb"], scene.render_views(cameras)["rgb"])
+
+
+@pytest.mark.parametrize("width, height", [(1, 1), (17, 3), (3, 33), (8200, 2), (2, 8200)])
+def test_sizes(width: int, height: int, device: torch.device, cpu) -> None:
+    case = random_scene(40, 8, width, height)
+    case.K[0, 0] = case.K[1, 1] = float(max(width, height))  # no grazing rays, at which float32 means little
+    check(scene_of(case), camera_of(case), device, cpu)
+
+
+def test_many_tiles_need_wide_keys(device: torch.device) -> None:
+    """Above 65,535 tiles keys have 32 bits; the tiles that a narrower image has as well must get the same lists."""
+    case = random_scene(30, 9, 1_000, 20)
+    scene, ranges = scene_of(case).to(device), []
+    for width in (1_000, 600_000):
+        renderer = BakedRenderer(scene, width, 20)
+        renderer._fit(2_000)
+        renderer._viewmats.copy_(case.viewmat)
+        renderer._Ks.copy_(case.K)
+        renderer.run(Stage.PREPARE)
+        renderer.run(Stage.BIN)
+        assert 100 < renderer.workspace.pairs <= renderer.workspace.capacity
+        across = -(-width // 16)
+        all_ranges = renderer.workspace.memory[256 : 256 + 8 * 2 * across].view(torch.int32).view(2, across, 2)
+        ranges.append(all_ranges.diff(dim=-1)[..., 0].cpu())
+        assert ranges[-1].sum() == renderer.workspace.pairs and (ranges[-1] >= 0).all()
+    narrow = ranges[0].shape[1] - 1  # the last tile is cut by the narrow image
+    assert torch.equal(ranges[0][:, :narrow], ranges[1][:, :narrow])
+
+
+def test_nothing_to_see(device: torch.device) -> None:
+    background = torch.tensor([0.2, 0.4, 0.6], device=device)
+    empty = BakedScene(make_surfels(0), "sv", torch.zeros(0, 5, dtype=torch.int32), None).to(device)
+    behind = textured(30, 0).to(device)
+    for scene, camera in ((empty, front(20, 20)), (behind, front(20, 20, -50.0))):
+        output = scene.render(camera, background, maps=True)
+        assert torch.equal(output.rgb, background.expand_as(output.rgb)) and not output.overdraw.any()
+
+
+def test_errors(device: torch.device, cpu) -> None:
+    scene = textured(4, 0).to(device)
+    double = BakedScene({name: v.double() for name, v in scene.surfels.items()}, "sv", scene.tiles, None)
+    with pytest.raises(TypeError, match="float32 surfels, but means is torch.float64"):
+        double.render(front(8, 8))
+    with pytest.raises(ValueError, match="one size"):
+        scene.render_views([front(8, 8), front(8, 9)])
+    with pytest.raises(ValueError, match="one size"):
+        scene.render_views([])
+    skewed = front(8, 8)
+    skewed.K[0, 1] = 1.0
+    with pytest.raises(ValueError, match="skew"):
+        scene.render(skewed)
+    with pytest.raises(ValueError, match="no image 'colour'"):
+        scene.render_views([front(8, 8)], None, ("colour",))
+    with pytest.raises(ValueError, match="draws .1, 8, 8."):
+        BakedRenderer(scene, 8, 8).draw([front(8, 9)])
+    with pytest.raises(ValueError, match="16777217, at most 16777216"):
+        module(device).baked_memory(2**24 + 1, 1, 8, 8, 1, False)
+    with pytest.raises(ValueError, match="a frame can have"):
+        BakedRenderer(scene, 8, 8)._fit(2**40)
+    if device.type == "cpu":
+        with cpu():
+            with pytest.raises(RuntimeError, match="move the scene"):
+                scene.render_views([front(8, 8)])
+            with pytest.raises(RuntimeError, match="on the CPU"):
+                BakedRenderer(scene, 8, 8)

@@ -86,6 +86,7 @@ def main() -> int:
     parser.add_argument(
         "--sizes", nargs="+", default=["1297x840", "1920x1080"], metavar="WxH", help="image sizes (%(default)s)"
     )
+    parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")
     parser.add_argument("--warm-up", type=int, default=10)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--sections", nargs="+", help="those alone, by name")
@@ -98,12 +99,13 @@ def main() -> int:
         if not torch.cuda.is_available():
             parser.error("no CUDA device is to be seen (or torch is a CPU build); --emulated tries the script without")
         build()
+    import gpu_baked
     import gpu_training
     from gpu_common import Options, Section, copy_bandwidth, missing
 
     from bitymi_ns.ops.backend import emulated_cuda
 
-    sections: tuple[Section, ...] = (*gpu_training.SECTIONS,)
+    sections: tuple[Section, ...] = (*gpu_baked.SECTIONS, *gpu_training.SECTIONS)
     names = [section.name for section in sections]
     if unknown := set(arguments.sections or ()) - set(names):
         parser.error(f"no section {', '.join(sorted(unknown))}: there are {', '.join(names)}")
@@ -121,7 +123,7 @@ def main() -> int:
         bandwidth = copy_bandwidth(device)
         notes.append(f"Copy within the device: {number(bandwidth / 1e9, 0)} GB/s, read and written bytes counted.")
         notes.append(f"Times: median of {runs} runs after {warm_up}, between CUDA events, launches included.")
-        options = Options(device, surfels, sizes, warm_up, runs, bandwidth)
+        options = Options(device, surfels, sizes, warm_up, runs, bandwidth, arguments.bundles)
         parts = []
         for section in sections:
             if arguments.sections and section.name not in arguments.sections:

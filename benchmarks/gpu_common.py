@@ -7,6 +7,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -31,6 +32,7 @@ class Options:
         sizes: image sizes, width and height.
         warm_up, runs: of every timing.
         copy_bytes: measured bytes a second of a device-to-device copy, read and written bytes counted.
+        bundles: folders of real scenes for the baked renderer.
     """
 
     device: torch.device
@@ -39,6 +41,7 @@ class Options:
     warm_up: int
     runs: int
     copy_bytes: float
+    bundles: Sequence[Path] = ()
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ struct FilteredPlace {
 template <class S, class T>
 BT_HD FilteredPlace<T> filtered_place(const S* g, T dx, T dy) {
   FilteredPlace<T> f;
-  const T zero = T(S(0)), one = T(S(1)), reach = T(S(kSupport)), w0 = T(g[kW0]), n = T(g[kArea]);
+  const T zero = T(S(0)), reach = T(S(kSupport)), w0 = T(g[kW0]), n = T(g[kArea]);
   const S c = filter_variance(g[kBeta]), spread = filter_spread(g);
   const T tilt = T(g[kW1]) * dx + T(g[kW2]) * dy;  // W - w0
   f.U = T(g[kU1]) * dx + T(g[kU2]) * dy, f.V = T(g[kV1]) * dx + T(g[kV2]) * dy;

@@ -6,6 +6,8 @@ rounds them alike): 1.2e-3 was the largest difference seen.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -98,25 +100,25 @@ def test_random_scenes(seed: int, device: torch.device, cpu) -> None:
     assert check(scene_of(case), camera_of(case), device, cpu, case.background.float()) < 1e-4
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, device: torch.device, cpu) -> None:
+@pytest.mark.parametrize("seed, prefilter", [*((i, "low_pass") for i in range(6)), (0, "pixel"), (1, "pixel")])
+def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: str, device: torch.device, cpu) -> None:
     """The bounds in single precision (core/reach.h) against the CPU's in double: the same fragments, to the pixel."""
     case = random_scene(150, 100 + seed, width=72, height=56)
     g = torch.Generator().manual_seed(seed)
     case.params["log_scales"] += 2.0 * torch.randn(150, 2, generator=g, dtype=torch.float64)
     case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
-    scene, camera = scene_of(case), camera_of(case)
+    scene, camera = scene_of(case, prefilter=prefilter), camera_of(case)
     got = scene.to(device).render(camera, maps=True).overdraw.cpu()
     with cpu():
         want = scene.render(camera, maps=True).overdraw
     assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
 
 
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
-def test_numbers_that_misbehave(case: SceneCase, device: torch.device, cpu) -> None:
-    if case.width * case.height > 4096:
-        case.width, case.height = min(case.width, 600), min(case.height, 600)  # see test_sizes for the long ones
-    check(scene_of(case), camera_of(case), device, cpu, case.background.float())
+def test_numbers_that_misbehave(case: SceneCase, prefilter: str, device: torch.device, cpu) -> None:
+    case = replace(case, width=min(case.width, 600), height=min(case.height, 600))  # test_sizes has the long ones
+    check(scene_of(case, prefilter=prefilter), camera_of(case), device, cpu, case.background.float())
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])

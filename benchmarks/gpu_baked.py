@@ -1,0 +1,204 @@
+"""Section of gpu.py: frames of the baked renderer, stage by stage, beside gsplat's.
+
+The scene of `gpu_common.trained_like` with BC7 tiles of random texels, as large as the surfels are on screen, and the
+weight bound of the presets; or bundles (--bundles), seen from three places around their middle. What a stage cannot do
+without, with n surfels of which v are visible, b pairs of surfel and tile, f fragments, p pixels, K sites:
+
+  prepare   56 n + (28 K + 132) v bytes: parameters, then rows of 96 bytes
+  bin       88 n + 96 v + 34 b bytes: a sort of n by 32 bits, one of b by 16 bits
+  draw      100 b + 12 p bytes; 60 f operations: planes 12, kernel 12, blending 12, texel and colour 24. The bytes are
+            read from the second-level cache, which the rows fit in; each of a tile's four warps reads its own.
+
+Times with --runs frames, the median; "frame" is the three stages launched by the host, "graph" the same as a CUDA graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from common import number, say, table
+from gpu_common import Options, Section, milliseconds, trained_like
+
+from bitymi_ns.bake import read_bundle
+from bitymi_ns.bake.packing import pack
+from bitymi_ns.ops.baked import Stage
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked_renderer import BakedRenderer
+from bitymi_ns.scene.camera import Camera
+
+SITES = 7
+TIMES_GSPLAT = (1, 3, 10)
+"""gsplat's numbers of Gaussians over ours: equal, and what equal quality takes at least and at most."""
+HEADER = (
+    "scene",
+    "size",
+    "million pairs",
+    "fragments/pixel",
+    "prepare ms",
+    "bin ms",
+    "draw ms",
+    "frame ms",
+    "graph ms",
+    "packed, graph ms",
+    "frames/s",
+    "G fragments/s",
+    "draw: of fp32",
+    "draw: of copy",
+)
+
+
+def frames(options: Options) -> str:
+    """Every scene at every size, then gsplat at the same sizes."""
+    rate = fp32_rate(options)
+    rows, graphs = [], {}
+    for width, height in options.sizes:
+        for n in options.surfels:
+            scene, camera = textured(n, width, height, options.device)
+            row, graphs[n, width, height] = _row(f"{n:,}", scene, [camera], options, rate)
+            rows.append(row)
+        for folder in options.bundles:
+            bundle = read_bundle(folder, decode=options.device.type != "cuda")
+            scene = BakedScene.from_bundle(bundle).to(options.device)
+            rows.append(
+                _row(f"{Path(folder).name}, {len(bundle):,}", scene, _around(bundle, width, height), options, rate)[0]
+            )
+    text = f"### Baked renderer\n\nfp32, measured by a product of matrices: {number(rate / 1e12, 1)} TFLOP/s.\n\n"
+    return text + table(HEADER, rows) + _gsplat(options, graphs)
+
+
+def textured(n: int, width: int, height: int, device: torch.device) -> tuple[BakedScene, Camera]:
+    """A trained-like scene with an atlas."""
+    scene, camera = trained_like(n, width, height, torch.device("cpu"), texture=False)
+    surfels = {name: value.detach().contiguous() for name, value in scene.surfels.items()}
+    pixels = 6 * surfels["log_scales"].exp() * camera.K[0, 0] / surfels["means"][:, 2:]
+    packing = pack(torch.exp2(torch.log2(pixels).ceil()).clamp(4, 64).long().numpy())
+    g = torch.Generator().manual_seed(1)
+    atlas = blocks = None
+    if device.type == "cuda":
+        blocks = torch.randint(
+            0, 256, (packing.layers, packing.height // 4, packing.width // 4, 16), dtype=torch.uint8, generator=g
+        )
+        blocks[..., 0] = 0x40  # mode 6: any other bits are a valid block
+    else:
+        shape = (packing.layers, packing.height, packing.width, 4)
+        atlas = torch.randint(0, 256, shape, dtype=torch.uint8, generator=g)
+    baked = BakedScene(
+        surfels,
+        "sv",
+        torch.from_numpy(packing.tiles).contiguous(),
+        atlas,
+        offset=-0.2,
+        scale=0.4,
+        weight_bound=scene.config.weight_bound,
+        blocks=blocks,
+    )
+    return baked.to(device), camera
+
+
+def fp32_rate(options: Options) -> float:
+    """Single-precision operations a second of a product of matrices."""
+    side = 8192 if options.device.type == "cuda" else 256
+    a = torch.rand(side, side, device=options.device)
+    before, torch.backends.cuda.matmul.allow_tf32 = torch.backends.cuda.matmul.allow_tf32, False
+    few = Options(options.device, (), (), 2, 5, options.copy_bytes)
+    ms = milliseconds(lambda: a @ a, few)
+    torch.backends.cuda.matmul.allow_tf32 = before
+    return 2 * side**3 / (1e-3 * ms)
+
+
+def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:
+    """A line of the table, means over the cameras; and the milliseconds of the recorded frame."""
+    width, height = cameras[0].width, cameras[0].height
+    card = options.device.type == "cuda"
+    sums = dict.fromkeys(("pairs", "fragments", "prepare", "bin", "draw", "frame", "graph", "packed"), 0.0)
+    for camera in cameras:
+        sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
+        frame = BakedRenderer(scene, width, height)
+        recorded = BakedRenderer(scene, width, height, graph=card)
+        packed = BakedRenderer(scene, width, height, images=("packed",), graph=card)
+        for renderer in (frame, recorded, packed):
+            renderer.draw([camera])
+        sums["pairs"] += frame.workspace.pairs
+        cases: list[tuple[str, Callable[[], object]]] = [
+            ("prepare", lambda frame=frame: frame.run(Stage.PREPARE)),
+            ("bin", lambda frame=frame: frame.run(Stage.BIN)),
+            ("draw", lambda frame=frame: frame.run(Stage.DRAW)),
+            ("frame", frame.run),
+            ("graph", recorded.run),
+            ("packed", packed.run),
+        ]
+        for stage, run in cases:
+            sums[stage] += milliseconds(run, options)
+    mean = {key: value / len(cameras) for key, value in sums.items()}
+    say(f"baked, {name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
+    pixels, draw = width * height, 1e-3 * mean["draw"]
+    row = [
+        name,
+        f"{width} x {height}",
+        number(mean["pairs"] / 1e6, 2),
+        number(mean["fragments"] / pixels, 1),
+        *(number(mean[key], 3) for key in ("prepare", "bin", "draw", "frame", "graph", "packed")),
+        number(1e3 / mean["graph"], 0),
+        number(mean["fragments"] / draw / 1e9, 1),
+        f"{100 * 60 * mean['fragments'] / draw / rate:.0f} %",
+        f"{100 * (100 * mean['pairs'] + 12 * pixels) / draw / options.copy_bytes:.0f} %",
+    ]
+    return row, mean["graph"]
+
+
+def _around(bundle, width: int, height: int) -> list[Camera]:
+    """Three cameras around the middle of a bundle, which training places in the ball of the cameras, of radius 1."""
+    middle = bundle.surfels["means"].median(dim=0).values
+    K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
+    cameras = []
+    for angle in (0.0, 2.1, 4.2):
+        eye = middle + 0.7 * torch.tensor([math.cos(angle), math.sin(angle), 0.3])
+        forward = torch.nn.functional.normalize(middle - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        cameras.append(Camera(viewmat, K, width, height))
+    return cameras
+
+
+def _gsplat(options: Options, graphs: dict[tuple[int, int, int], float]) -> str:
+    """gsplat's 3DGS frames at the same sizes with as many Gaussians, and with more."""
+    if options.device.type != "cuda":
+        return ""
+    try:
+        import gsplat
+        import gsplat.cuda._backend  # compiles the kernels where that was not done
+    except (ImportError, RuntimeError, OSError) as error:
+        return f"\n\ngsplat cannot be timed here: {error}"
+    rows = []
+    for (n, width, height), ours in graphs.items():
+        for times in TIMES_GSPLAT:
+            scene, camera = trained_like(times * n, width, height, options.device, view_color="sh", texture=False)
+            q = {name: value.detach() for name, value in scene.surfels.items()}
+            beta = 4 * torch.sigmoid(q["beta_raw"])
+            scales = q["log_scales"].exp() * (3 / (2 * beta).sqrt())[:, None]  # the kernel's curvature at its centre
+            scales = torch.cat([scales, scales.amin(dim=1, keepdim=True)], dim=1)
+            colors = torch.cat([q["sh_dc"][:, None], q["sh_rest"]], dim=1)
+            opacities = torch.sigmoid(q["opacity_logits"])
+            view = (camera.viewmat[None], camera.K[None], width, height)
+
+            @torch.no_grad()
+            def draw(a=(q["means"], q["quats"], scales, opacities, colors), view=view) -> object:
+                return gsplat.rasterization(*a, *view, sh_degree=3, packed=False)
+
+            ms = milliseconds(draw, options)
+            say(f"gsplat, {times * n:,} Gaussians, {width} x {height}: {ms:.3f} ms")
+            rows.append([f"{times * n:,}", f"{width} x {height}", number(ms, 3), number(ours, 3), number(ms / ours, 2)])
+    header = ("Gaussians", "size", "gsplat ms", "ours, graph ms", "gsplat / ours")
+    note = (
+        f"\n\ngsplat {getattr(gsplat, '__version__', '')} `rasterization`, SH of degree 3, beside our scene of a first, "
+        "a third and a tenth as many surfels:\n\n"
+    )
+    return note + table(header, rows)
+
+
+SECTIONS = (Section("baked", ("baked_frame",), frames),)

@@ -35,7 +35,7 @@ class BakedModel(SurfelModel):
         self._count = len(bundle)
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        return self._scene[0].render(camera.to("cpu"), background=background.cpu(), maps=maps)
+        return self._scene[0].render(camera.to(self.device), background=background.to(self.device), maps=maps)
 
     def surfel_count(self) -> int:
         return self._count
@@ -48,7 +48,10 @@ class BakedModel(SurfelModel):
         return {**super().size_metrics(), "atlas_bytes": float(self._atlas_bytes)}
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
-        return self  # the renderer runs on the CPU
+        super().to(*args, **kwargs)
+        if self._scene[0].tiles.device != self.device:
+            self._scene[0] = self._scene[0].to(self.device)
+        return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         """Nothing to load: everything is in the bundle."""

@@ -251,6 +251,6 @@ def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tens
         raise ValueError(f"views that are drawn together need one size, not {sorted(sizes)}")
     if any(camera.skewed for camera in cameras):
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
-    viewmats = torch.stack([camera.viewmat.to("cpu", torch.float32) for camera in cameras]).to(device)
-    Ks = torch.stack([camera.K.to("cpu", torch.float32) for camera in cameras]).to(device)
+    viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device, torch.float32)
+    Ks = torch.stack([camera.K for camera in cameras]).to(device, torch.float32)
     return viewmats, Ks, *sizes.pop()

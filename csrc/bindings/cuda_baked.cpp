@@ -32,10 +32,10 @@ Parameters parameters(const std::string& kind, int64_t terms) {
 void frame(Floats means, Floats quats, Floats log_scales, Floats opacity_logits, Floats beta_raw,
            const std::string& kind, int terms, Floats a, Floats b, MaybeFloats c, Array<const int32_t> tiles,
            MaybeFloats extent, MaybeFloats mean_residual, Maybe<const int64_t> pages, double offset, double scale,
-           double weight_bound, double near, bool prefilter, double transmittance_min, Floats viewmats, Floats Ks, int width, int height,
-           MaybeFloats background, Maybe<float> rgb, Maybe<float> alpha, Maybe<int32_t> packed, Maybe<float> beta,
-           Maybe<float> depth, Maybe<float> normal, Maybe<int32_t> overdraw, int stages, Array<uint8_t> memory,
-           int64_t capacity, uintptr_t stream) {
+           double weight_bound, double near, bool prefilter, double transmittance_min, Floats viewmats, Floats Ks,
+           int width, int height, MaybeFloats background, Maybe<float> rgb, Maybe<float> alpha, Maybe<int32_t> packed,
+           Maybe<float> beta, Maybe<float> depth, Maybe<float> normal, Maybe<int32_t> overdraw, int stages,
+           Array<uint8_t> memory, int64_t capacity, uintptr_t stream) {
   const int64_t n = int64_t(opacity_logits.size());
   const Parameters p = parameters(kind, terms);
   const BakedViews views = {int(viewmats.size() / 16), width, height, viewmats.data(),
@@ -94,8 +94,8 @@ void bind_baked(nb::module_& m) {
         "opacity_logits"_a.noconvert(), "beta_raw"_a.noconvert(), "kind"_a, "terms"_a, "a"_a.noconvert(),
         "b"_a.noconvert(), "c"_a.noconvert().none(), "tiles"_a.noconvert(), "extent"_a.noconvert().none(),
         "mean_residual"_a.noconvert().none(), "pages"_a.noconvert().none(), "offset"_a, "scale"_a, "weight_bound"_a,
-        "near"_a, "prefilter"_a, "transmittance_min"_a, "viewmats"_a.noconvert(), "Ks"_a.noconvert(), "width"_a, "height"_a,
-        "background"_a.noconvert().none(), "rgb"_a.noconvert().none(), "alpha"_a.noconvert().none(),
+        "near"_a, "prefilter"_a, "transmittance_min"_a, "viewmats"_a.noconvert(), "Ks"_a.noconvert(), "width"_a,
+        "height"_a, "background"_a.noconvert().none(), "rgb"_a.noconvert().none(), "alpha"_a.noconvert().none(),
         "packed"_a.noconvert().none(), "beta"_a.noconvert().none(), "depth"_a.noconvert().none(),
         "normal"_a.noconvert().none(), "overdraw"_a.noconvert().none(), "stages"_a, "memory"_a.noconvert(),
         "capacity"_a, "stream"_a = 0);

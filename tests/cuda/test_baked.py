@@ -189,6 +189,15 @@ def test_views_drawn_together(device: torch.device) -> None:
             assert torch.equal(together[name][i], getattr(alone, name)), name
 
 
+def test_all_surfels_are_blended_without_a_least_transmittance(device: torch.device, cpu) -> None:
+    case = random_scene(200, 10, width=20, height=16)
+    case.params["opacity_logits"] += 4.0
+    scene, camera = scene_of(case, transmittance_min=0.0), camera_of(case)
+    check(scene, camera, device, cpu)
+    most = scene.to(device).render(camera, maps=True).overdraw
+    assert most.sum() > 1.5 * scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
+
+
 def test_packed_image(device: torch.device) -> None:
     images = textured(50, 5).to(device).render_views([front()], None, ("rgb", "alpha", "packed"))
     want = torch.cat([images["rgb"], images["alpha"]], dim=-1).clamp(0, 1).mul(255).add(0.5).to(torch.uint8)

@@ -60,7 +60,7 @@ def test_a_resumed_run_is_the_same_run(make_scene, views, options):
 
 
 def test_the_field_learns_on_its_steps_only(make_scene, views):
-    scene, config = make_scene(), TrainConfig(resolution_schedule=0)
+    scene, config = make_scene(), TrainConfig(resolution_schedule=0, freeze_min_updates=50)
     schedule = Schedule(config, 600)
     for step, learns in ((0, True), (99, True), (101, False), (110, True)):
         scene.zero_grad(set_to_none=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, kernel_class
+from .backend import cuda_backend, dense, kernel, kernel_class, module
+from .project import FRAME
 
 FEATURES = 4
 """Features a level."""
@@ -52,6 +53,30 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
     return kernel_class("Field", table)(*weights, levels, log2_size, g.min_resolution, g.contract, tuple(g.mid), g.half)
 
 
+def backward_memory(
+    like: Tensor, table: Tensor | None, surfels: int = 0, frames: bool = False
+) -> tuple[Tensor | None, ...]:
+    """Working memory that the backward kernels of field and shading take as their last arguments: none on the CPU.
+
+    On CUDA: sums of the MLP's gradients a block; and, where torch is asked for deterministic algorithms
+    (torch.use_deterministic_algorithms), int64 sums of what blocks add up together: a sum of integers does not depend
+    on the order.
+
+    Args:
+        like: tells device and dtype.
+        table: the hash table where the field learns, else None.
+        surfels: number of surfels whose base colours get gradients.
+        frames: whether their frames get some, too.
+    """
+    if not cuda_backend(like.device):
+        return ()
+    mlp = None if table is None else like.new_empty(module(like.device).MLP_WORK)
+    if not torch.are_deterministic_algorithms_enabled():
+        return mlp, None
+    numbers = (0 if table is None else table.numel()) + 8 + (3 + FRAME if frames else 3) * surfels
+    return mlp, torch.empty(numbers, dtype=torch.int64, device=like.device)
+
+
 class _Field(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, geometry, *params):
@@ -67,7 +92,10 @@ class _Field(torch.autograd.Function):
         points, *params = ctx.saved_tensors
         grads = [torch.empty_like(p) for p in params]
         dx = torch.empty_like(points) if ctx.needs_input_grad[0] else None
-        kernel("field_backward", points)(kernel_field(ctx.geometry, *params), points, dense(drho, points), *grads, dx)
+        memory = backward_memory(points, params[0])
+        kernel("field_backward", points)(
+            kernel_field(ctx.geometry, *params), points, dense(drho, points), *grads, dx, *memory
+        )
         return dx, None, *grads
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel
-from .field import FieldGeometry, kernel_field
+from .field import FieldGeometry, backward_memory, kernel_field
 from .trace import Fragments
 
 
@@ -46,6 +46,7 @@ class _Shade(torch.autograd.Function):
             *grads,
             duv,
             dframes,
+            *backward_memory(base, params[0] if learn else None, len(base), dframes is not None),
         )
         return dbase, dframes, duv, None, None, None, None, *(grads if params else ())
 

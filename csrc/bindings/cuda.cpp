@@ -15,4 +15,5 @@ NB_MODULE(_cuda, m) {
   bt::cuda::bind_project(m);
   bt::cuda::bind_trace(m);
   bt::cuda::bind_baked(m);
+  bt::cuda::bind_field(m);
 }

@@ -55,5 +55,6 @@ FragmentArrays<S> fragments(int64_t n, const Array<int32_t>& surfel, const Array
 void bind_project(nb::module_& m);
 void bind_trace(nb::module_& m);
 void bind_baked(nb::module_& m);
+void bind_field(nb::module_& m);
 
 }  // namespace bt::cuda

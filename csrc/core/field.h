@@ -9,6 +9,19 @@ constexpr int kFeatures = 4;  // a level
 constexpr int kWidth = 16;    // of both hidden layers
 constexpr int kMaxLevels = 4;
 
+// The field as the kernels take it.
+template <class S>
+struct FieldArrays {
+  int levels, log2_size, min_resolution;
+  bool contract;
+  S mid[3], half;
+  const S *table, *w1, *w2, *w3;  // [levels, 2^log2_size, 4], [4 levels, 16], [16, 16], [16, 3]
+};
+template <class S>
+struct FieldGradients {
+  S *table, *w1, *w2, *w3;
+};
+
 // Unsigned integers as wide as a real; hashing needs their low 32 bits only.
 template <class T>
 struct IndexOf {
@@ -72,21 +85,41 @@ BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
   }
 }
 
+// d loss / d grid coordinate from d loss / d interpolated value of each corner.
+template <class S>
+BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, const S* d) {
+  const S gx = S(1) - fx, gy = S(1) - fy, gz = S(1) - fz;
+  return {resolution *
+              (gy * gz * (d[1] - d[0]) + fy * gz * (d[3] - d[2]) + gy * fz * (d[5] - d[4]) + fy * fz * (d[7] - d[6])),
+          resolution *
+              (gx * gz * (d[2] - d[0]) + fx * gz * (d[3] - d[1]) + gx * fz * (d[6] - d[4]) + fx * fz * (d[7] - d[5])),
+          resolution *
+              (gx * gy * (d[4] - d[0]) + fx * gy * (d[5] - d[1]) + gx * fy * (d[6] - d[2]) + fx * fy * (d[7] - d[3]))};
+}
+
 // The MLP on rows of kWidth values. `Row` is a pack of kWidth reals; weights are stored input-major, w3 output-major
-// (three rows), and the transposes serve the backward pass.
+// (three rows), and the transposes serve the backward pass. With fewer levels than kMaxLevels the rows of w1 that have
+// no input are 0, and so are those inputs.
+constexpr int kInputs = kMaxLevels * kFeatures;
+static_assert(kInputs == kWidth, "features and hidden layers share one type of row");
 template <class S, class Row>
 struct Mlp {
-  Row w1[kMaxLevels * kFeatures], w2[kWidth], w3[3], w1t[kWidth], w2t[kWidth];
-  int inputs;
+  Row w1[kInputs], w2[kWidth], w3[3], w1t[kWidth], w2t[kWidth];
 };
 template <class S, class Row>
 struct MlpState {
   Row h1, h2;
 };
+// Gradients before the two ReLUs.
+template <class Row>
+struct MlpGradient {
+  Row g1, g2;
+};
+// sum_i w_i in_i
 template <class S, class Row>
-BT_HD Row product(const Row* w, const S* in, int n) {
+BT_HD Row product(const Row* w, const S* in) {
   Row a = Row(S(0)), b = Row(S(0));  // two chains hide the latency of the multiply-add
-  for (int i = 0; i < n; i += 2) {
+  for (int i = 0; i < kWidth; i += 2) {
     a += w[i] * Row(in[i]);
     b += w[i + 1] * Row(in[i + 1]);
   }
@@ -95,26 +128,53 @@ BT_HD Row product(const Row* w, const S* in, int n) {
 template <class S, class Row>
 BT_HD Vec3<S> mlp(const Mlp<S, Row>& m, const S* features, MlpState<S, Row>& state) {
   S h[kWidth];
-  state.h1 = relu(product(m.w1, features, m.inputs));
+  state.h1 = relu(product(m.w1, features));
   store(h, state.h1);
-  state.h2 = relu(product(m.w2, h, kWidth));
+  state.h2 = relu(product(m.w2, h));
   return {sum(state.h2 * m.w3[0]), sum(state.h2 * m.w3[1]), sum(state.h2 * m.w3[2])};
 }
-// Adds the weights' gradients to g (w1, w2, w3 used) and returns those of the features.
+// Returns the gradient of the features from that of the output.
 template <class S, class Row>
-BT_HD Row mlp_vjp(const Mlp<S, Row>& m, const S* features, const MlpState<S, Row>& state, Vec3<S> d, Mlp<S, Row>& g) {
+BT_HD Row mlp_vjp(const Mlp<S, Row>& m, const MlpState<S, Row>& state, Vec3<S> d, MlpGradient<Row>& g) {
   S h[kWidth];
   const Row zero = Row(S(0));
-  g.w3[0] += state.h2 * Row(d.x), g.w3[1] += state.h2 * Row(d.y), g.w3[2] += state.h2 * Row(d.z);
-  Row g2 = m.w3[0] * Row(d.x) + m.w3[1] * Row(d.y) + m.w3[2] * Row(d.z);
-  g2 = select(state.h2 > zero, g2, zero);
+  g.g2 = m.w3[0] * Row(d.x) + m.w3[1] * Row(d.y) + m.w3[2] * Row(d.z);
+  g.g2 = select(state.h2 > zero, g.g2, zero);
+  store(h, g.g2);
+  g.g1 = select(state.h1 > zero, product(m.w2t, h), zero);
+  store(h, g.g1);
+  return product(m.w1t, h);
+}
+// Adds the weights' gradients to w1, w2 and w3 of `sums`: outer products of what a layer was given and the gradient of
+// what it made of it.
+template <class S, class Row>
+BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state, const MlpGradient<Row>& g, Vec3<S> d,
+                               Mlp<S, Row>& sums) {
+  S h[kWidth];
+  sums.w3[0] += state.h2 * Row(d.x), sums.w3[1] += state.h2 * Row(d.y), sums.w3[2] += state.h2 * Row(d.z);
   store(h, state.h1);
-  for (int i = 0; i < kWidth; ++i) g.w2[i] += g2 * Row(h[i]);
-  store(h, g2);
-  const Row g1 = select(state.h1 > zero, product(m.w2t, h, kWidth), zero);
-  for (int i = 0; i < m.inputs; ++i) g.w1[i] += g1 * Row(features[i]);
-  store(h, g1);
-  return product(m.w1t, h, kWidth);
+  for (int i = 0; i < kWidth; ++i) sums.w2[i] += g.g2 * Row(h[i]);
+  for (int i = 0; i < kInputs; ++i) sums.w1[i] += g.g1 * Row(features[i]);
+}
+
+// Shading, eq. (color): relu(relu(f_view + 0.5) + rho(x)). The residual passes gradient where the outer ReLU is open,
+// the view colour where both are.
+template <class S>
+BT_HD S view_base(S f_view) {
+  return relu(f_view + S(0.5));
+}
+template <class S>
+BT_HD S residual_gradient(S color, S dcolor) {
+  return color > S(0) ? dcolor : S(0);
+}
+template <class S>
+BT_HD S base_gradient(S f_view, S dresidual) {
+  return f_view > S(-0.5) ? dresidual : S(0);
+}
+// Where a fragment lies; frame: mean, s_u t_u, s_v t_v.
+template <class S>
+BT_HD Vec3<S> world_point(const S* frame, S u, S v) {
+  return load3(frame) + u * load3(frame + 3) + v * load3(frame + 6);
 }
 
 }  // namespace bt

@@ -20,4 +20,10 @@ BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
+// Surfel coordinate of the centre of texel i, eq. (texel centres).
+template <class S>
+BT_HD S texel_centre(int i, int r, S extent) {
+  return (S(i) + S(0.5)) * (S(2) * extent / S(r)) - extent;
+}
+
 }  // namespace bt

@@ -37,6 +37,7 @@ void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S*
     parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
       Encoder<S> enc;
       MlpState<S, Pack<S>> state;
+      MlpGradient<Pack<S>> gradient;
       S lanes[kWidth];
       int64_t slot = scatter.slot(part, begin);
       for (int64_t i = begin; i < end; i += kBatch) {
@@ -45,8 +46,10 @@ void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S*
         enc.encode(field, count);
         auto& batch = scatter.open(slot++, enc, field.levels, count);
         for (int p = 0; p < count; ++p) {
+          const Vec3<S> d = load3(drho + 3 * (block + i + p));
           mlp(m, enc.features[p], state);
-          batch.dfeatures[p] = mlp_vjp(m, enc.features[p], state, load3(drho + 3 * (block + i + p)), sums[part]);
+          batch.dfeatures[p] = mlp_vjp(m, state, d, gradient);
+          add_weight_gradient(enc.features[p], state, gradient, d, sums[part]);
           if (dx) {
             store(lanes, batch.dfeatures[p]);
             store3(dx + 3 * (block + i + p), enc.position_gradient(field, p, lanes));
@@ -58,17 +61,6 @@ void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S*
   }
   add_mlp_gradient(sums, threads, field.levels * kFeatures, out);
 }
-
-namespace {
-template <class S>
-Vec3<S> world_point(const S* frame, S u, S v) {
-  return load3(frame) + u * load3(frame + 3) + v * load3(frame + 6);
-}
-template <class S>
-S view_base(S b) {
-  return relu(b + S(0.5));
-}
-}  // namespace
 
 template <class S>
 void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const S* base, const S* frames,
@@ -121,7 +113,6 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
     clear_gradients(*field, *dfield);
   }
   if (geometry) std::fill(duv, duv + 2 * fragments, S(0));
-  // the residual passes gradient where the outer ReLU is open, the view colour where both are
   for (int64_t block = 0; block < fragments; block += learn ? kBlock : fragments) {
     const int64_t size = learn ? std::min(kBlock, fragments - block) : fragments;
     if (learn) scatter.resize(size, threads);
@@ -129,7 +120,8 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
       std::vector<S>& own = partial[part];
       Encoder<S> enc;
       MlpState<S, Pack<S>> state;
-      Vec3<S> gradient[kBatch];
+      MlpGradient<Pack<S>> gradient;
+      Vec3<S> drho[kBatch];
       int64_t who[kBatch];
       int count = 0;
       int64_t slot = scatter.slot(part, begin);
@@ -139,12 +131,12 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
         const S* b = base + 3 * id;
         S g[3];
         for (int c = 0; c < 3; ++c) {
-          g[c] = colors[3 * i + c] > S(0) ? dcolors[3 * i + c] : S(0);
-          own[id * columns + c] += b[c] > S(-0.5) ? g[c] : S(0);
+          g[c] = residual_gradient(colors[3 * i + c], dcolors[3 * i + c]);
+          own[id * columns + c] += base_gradient(b[c], g[c]);
         }
         if (learn && f.weight[i] >= bound) {
           enc.set(count, world_point(frames + id * kFrame, f.uv[i], f.uv[fragments + i]));
-          gradient[count] = load3(g);
+          drho[count] = load3(g);
           who[count++] = i;
         }
         if (count == kBatch || (count && k + 1 == end)) {
@@ -152,7 +144,8 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
           auto& batch = scatter.open(slot++, enc, field->levels, count);
           for (int p = 0; p < count; ++p) {
             mlp(m, enc.features[p], state);
-            batch.dfeatures[p] = mlp_vjp(m, enc.features[p], state, gradient[p], sums[part]);
+            batch.dfeatures[p] = mlp_vjp(m, state, drho[p], gradient);
+            add_weight_gradient(enc.features[p], state, gradient, drho[p], sums[part]);
             if (!geometry) continue;
             store(lanes, batch.dfeatures[p]);
             const Vec3<S> dx = enc.position_gradient(*field, p, lanes);

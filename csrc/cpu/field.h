@@ -14,12 +14,12 @@ constexpr int kBatch = 16;  // points whose table entries are looked up together
 template <class S>
 Mlp<S, Pack<S>> load_mlp(const FieldArrays<S>& field) {
   Mlp<S, Pack<S>> m;
-  m.inputs = field.levels * kFeatures;
-  for (int i = 0; i < kMaxLevels * kFeatures; ++i) m.w1[i] = i < m.inputs ? load(field.w1 + i * kWidth) : Pack<S>(S(0));
+  const int inputs = field.levels * kFeatures;
+  for (int i = 0; i < kInputs; ++i) m.w1[i] = i < inputs ? load(field.w1 + i * kWidth) : Pack<S>(S(0));
   for (int i = 0; i < kWidth; ++i) m.w2[i] = load(field.w2 + i * kWidth);
   for (int o = 0; o < kWidth; ++o)
     for (int i = 0; i < kWidth; ++i) {
-      m.w1t[o].v[i] = i < m.inputs ? field.w1[i * kWidth + o] : S(0);
+      m.w1t[o].v[i] = i < inputs ? field.w1[i * kWidth + o] : S(0);
       m.w2t[o].v[i] = field.w2[i * kWidth + o];
     }
   for (int c = 0; c < 3; ++c)
@@ -39,7 +39,7 @@ template <class S>
 struct Encoder {
   using P = Pack<S>;
   Corners<P> at[kMaxLevels];
-  alignas(64) S features[kBatch][kMaxLevels * kFeatures];
+  alignas(64) S features[kBatch][kInputs] = {};
   alignas(64) S x[3][kBatch] = {};
 
   void set(int p, Vec3<S> a) { x[0][p] = a.x, x[1][p] = a.y, x[2][p] = a.z; }
@@ -78,14 +78,7 @@ struct Encoder {
         d[k] = S(0);
         for (int j = 0; j < kFeatures; ++j) d[k] += dfeatures[l * kFeatures + j] * entry[j];
       }
-      const S fx = c.fx[p], fy = c.fy[p], fz = c.fz[p], gx = S(1) - fx, gy = S(1) - fy, gz = S(1) - fz;
-      const S r = S(f.min_resolution << l);
-      dc.x +=
-          r * (gy * gz * (d[1] - d[0]) + fy * gz * (d[3] - d[2]) + gy * fz * (d[5] - d[4]) + fy * fz * (d[7] - d[6]));
-      dc.y +=
-          r * (gx * gz * (d[2] - d[0]) + fx * gz * (d[3] - d[1]) + gx * fz * (d[6] - d[4]) + fx * fz * (d[7] - d[5]));
-      dc.z +=
-          r * (gx * gy * (d[4] - d[0]) + fx * gy * (d[5] - d[1]) + gx * fy * (d[6] - d[2]) + fx * fy * (d[7] - d[3]));
+      dc = dc + cell_gradient(c.fx[p], c.fy[p], c.fz[p], S(f.min_resolution << l), d);
     }
     return grid_coordinate_vjp(point(p), load3(f.mid), f.half, f.contract, dc);
   }

@@ -7,6 +7,8 @@
 #include <vector>
 
 #include "core/bounds.h"
+#include "core/field.h"
+#include "core/view_color.h"
 
 namespace bt {
 
@@ -89,15 +91,7 @@ void composite_backward(int64_t n, bool maps, const S* geom, const int64_t* tile
 void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixel, const uint8_t* mask,
                    int32_t* counts);
 
-// View colours; kind: 0 sv, 1 sh, 2 sb, 3 sg; `terms` = sites, coefficients (with dc) or lobes.
-// Parameters: sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
-// sb, sg a = base [n,3], b = lobes [n,K,6 or 7]. center [3]: of the camera. Rows where active is 0 give 0 and get
-// gradient 0.
-template <class S>
-struct ViewColorArrays {
-  int kind, terms;
-  S *a, *b, *c;
-};
+// View colours; center [3]: of the camera. Rows where active is 0 give 0 and get gradient 0.
 template <class S>
 void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                         const uint8_t* active, S* out);
@@ -106,17 +100,6 @@ void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* 
                          const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans);
 
 // Residual colour field.
-template <class S>
-struct FieldArrays {
-  int levels, log2_size, min_resolution;
-  bool contract;
-  S mid[3], half;
-  const S *table, *w1, *w2, *w3;  // [levels, 2^log2_size, 4], [4 levels, 16], [16, 16], [16, 3]
-};
-template <class S>
-struct FieldGradients {
-  S *table, *w1, *w2, *w3;
-};
 template <class S>
 void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho);
 // dx may be null. Gradients are written.

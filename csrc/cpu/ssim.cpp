@@ -1,5 +1,5 @@
 // Structural similarity over the valid 11 x 11 Gaussian windows, with its gradient, separable.
-#include <cmath>
+#include "core/ssim.h"
 
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
@@ -7,17 +7,7 @@
 namespace bt {
 
 namespace {
-constexpr int kTaps = 11;
-
-template <class S>
-struct Window {
-  S k[kTaps];
-  Window() {
-    double total = 0, value[kTaps];
-    for (int i = 0; i < kTaps; ++i) total += value[i] = std::exp(-(i - 5) * (i - 5) / (2 * 1.5 * 1.5));
-    for (int i = 0; i < kTaps; ++i) k[i] = S(value[i] / total);
-  }
-};
+constexpr int kTaps = kSsimTaps;
 
 // The five moments of a pair of rows, filtered along the row.
 template <class S>
@@ -35,7 +25,7 @@ void filter_row(const S* a, const S* b, int n, int stride, const S* k, S* const*
 
 template <class S>
 S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
-  static const Window<S> window;
+  static const SsimWindow<S> window;
   const S* k = window.k;
   const int rows = height - kTaps + 1, line = width * channels;
   const int n = (width - kTaps + 1) * channels;  // filtered length of a row
@@ -50,7 +40,7 @@ S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
       filter_row(a + y * line, b + y * line, n, channels, k, out);
     }
   });
-  const S c1 = S(0.01 * 0.01), c2 = S(0.03 * 0.03), share = S(1) / (S(rows) * S(n));
+  const S share = S(1) / (S(rows) * S(n));
   std::vector<double> row_sum(rows);
   parallel_parts(rows, 16, [&](int, int64_t begin, int64_t end) {
     std::vector<S> m(5 * n), s(n);
@@ -65,17 +55,10 @@ S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
       const S *ma = m.data(), *mb = ma + n, *aa = mb + n, *bb = aa + n, *ab = bb + n;
       S* g = da ? gradient.data() + 3 * y * n : nullptr;
       for (int x = 0; x < n; ++x) {
-        const S p = S(2) * ma[x] * mb[x] + c1, q = S(2) * (ab[x] - ma[x] * mb[x]) + c2;
-        const S r = ma[x] * ma[x] + mb[x] * mb[x] + c1;
-        const S t = (aa[x] - ma[x] * ma[x]) + (bb[x] - mb[x] * mb[x]) + c2;
-        const S i = S(1) / (r * t), value = p * q * i;
-        s[x] = value;
-        if (g) {
-          // value as a function of the moments of a: mean, mean square, mean product
-          g[x] = share * S(2) * (mb[x] * (q - p) * i - ma[x] * value * (S(1) / r - S(1) / t));
-          g[n + x] = -share * value / t;
-          g[2 * n + x] = share * S(2) * p * i;
-        }
+        S d[3];
+        s[x] = ssim_window(ma[x], mb[x], aa[x], bb[x], ab[x], d);
+        if (g)
+          for (int j = 0; j < 3; ++j) g[j * n + x] = share * d[j];
       }
       double total = 0;
       for (int x = 0; x < n; ++x) total += s[x];

@@ -27,9 +27,20 @@ inline void check(cudaError_t error, const char* what) {
     ::bt::cuda::check(cudaGetLastError(), #kernel);                                        \
   } while (0)
 
+// Before a loop whose indices the compiler must know: arrays live in registers only then. Host code has no such pragma.
+#if defined(__CUDA_ARCH__)
 #define BT_UNROLL _Pragma("unroll")
 #define BT_PRAGMA(text) _Pragma(#text)
 #define BT_UNROLL_BY(n) BT_PRAGMA(unroll n)
+#else
+#define BT_UNROLL
+#define BT_UNROLL_BY(n)
+#endif
+
+// More than 48 KB of shared memory a block has to be asked for.
+#define BT_ALLOW_SHARED(kernel, bytes) \
+  ::bt::cuda::check(                   \
+      cudaFuncSetAttribute((kernel), cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)), #kernel)
 
 #define BT_DYNAMIC_SHARED(Type, name)                               \
   extern __shared__ __align__(16) unsigned char bt_shared_memory[]; \
@@ -38,6 +49,10 @@ inline void check(cudaError_t error, const char* what) {
 #else
 
 #include "cuda/emulator.h"
+
+#define BT_UNROLL
+
+#define BT_ALLOW_SHARED(kernel, bytes) ((void)(kernel), (void)(bytes))
 
 #define BT_LAUNCH(kernel, grid, block, shared, stream, ...) \
   ((void)(stream), ::bt::emulator::launch(#kernel, (grid), (block), (shared), [=] { kernel(__VA_ARGS__); }))

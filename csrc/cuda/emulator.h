@@ -125,6 +125,7 @@ inline int __syncthreads_and(bool predicate) { return __syncthreads_count(!predi
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline int __popcll(unsigned long long x) { return __builtin_popcountll(x); }
 inline int __ffs(int x) { return __builtin_ffs(x); }
+inline long long __double2ll_rn(double x) { return std::fabs(x) < 9e18 ? std::llrint(x) : 0; }
 inline int __clz(int x) { return x ? __builtin_clz(unsigned(x)) : 32; }
 template <class T>
 T __ldg(const T* p) {

@@ -1,0 +1,39 @@
+// Structural similarity of one window from its moments, and the part of its gradient that all its pixels share.
+#pragma once
+
+#include "core/common.h"
+
+namespace bt {
+
+constexpr int kSsimTaps = 11;
+constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
+
+// The Gaussian window of standard deviation 1.5, normalised.
+template <class S>
+struct SsimWindow {
+  S k[kSsimTaps];
+  SsimWindow() {
+    double total = 0, value[kSsimTaps];
+    for (int i = 0; i < kSsimTaps; ++i) {
+      const double d = i - kSsimTaps / 2;
+      total += value[i] = std::exp(-d * d / (2 * 1.5 * 1.5));
+    }
+    for (int i = 0; i < kSsimTaps; ++i) k[i] = S(value[i] / total);
+  }
+};
+
+// Weighted means over a window: of a, b, a^2, b^2 and a b. The derivatives are those towards the means of a, a^2 and
+// a b; a pixel p of weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
+template <class S>
+BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
+  const S c1 = S(kSsimC1), c2 = S(kSsimC2), two = S(2);
+  const S p = two * a * b + c1, q = two * (ab - a * b) + c2;
+  const S r = a * a + b * b + c1, t = (aa - a * a) + (bb - b * b) + c2;
+  const S i = S(1) / (r * t), value = p * q * i;
+  d[0] = two * (b * (q - p) * i - a * value * (S(1) / r - S(1) / t));
+  d[1] = -value / t;
+  d[2] = two * p * i;
+  return value;
+}
+
+}  // namespace bt

@@ -1,0 +1,202 @@
+// Colours of fragments. Fragments of small weight have no residual, in trained scenes about half of them: a warp
+// collects the others in a queue in shared memory and looks up the field for 32 at a time, with all lanes at work. The
+// list is in the order of tile and surfel, so a surfel's fragments in a tile are neighbours: they share cells of the
+// field, and their gradients are added up within the warp before they go to memory.
+#include "cuda/field_device.h"
+
+namespace bt::cuda {
+
+// Where the backward kernel writes.
+template <class S>
+struct ShadeGradients {
+  S *base, *table, *uv, *frames;
+  S* partial;  // of the MLP's weights
+};
+
+namespace {
+constexpr int kForwardWarps = 4;
+
+// Puts the item of every lane that has one at the end of the queue, in the order of the lanes.
+__device__ void put(int64_t* queue, int& count, bool has, int64_t item, int lane) {
+  const unsigned votes = __ballot_sync(kFullMask, has);
+  if (has) queue[count + count_below(votes, lane)] = item;
+  count += __popc(votes);
+  __syncwarp();
+}
+// Takes up to 32 items from the front.
+__device__ void drop(int64_t* queue, int& count, int lane) {
+  const int rest = count > kWarp ? count - kWarp : 0;
+  const int64_t later = lane < rest ? queue[kWarp + lane] : 0;
+  __syncwarp();
+  if (lane < rest) queue[lane] = later;
+  __syncwarp();
+  count = rest;
+}
+
+template <class S>
+__device__ Vec3<S> fragment_point(const FragmentArrays<S>& f, const S* frames, int64_t i) {
+  return world_point(frames + int64_t(f.surfel[i]) * kFrame, f.uv[i], f.uv[f.total + i]);
+}
+
+template <class S>
+__global__ void __launch_bounds__(kForwardWarps* kWarp)
+    forward_kernel(FragmentArrays<S> f, S bound, const S* __restrict__ base, const S* __restrict__ frames,
+                   FieldArrays<S> field, S* __restrict__ colors) {
+  __shared__ DeviceMlp<S> m;
+  __shared__ int64_t queues[kForwardWarps][2 * kWarp];
+  const bool textured = field.levels > 0;
+  if (textured) load_mlp(field, threadIdx.x, kForwardWarps * kWarp, m);
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const int64_t begin = (int64_t(blockIdx.x) * kForwardWarps + warp) * kChunk;
+  const int64_t end = begin + kChunk < f.total ? begin + kChunk : f.total;
+  int64_t* queue = queues[warp];
+  int count = 0;
+  for (int64_t first = begin; first < end; first += kWarp) {
+    const int64_t i = first + lane;
+    const bool in = i < end, looks_up = in && textured && f.weight[i] >= bound;
+    if (in && !looks_up) {
+      const S* b = base + 3 * int64_t(f.surfel[i]);
+      for (int c = 0; c < 3; ++c) colors[3 * i + c] = view_base(b[c]);
+    }
+    put(queue, count, looks_up, i, lane);
+    while (count >= kWarp || (count && first + kWarp >= end)) {
+      if (lane < count) {
+        const int64_t j = queue[lane];
+        const S* b = base + 3 * int64_t(f.surfel[j]);
+        const Vec3<S> rho = evaluate(field, m, fragment_point(f, frames, j));
+        colors[3 * j] = bt::relu(view_base(b[0]) + rho.x);
+        colors[3 * j + 1] = bt::relu(view_base(b[1]) + rho.y);
+        colors[3 * j + 2] = bt::relu(view_base(b[2]) + rho.z);
+      }
+      drop(queue, count, lane);
+    }
+  }
+}
+
+// Adds M numbers of every lane to rows of width M, one addition a run of lanes with the same row. Row -1: none.
+template <int M, class S, bool kExact>
+__device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S, kExact>& to) {
+  const unsigned run = run_of(row, lane);
+  sum_over_run(run, lane, value);
+  if (row < 0 || count_below(run, lane)) return;
+  BT_UNROLL
+  for (int k = 0; k < M; ++k) to.add(int64_t(row) * M + k, value[k]);
+}
+
+// kLearn: the field gets gradients, too.
+template <class S, bool kExact, bool kLearn>
+__global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
+    backward_kernel(FragmentArrays<S> f, S bound, const S* __restrict__ base, const S* __restrict__ frames,
+                    FieldArrays<S> field, const S* __restrict__ colors, const S* __restrict__ dcolors,
+                    ShadeGradients<S> out, ExactSums exact) {
+  constexpr int kWarps = kBackwardWarps<S>;
+  BT_DYNAMIC_SHARED(BackwardShared<S>, shared);
+  if constexpr (kLearn) load_mlp(field, threadIdx.x, kWarps * kWarp, shared->mlp);
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  Adder<S, kExact> dbase, dtable, dframes;
+  if constexpr (kExact) {
+    dbase = {exact.base, exact.range->base}, dtable = {exact.table, exact.range->table};
+    dframes = {exact.frames, exact.range->frames};
+  } else {
+    dbase = {out.base}, dtable = {out.table}, dframes = {out.frames};
+  }
+  WeightSums<S> weights;
+  int count = 0;
+  const int64_t step = int64_t(gridDim.x) * kWarps * kChunk;
+  const int64_t begin = (int64_t(blockIdx.x) * kWarps + warp) * kChunk;
+
+  const auto look_up = [&] {
+    const bool active = lane < count;
+    const int64_t j = active ? shared->queue[warp][lane] : 0;
+    const Vec3<S> zero = {S(0), S(0), S(0)};
+    Vec3<S> x = zero, d = zero;
+    if (active) {
+      x = fragment_point(f, frames, j);
+      d = {residual_gradient(colors[3 * j], dcolors[3 * j]), residual_gradient(colors[3 * j + 1], dcolors[3 * j + 1]),
+           residual_gradient(colors[3 * j + 2], dcolors[3 * j + 2])};
+    }
+    const bool moves = out.uv != nullptr;
+    const Vec3<S> dx = learn(field, shared->mlp, x, d, active, lane, shared->stage[warp], weights, dtable, moves);
+    if (moves) {
+      S g[kFrame] = {};
+      if (active) {
+        const S* frame = frames + int64_t(f.surfel[j]) * kFrame;
+        const S u = f.uv[j], v = f.uv[f.total + j];
+        out.uv[j] = dot(dx, load3(frame + 3)), out.uv[f.total + j] = dot(dx, load3(frame + 6));
+        store3(g, dx), store3(g + 3, u * dx), store3(g + 6, v * dx);
+      }
+      add_to_rows(active ? f.surfel[j] : -1, lane, g, dframes);
+    }
+    drop(shared->queue[warp], count, lane);
+  };
+
+  int64_t chunk = begin, first = begin;
+  while (first < f.total) {
+    const int64_t i = first + lane;
+    const bool in = i < f.total;
+    const int32_t surfel = in ? f.surfel[i] : -1;
+    S g[3] = {};
+    if (in)
+      for (int c = 0; c < 3; ++c)
+        g[c] = base_gradient(base[3 * int64_t(surfel) + c], residual_gradient(colors[3 * i + c], dcolors[3 * i + c]));
+    add_to_rows(surfel, lane, g, dbase);
+    first += kWarp;
+    if (first == chunk + kChunk) first = chunk += step;
+    if constexpr (kLearn) {
+      const bool looks_up = in && f.weight[i] >= bound;
+      if (in && !looks_up && out.uv) out.uv[i] = out.uv[f.total + i] = S(0);
+      put(shared->queue[warp], count, looks_up, i, lane);
+      while (count >= kWarp || (count && first >= f.total)) look_up();
+    }
+  }
+  if constexpr (kLearn) give_weights(*shared, weights, warp, lane, out.partial);
+}
+}  // namespace
+
+template <class S>
+void shade_forward(const FragmentArrays<S>& f, S bound, const S* base, const S* frames, const FieldArrays<S>* field,
+                   S* colors, Stream stream) {
+  if (!f.total) return;
+  FieldArrays<S> none = {};
+  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(f.total, kChunk * kForwardWarps))), dim3(kForwardWarps * kWarp),
+            0, stream, f, bound, base, frames, field ? *field : none, colors);
+}
+
+template <class S>
+void shade_backward(int64_t n, const FragmentArrays<S>& f, S bound, const S* base, const S* frames,
+                    const FieldArrays<S>* field, const S* colors, const S* dcolors, S* dbase,
+                    const FieldGradients<S>* dfield, S* duv, S* dframes, const FieldWork<S>& work, Stream stream) {
+  const bool learns = field && dfield;
+  const FieldArrays<S>* learned = learns ? field : nullptr;
+  FieldArrays<S> arrays = {};
+  if (learns) arrays = *field;
+  const ShadeGradients<S> out = {dbase, learns ? dfield->table : nullptr, duv, dframes, work.mlp};
+  const int blocks = backward_blocks<S>(f.total);
+  const size_t shared = learns ? sizeof(BackwardShared<S>) : 0;
+  const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
+  const auto run = [&](auto kernel, const ExactSums& exact) {
+    BT_ALLOW_SHARED(kernel, shared);
+    BT_LAUNCH(kernel, grid, block, shared, stream, f, bound, base, frames, arrays, colors, dcolors, out, exact);
+  };
+  if (work.exact) {
+    const ExactSums exact = begin_exact(work, learned, n, dframes != nullptr, f.total, dcolors, stream);
+    learns ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
+    end_exact(exact, learned, n, out.table, dbase, dframes, stream);
+  } else {
+    fill_zero(dbase, 3 * n, stream);
+    if (dframes) fill_zero(dframes, kFrame * n, stream);
+    if (learns) fill_zero(out.table, entries_of(arrays), stream);
+    learns ? run(backward_kernel<S, false, true>, ExactSums()) : run(backward_kernel<S, false, false>, ExactSums());
+  }
+  if (learns) sum_weights(work.mlp, blocks, arrays.levels, *dfield, stream);
+}
+
+#define BT_INSTANTIATE(S)                                                                                             \
+  template void shade_forward<S>(const FragmentArrays<S>&, S, const S*, const S*, const FieldArrays<S>*, S*, Stream); \
+  template void shade_backward<S>(int64_t, const FragmentArrays<S>&, S, const S*, const S*, const FieldArrays<S>*,    \
+                                  const S*, const S*, S*, const FieldGradients<S>*, S*, S*, const FieldWork<S>&,      \
+                                  Stream);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt::cuda

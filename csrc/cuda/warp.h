@@ -1,0 +1,78 @@
+// Steps of a warp: runs of lanes with equal keys, sums over them, and adding to memory.
+#pragma once
+
+#include "core/common.h"
+#include "cuda/device.h"
+
+namespace bt::cuda {
+
+// `in` of the lanes below mine.
+__device__ inline int count_below(unsigned in, int lane) { return __popc(in & ((1u << lane) - 1u)); }
+
+// The lanes of my run: neighbours with my key. All 32 lanes take part.
+template <class Key>
+__device__ unsigned run_of(Key key, int lane) {
+  const Key before = __shfl_up_sync(kFullMask, key, 1);
+  const unsigned heads = __ballot_sync(kFullMask, lane == 0 || key != before);
+  const unsigned upto = heads & (0xffffffffu >> (kWarp - 1 - lane));  // has bit 0: lane 0 is a head
+  const unsigned after = lane == kWarp - 1 ? 0u : heads & (0xfffffffeu << lane);
+  const unsigned from_head = 0xffffffffu << (kWarp - 1 - __clz(int(upto)));
+  const unsigned to_end = after ? (1u << (__ffs(int(after)) - 1)) - 1u : 0xffffffffu;
+  return from_head & to_end;
+}
+
+// Sums M values over the lanes of each run; the first lane of a run gets the sum, always in the same order. Takes
+// log2(longest run) steps of M shuffles.
+template <int M, class S>
+__device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
+  unsigned above = lane == kWarp - 1 ? 0u : run & (0xfffffffeu << lane);
+  int rank = count_below(run, lane);
+  while (__any_sync(kFullMask, above != 0)) {
+    const int next = __ffs(int(above));  // 1 + the lane whose sum comes after mine; 0: none is left
+    BT_UNROLL
+    for (int m = 0; m < M; ++m) {
+      const S other = __shfl_sync(kFullMask, value[m], next ? next - 1 : lane);
+      if (next) value[m] += other;
+    }
+    above &= ~__ballot_sync(kFullMask, rank & 1);  // the odd ones have been taken in
+    rank >>= 1;
+  }
+}
+
+// Adds to memory that all blocks share. Sums of floating-point numbers depend on the order in which the blocks come;
+// for a result that does not, values are added as integers in units of 1 / scale.
+template <class S, bool kExact>
+struct Adder;
+template <class S>
+struct Adder<S, false> {
+  S* to;
+  __device__ void add(int64_t at, S value) const { atomicAdd(to + at, value); }
+  // four neighbours, `at` a multiple of 4
+  __device__ void add4(int64_t at, const S* v) const {
+    for (int j = 0; j < 4; ++j) atomicAdd(to + at + j, v[j]);
+  }
+};
+template <>
+__device__ inline void Adder<float, false>::add4(int64_t at, const float* v) const {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+  // one request of 16 bytes to the L2 instead of four of 4
+  asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(__cvta_generic_to_global(to + at)), "f"(v[0]),
+               "f"(v[1]), "f"(v[2]), "f"(v[3])
+               : "memory");
+#else
+  for (int j = 0; j < 4; ++j) atomicAdd(to + at + j, v[j]);
+#endif
+}
+template <class S>
+struct Adder<S, true> {
+  unsigned long long* to;  // two's complement
+  double scale;
+  __device__ void add(int64_t at, S value) const {
+    atomicAdd(to + at, static_cast<unsigned long long>(__double2ll_rn(double(value) * scale)));
+  }
+  __device__ void add4(int64_t at, const S* v) const {
+    for (int j = 0; j < 4; ++j) add(at + j, v[j]);
+  }
+};
+
+}  // namespace bt::cuda

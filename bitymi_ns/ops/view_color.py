@@ -88,5 +88,5 @@ def view_color(
     terms = check_view_color(kind, params, means.shape[0])
     given = [params[name] for name in VIEW_COLORS[kind]]
     n = means.shape[0]
-    flags = torch.ones(n, dtype=torch.uint8) if active is None else active.to(torch.uint8)
-    return _ViewColor.apply(kind, terms, flags.to(means.device), center, means, *given)
+    flags = means.new_ones(n, dtype=torch.uint8) if active is None else active.to(means.device, torch.uint8)
+    return _ViewColor.apply(kind, terms, flags, center, means, *given)

@@ -16,4 +16,5 @@ NB_MODULE(_cuda, m) {
   bt::cuda::bind_trace(m);
   bt::cuda::bind_baked(m);
   bt::cuda::bind_field(m);
+  bt::cuda::bind_appearance(m);
 }

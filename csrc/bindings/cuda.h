@@ -56,5 +56,6 @@ void bind_project(nb::module_& m);
 void bind_trace(nb::module_& m);
 void bind_baked(nb::module_& m);
 void bind_field(nb::module_& m);
+void bind_appearance(nb::module_& m);
 
 }  // namespace bt::cuda

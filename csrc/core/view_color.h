@@ -226,4 +226,48 @@ BT_HD void sg_color_vjp(int K, const S* lobes, Vec3<S> d, Vec3<S> dc, S* dbase, 
   }
 }
 
+// The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes:
+// sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
+// sb, sg a = base [n,3], b = lobes [n,K,6 or 7].
+enum ViewColorKind { kSv, kSh, kSb, kSg };
+template <class S>
+struct ViewColorArrays {
+  int kind, terms;
+  S *a, *b, *c;
+};
+// Numbers a surfel of a, b and c.
+struct ViewColorWidths {
+  int64_t a, b, c;
+};
+BT_HD ViewColorWidths view_color_widths(int kind, int K) {
+  return {kind == kSv ? 3 * K : 3,
+          kind == kSv   ? K
+          : kind == kSh ? 3 * (K - 1)
+                        : (kind == kSb ? 6 : 7) * K,
+          kind == kSv ? 3 * K : 0};
+}
+// Colour of surfel i. kind and K are those of p; a kernel that knows them when it is compiled unrolls its loops.
+template <class S>
+BT_HD Vec3<S> view_color(int kind, int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d) {
+  const ViewColorWidths w = view_color_widths(kind, K);
+  const S *a = p.a + w.a * i, *b = p.b + w.b * i;
+  if (kind == kSv) return sv_color(K, a, b, p.c + w.c * i, d);
+  if (kind == kSh) return sh_color(K, a, b, d);
+  return kind == kSb ? sb_color(K, a, b, d) : sg_color(K, a, b, d);
+}
+// Writes the gradients of the parameters of surfel i and returns that of d.
+template <class S>
+BT_HD Vec3<S> view_color_vjp(int kind, int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d, Vec3<S> dc,
+                             const ViewColorArrays<S>& dp) {
+  const ViewColorWidths w = view_color_widths(kind, K);
+  const S *a = p.a + w.a * i, *b = p.b + w.b * i;
+  S *da = dp.a + w.a * i, *db = dp.b + w.b * i;
+  Vec3<S> dd = {S(0), S(0), S(0)};
+  if (kind == kSv) sv_color_vjp(K, a, b, p.c + w.c * i, d, dc, da, db, dp.c + w.c * i, dd);
+  if (kind == kSh) sh_color_vjp(K, b, d, dc, da, db, dd);
+  if (kind == kSb) sb_color_vjp(K, b, d, dc, da, db, dd);
+  if (kind == kSg) sg_color_vjp(K, b, d, dc, da, db, dd);
+  return dd;
+}
+
 }  // namespace bt

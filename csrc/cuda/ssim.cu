@@ -1,0 +1,210 @@
+// SSIM and its gradient, separable, a channel at a time. A block takes a tile of windows: the pixels under it go to
+// shared memory once, are filtered along the rows, then down the columns, each thread keeping its part of a column in
+// registers. At 88 bytes and some 400 operations a value for both passes, memory and arithmetic are about even on an
+// H200; what is read twice, at the rims of tiles, comes from the L2.
+#include "core/ssim.h"
+#include "cuda/appearance.h"
+#include "cuda/workspace.h"
+
+namespace bt::cuda {
+
+namespace {
+constexpr int kTaps = kSsimTaps, kRim = kTaps - 1;
+constexpr int kWide = 32, kRows = 4;  // a tile is 32 columns; a thread takes 4 rows of one
+template <class S>
+constexpr int kThreads = sizeof(S) == 4 ? 128 : 64;  // as many as the shared memory of 48 KB allows
+template <class S>
+constexpr int kHigh = kThreads<S> / kWide * kRows;
+
+template <class S>
+struct Moments {
+  S image[2][kHigh<S> + kRim][kWide + kRim];
+  S row[5][kHigh<S> + kRim][kWide];
+};
+
+template <class S>
+__global__ void __launch_bounds__(kThreads<S>)
+    windows_kernel(int height, int width, int channels, SsimWindow<S> window, const S* __restrict__ a,
+                   const S* __restrict__ b, double* sums, S* __restrict__ parts) {
+  __shared__ Moments<S> s;
+  __shared__ double total[kThreads<S>];
+  const int x0 = int(blockIdx.x) * kWide, y0 = int(blockIdx.y) * kHigh<S>, channel = int(blockIdx.z);
+  const int columns = width - kRim, rows = height - kRim, thread = int(threadIdx.x);
+  for (int k = thread; k < (kHigh<S> + kRim) * (kWide + kRim); k += kThreads<S>) {
+    const int x = k % (kWide + kRim), y = k / (kWide + kRim);
+    const bool in = x0 + x < width && y0 + y < height;
+    const int64_t at = (int64_t(y0 + y) * width + x0 + x) * channels + channel;
+    s.image[0][y][x] = in ? a[at] : S(0);
+    s.image[1][y][x] = in ? b[at] : S(0);
+  }
+  __syncthreads();
+  for (int k = thread; k < (kHigh<S> + kRim) * kWide; k += kThreads<S>) {
+    const int x = k % kWide, y = k / kWide;
+    S m[5] = {};
+    BT_UNROLL
+    for (int t = 0; t < kTaps; ++t) {
+      const S p = s.image[0][y][x + t], q = s.image[1][y][x + t], kp = window.k[t] * p, kq = window.k[t] * q;
+      m[0] += kp, m[1] += kq, m[2] += kp * p, m[3] += kq * q, m[4] += kp * q;
+    }
+    BT_UNROLL
+    for (int j = 0; j < 5; ++j) s.row[j][y][x] = m[j];
+  }
+  __syncthreads();
+  const int x = thread % kWide, y = thread / kWide * kRows;
+  S m[5][kRows] = {};
+  BT_UNROLL
+  for (int j = 0; j < 5; ++j) {
+    BT_UNROLL
+    for (int t = 0; t < kTaps + kRows - 1; ++t) {
+      const S value = s.row[j][y + t][x];
+      BT_UNROLL
+      for (int i = 0; i < kRows; ++i)
+        if (t >= i && t - i < kTaps) m[j][i] += window.k[t - i] * value;
+    }
+  }
+  const S share = S(1) / (S(rows) * S(columns) * S(channels));
+  double own = 0;
+  BT_UNROLL
+  for (int i = 0; i < kRows; ++i) {
+    if (x0 + x >= columns || y0 + y + i >= rows) continue;
+    S d[3];
+    own += double(ssim_window(m[0][i], m[1][i], m[2][i], m[3][i], m[4][i], d));
+    if (!parts) continue;
+    for (int j = 0; j < 3; ++j)
+      parts[((int64_t(channel) * 3 + j) * rows + y0 + y + i) * columns + x0 + x] = share * d[j];
+  }
+  total[thread] = own;
+  for (int half = kThreads<S> / 2; half; half /= 2) {
+    __syncthreads();
+    if (thread < half) total[thread] += total[thread + half];
+  }
+  if (thread == 0) sums[(int64_t(channel) * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = total[0];
+}
+
+// Adds up the blocks in an order that depends on their number alone.
+constexpr int kSumThreads = 256;
+template <class S>
+__global__ void __launch_bounds__(kSumThreads) mean_kernel(int64_t n, const double* sums, double count, S* value) {
+  __shared__ double total[kSumThreads];
+  const int thread = int(threadIdx.x);
+  double own = 0;
+  for (int64_t i = thread; i < n; i += kSumThreads) own += sums[i];
+  total[thread] = own;
+  for (int half = kSumThreads / 2; half; half /= 2) {
+    __syncthreads();
+    if (thread < half) total[thread] += total[thread + half];
+  }
+  if (thread == 0) *value = count > 0 ? S(total[0] / count) : S(1);
+}
+
+template <class S>
+struct Parts {
+  S window[3][kHigh<S> + kRim][kWide + kRim];
+  S row[3][kHigh<S> + kRim][kWide];
+};
+
+// The transposed filter: a pixel gets from the windows up to 10 pixels above and left of it.
+template <class S>
+__global__ void __launch_bounds__(kThreads<S>)
+    gradient_kernel(int height, int width, int channels, SsimWindow<S> window, const S* __restrict__ a,
+                    const S* __restrict__ b, const S* __restrict__ parts, S* __restrict__ da) {
+  __shared__ Parts<S> s;
+  const int x0 = int(blockIdx.x) * kWide, y0 = int(blockIdx.y) * kHigh<S>, channel = int(blockIdx.z);
+  const int columns = width - kRim, rows = height - kRim, thread = int(threadIdx.x);
+  for (int k = thread; k < (kHigh<S> + kRim) * (kWide + kRim); k += kThreads<S>) {
+    const int i = k % (kWide + kRim), j = k / (kWide + kRim);
+    const int x = x0 + i - kRim, y = y0 + j - kRim;
+    const bool in = x >= 0 && y >= 0 && x < columns && y < rows;
+    BT_UNROLL
+    for (int part = 0; part < 3; ++part)
+      s.window[part][j][i] = in ? parts[((int64_t(channel) * 3 + part) * rows + y) * columns + x] : S(0);
+  }
+  __syncthreads();
+  for (int k = thread; k < (kHigh<S> + kRim) * kWide; k += kThreads<S>) {
+    const int x = k % kWide, y = k / kWide;
+    BT_UNROLL
+    for (int part = 0; part < 3; ++part) {
+      S m = S(0);
+      BT_UNROLL
+      for (int t = 0; t < kTaps; ++t) m += window.k[t] * s.window[part][y][x + kRim - t];
+      s.row[part][y][x] = m;
+    }
+  }
+  __syncthreads();
+  const int x = thread % kWide, y = thread / kWide * kRows;
+  S m[3][kRows] = {};
+  BT_UNROLL
+  for (int part = 0; part < 3; ++part) {
+    BT_UNROLL
+    for (int t = 0; t < kTaps + kRows - 1; ++t) {
+      const S value = s.row[part][y + t][x];
+      BT_UNROLL
+      for (int i = 0; i < kRows; ++i)
+        if (t >= i && t - i < kTaps) m[part][i] += window.k[kRim - (t - i)] * value;
+    }
+  }
+  BT_UNROLL
+  for (int i = 0; i < kRows; ++i) {
+    if (x0 + x >= width || y0 + y + i >= height) continue;
+    const int64_t at = (int64_t(y0 + y + i) * width + x0 + x) * channels + channel;
+    da[at] = m[0][i] + S(2) * a[at] * m[1][i] + b[at] * m[2][i];
+  }
+}
+}  // namespace
+
+namespace {
+// What a call works with: its tiles, and the memory they need.
+template <class S>
+struct Plan {
+  int64_t rows, columns;  // of windows
+  dim3 windows, pixels;   // blocks
+  double* sums;           // [blocks of windows]
+  S* parts;               // [channels, 3, rows, columns], with a gradient
+  int64_t bytes;
+
+  Plan(int height, int width, int channels, bool gradient, void* workspace)
+      : rows(height - kRim), columns(width - kRim), windows(0, 0, 0) {
+    const auto blocks = [channels](int64_t wide, int64_t high) {
+      return dim3(unsigned(ceil_div(wide, kWide)), unsigned(ceil_div(high, kHigh<S>)), unsigned(channels));
+    };
+    if (rows > 0 && columns > 0) windows = blocks(columns, rows);
+    pixels = blocks(width, height);
+    Arena arena(workspace);
+    sums = arena.take<double>(count());
+    parts = arena.take<S>(gradient && count() ? 3 * rows * columns * channels : 0);
+    bytes = arena.used();
+  }
+  int64_t count() const { return int64_t(windows.x) * windows.y * windows.z; }
+};
+}  // namespace
+
+template <class S>
+int64_t ssim_workspace(int height, int width, int channels, bool gradient) {
+  return Plan<S>(height, width, channels, gradient, nullptr).bytes;
+}
+
+template <class S>
+void ssim(int height, int width, int channels, const S* a, const S* b, S* value, S* da, void* workspace,
+          Stream stream) {
+  const Plan<S> plan(height, width, channels, da != nullptr, workspace);
+  const SsimWindow<S> window;
+  const bool any = plan.count() > 0;
+  if (any)
+    BT_LAUNCH(windows_kernel<S>, plan.windows, dim3(kThreads<S>), 0, stream, height, width, channels, window, a, b,
+              plan.sums, da ? plan.parts : nullptr);
+  BT_LAUNCH(mean_kernel<S>, dim3(1), dim3(kSumThreads), 0, stream, plan.count(), plan.sums,
+            any ? double(plan.rows) * double(plan.columns) * channels : 0.0, value);
+  if (da && any)
+    BT_LAUNCH(gradient_kernel<S>, plan.pixels, dim3(kThreads<S>), 0, stream, height, width, channels, window, a, b,
+              plan.parts, da);
+  else if (da)
+    fill_zero(da, int64_t(height) * width * channels, stream);
+}
+
+#define BT_INSTANTIATE(S)                                  \
+  template int64_t ssim_workspace<S>(int, int, int, bool); \
+  template void ssim<S>(int, int, int, const S*, const S*, S*, S*, void*, Stream);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt::cuda

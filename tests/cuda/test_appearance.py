@@ -1,0 +1,105 @@
+"""View colours and SSIM by the CUDA kernels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
+from tests.ops.test_kernels import relative
+
+DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+TERMS = {"sv": (7, 3), "sh": (16, 4), "sb": (2, 5), "sg": (2, 3)}
+"""Of each view colour: what kernels are compiled for, and another number."""
+
+
+def parameters(kind: str, terms: int, n: int) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(5)
+    shapes = {
+        "sv": {"sv_sites": (terms, 3), "sv_log_tau": (terms,), "sv_rgb": (terms, 3)},
+        "sh": {"sh_dc": (3,), "sh_rest": (terms - 1, 3)},
+        "sb": {"sb_base": (3,), "sb_lobes": (terms, 6)},
+        "sg": {"sg_base": (3,), "sg_lobes": (terms, 7)},
+    }[kind]
+    return {name: torch.randn(n, *shape, generator=g, dtype=torch.float64) for name, shape in shapes.items()}
+
+
+@DTYPES
+@pytest.mark.parametrize(("kind", "terms"), [(kind, t) for kind, both in TERMS.items() for t in both])
+def test_view_colors_and_gradients_against_the_cpu(
+    kind: str, terms: int, dtype: torch.dtype, device: torch.device, cpu
+) -> None:
+    n = 150
+    g = torch.Generator().manual_seed(1)
+    means, center = torch.randn(n, 3, generator=g, dtype=torch.float64), torch.randn(3, generator=g)
+    active = torch.rand(n, generator=g) > 0.3
+
+    def run(device: torch.device) -> list[Tensor]:
+        leaves = {k: v.to(device, dtype).requires_grad_() for k, v in parameters(kind, terms, n).items()}
+        x = means.to(device, dtype).requires_grad_()
+        color = ops.view_color(kind, leaves, x, center.to(device), active.to(device))
+        (color * torch.cos(torch.arange(3 * n, device=device)).view(n, 3).to(dtype)).sum().backward()
+        return [t.detach().cpu().double() for t in (color, x.grad, *(v.grad for v in leaves.values()))]
+
+    got = run(device)
+    with cpu():
+        want = run(torch.device("cpu"))
+    for a, b in zip(got, want, strict=True):
+        assert relative(a, b) < (1e-12 if dtype == torch.float64 else 2e-5)
+        assert not a[~active].any()
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+def test_view_colors_by_finite_differences(kind: str, device: torch.device) -> None:
+    params = parameters(kind, TERMS[kind][0], 3)
+    leaves = [v.to(device).requires_grad_() for v in (torch.randn(3, 3, dtype=torch.float64), *params.values())]
+    center = torch.zeros(3, dtype=torch.float64, device=device)
+
+    def function(x: Tensor, *values: Tensor) -> Tensor:
+        return ops.view_color(kind, dict(zip(params, values, strict=True)), x, center)
+
+    assert torch.autograd.gradcheck(function, leaves, eps=1e-6, atol=1e-6, rtol=1e-4, fast_mode=True)
+
+
+def test_view_colors_of_no_surfels_and_at_extreme_temperatures(device: torch.device) -> None:
+    none = {k: v[:0].to(device).requires_grad_() for k, v in parameters("sv", 7, 1).items()}
+    ops.view_color("sv", none, torch.zeros(0, 3, device=device).double(), torch.zeros(3)).sum().backward()
+    n = 6
+    sites = torch.randn(n, 7, 3) * torch.tensor([0.0, 1e-20, 1e-10, 1.0, 1e10, 1e18]).view(-1, 1, 1)
+    leaves = {"sv_sites": sites, "sv_log_tau": torch.full((n, 7), 80.0), "sv_rgb": torch.rand(n, 7, 3)}
+    leaves = {name: value.to(device).requires_grad_() for name, value in leaves.items()}
+    color = ops.view_color("sv", leaves, torch.zeros(n, 3, device=device), torch.zeros(3, device=device))
+    color.sum().backward()
+    assert color.isfinite().all() and all(leaf.grad.isfinite().all() for leaf in leaves.values())
+
+
+@DTYPES
+@pytest.mark.parametrize("size", [(11, 11, 3), (27, 43, 3), (40, 17, 1), (10, 30, 3), (60, 75, 2), (1, 1, 3)])
+def test_ssim_and_its_gradient(size: tuple[int, int, int], dtype: torch.dtype, device: torch.device) -> None:
+    g = torch.Generator().manual_seed(1)
+    a, b = (torch.rand(size, generator=g, dtype=torch.float64) for _ in range(2))
+    p, q = a.to(device, dtype, copy=True).requires_grad_(), a.clone().requires_grad_()
+    got = ops.ssim(p, b.to(device, dtype))
+    (3 * got).backward()
+    assert got.shape == () and got.device.type == device.type
+    if min(size[:2]) < 11:
+        assert got == 1.0 and not p.grad.any()
+        return
+    want = reference_ssim(q, b)
+    (3 * want).backward()
+    double = dtype == torch.float64
+    assert abs(got.item() - want.item()) < (1e-13 if double else 1e-5)
+    assert relative(p.grad.cpu(), q.grad) < (1e-10 if double else 1e-3)
+
+
+def test_ssim_without_a_gradient_does_not_depend_on_the_order_of_threads(device: torch.device) -> None:
+    a, b = torch.rand(50, 90, 3, device=device), torch.rand(50, 90, 3, device=device)
+    values = {float(ops.ssim(a, b))}
+    if device.type == "cpu":
+        with emulated_cuda(7):
+            values.add(float(ops.ssim(a, b)))
+    values.add(float(ops.ssim(a, b)))
+    assert len(values) == 1

@@ -1,0 +1,208 @@
+"""The residual field by the CUDA kernels: at points, at fragments and at texels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.scene import Camera, HashField, SceneConfig
+from tests.ops.golden import SURFEL_KEYS, extreme_scenes, random_scene
+from tests.ops.test_kernels import field_reference, make_field, relative
+
+
+@pytest.fixture
+def exactly():
+    """Torch asked for deterministic algorithms."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def points(count: int, device: torch.device, dtype: torch.dtype, close: bool = False) -> Tensor:
+    """[count, 3]; close: neighbours in the list share cells of the coarse levels."""
+    g = torch.Generator().manual_seed(count)
+    x = torch.randn(count, 3, generator=g, dtype=torch.float64) * 2
+    if close:
+        x = x[:1] + 0.3 * torch.arange(count)[:, None] / count
+    return x.to(device, dtype)
+
+
+def value_and_gradients(field: HashField, x: Tensor) -> list[Tensor]:
+    """rho, and the gradients of x, table and weights for a fixed direction; on the CPU, in double."""
+    x = x.clone().requires_grad_()
+    field.zero_grad()
+    rho = field(x)
+    (rho * torch.cos(torch.arange(rho.numel(), device=rho.device)).view_as(rho).to(rho)).sum().backward()
+    return [t.detach().cpu().double() for t in (rho, x.grad, *(p.grad for p in field.parameters()))]
+
+
+@pytest.mark.parametrize("contract", [True, False])
+@pytest.mark.parametrize("count", [1, 31, 33, 700])
+def test_values_against_the_reference(contract: bool, count: int, device: torch.device) -> None:
+    x = points(count, device, torch.float64)
+    field = make_field(contract, torch.float64).to(device)
+    want = field_reference(field.cpu(), x.cpu())
+    torch.testing.assert_close(field.to(device)(x).cpu(), want, rtol=1e-10, atol=1e-11)
+    single = make_field(contract, torch.float32).to(device)
+    got = single(x.float()).cpu().double()
+    torch.testing.assert_close(got, field_reference(single.cpu(), x.float().cpu()), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize(("count", "close"), [(1, False), (32, False), (300, False), (300, True)])
+def test_gradients_against_the_cpu(count: int, close: bool, dtype: torch.dtype, device: torch.device, cpu) -> None:
+    x = points(count, device, dtype, close)
+    field = make_field(True, dtype).to(device)
+    got = value_and_gradients(field, x)
+    with cpu():
+        want = value_and_gradients(field.cpu(), x.cpu())
+    for a, b in zip(got, want, strict=True):
+        assert relative(a, b) < (1e-11 if dtype == torch.float64 else 2e-4)
+
+
+def test_fewer_levels(device: torch.device, cpu) -> None:
+    for levels in (1, 3):
+        config = SceneConfig(min_resolution=8, levels=levels)
+        field = HashField(config, (0.0, 0.0, 0.0), 1.0, True, 6, torch.Generator().manual_seed(0)).double()
+        with torch.no_grad():
+            field.field_w3.uniform_(-1, 1, generator=torch.Generator().manual_seed(1))
+        x = points(40, device, torch.float64)
+        got = value_and_gradients(field.to(device), x)
+        with cpu():
+            want = value_and_gradients(field.cpu(), x.cpu())
+        for a, b in zip(got, want, strict=True):
+            assert relative(a, b) < 1e-11
+
+
+def test_gradients_by_finite_differences(device: torch.device) -> None:
+    field = make_field(True, torch.float64, log2=4).to(device)
+    x = points(5, device, torch.float64).requires_grad_()
+    weights = [w.detach().clone().requires_grad_() for w in field.weights]
+
+    def function(x: Tensor, *values: Tensor) -> Tensor:
+        return ops.field(x, field.geometry, *values)
+
+    assert torch.autograd.gradcheck(function, (x, *weights), eps=1e-7, atol=1e-5, rtol=1e-3)
+
+
+def test_no_points_and_points_far_away(device: torch.device) -> None:
+    field = make_field(True, torch.float32).to(device)
+    none = torch.zeros(0, 3, device=device, requires_grad=True)
+    field(none).sum().backward()
+    assert none.grad.shape == (0, 3) and all(not p.grad.any() for p in field.parameters())
+    far = torch.tensor([[1e30, -1e30, 1e30], [3e38, 0, 0], [1e6, 1e6, 1e6]], device=device, requires_grad=True)
+    field(far).sum().backward()
+    assert far.grad.isfinite().all() and all(p.grad.isfinite().all() for p in field.parameters())
+
+
+class Shading:
+    """Fragments of a random view by the CPU kernels, and their colours with all gradients by either kernels."""
+
+    def __init__(self, dtype: torch.dtype, cpu, case=None) -> None:
+        case = case or random_scene(25, 11, width=20, height=18, scale=0.4)
+        camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+        with cpu(), torch.no_grad():
+            self.projection = ops.project(*(case.params[key].to(dtype) for key in SURFEL_KEYS), camera)
+            self.fragments = ops.trace(self.projection)
+        n = len(case.params["means"])
+        self.base = torch.linspace(-0.8, 0.8, 3 * n, dtype=dtype).view(n, 3)
+        self.field = make_field(True, dtype, log2=6)
+
+    def run(self, device: torch.device, mode: str, bound: float = 0.05) -> list[Tensor]:
+        """Colours and gradients of base colours, frames, uv, table and weights; those that the mode has."""
+        f = self.fragments
+        moved = {name: getattr(f, name).to(device) for name in ("weight", "uv", "depth", "surfel", "pixel", "sigma")}
+        leaves = [t.to(device).requires_grad_() for t in (self.base.clone(), self.projection.frames.clone())]
+        moved["uv"] = moved["uv"].clone().requires_grad_()
+        fragments = ops.Fragments(
+            **moved, tile_start=f.tile_start.to(device), width=f.width, height=f.height, layout=f.layout
+        )
+        params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]
+        geometry = None if mode == "plain" else self.field.geometry
+        args = (geometry, () if mode == "plain" else tuple(params), bound, mode == "move")
+        colors = ops.shade(fragments, *leaves, *args)
+        (colors * torch.cos(torch.arange(colors.numel(), device=device)).view_as(colors).to(colors)).sum().backward()
+        grads = [t.grad for t in (*leaves, fragments.uv, *params)]
+        return [t.detach().cpu().double() for t in (colors, *grads) if t is not None]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize("mode", ["plain", "frozen", "learn", "move"])
+def test_shading_against_the_cpu(mode: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
+    shading = Shading(dtype, cpu)
+    got = shading.run(device, mode)
+    with cpu():
+        want = shading.run(torch.device("cpu"), mode)
+    assert len(got) == len(want) == {"plain": 2, "frozen": 2, "learn": 6, "move": 8}[mode]
+    for a, b in zip(got, want, strict=True):
+        assert b.abs().max() > 0
+        assert relative(a, b) < (1e-11 if dtype == torch.float64 else 2e-4)
+
+
+@pytest.mark.parametrize("bound", [0.0, 2.0])
+def test_weight_bounds_that_let_all_or_nothing_through(bound: float, device: torch.device, cpu) -> None:
+    shading = Shading(torch.float64, cpu)
+    got = shading.run(device, "move", bound)
+    with cpu():
+        want = shading.run(torch.device("cpu"), "move", bound)
+    for a, b in zip(got, want, strict=True):
+        assert relative(a, b) < 1e-11
+
+
+def test_without_fragments(device: torch.device, cpu) -> None:
+    case = random_scene(3, 0, width=8, height=8)
+    case.params["opacity_logits"].fill_(-20.0)
+    shading = Shading(torch.float32, cpu, case)
+    assert len(shading.fragments) == 0
+    colors, *grads = shading.run(device, "move")
+    assert colors.shape == (0, 3) and not any(g.any() for g in grads)
+
+
+EXTREMES = ("edge_on", "huge_scales", "coordinates_1e6", "screen_filling", "beta_0")
+
+
+@pytest.mark.parametrize("case", [c for c in extreme_scenes() if c.name in EXTREMES], ids=lambda case: case.name)
+def test_extreme_scenes_stay_finite(case, device: torch.device, cpu) -> None:
+    for values in Shading(torch.float32, cpu, case).run(device, "move"):
+        assert values.isfinite().all()
+
+
+def test_deterministic_sums_do_not_depend_on_the_order_of_threads(device: torch.device, cpu, exactly) -> None:
+    shading = Shading(torch.float32, cpu)
+    if device.type == "cpu":
+        runs = []
+        for seed in range(3):
+            with emulated_cuda(seed):
+                runs.append(shading.run(device, "move"))
+    else:
+        runs = [shading.run(device, "move") for _ in range(5)]
+    for other in runs[1:]:
+        for a, b in zip(runs[0], other, strict=True):
+            assert torch.equal(a, b)
+    with cpu():
+        want = shading.run(torch.device("cpu"), "move")
+    for a, b in zip(runs[0], want, strict=True):
+        assert relative(a, b) < 2e-4
+
+
+def test_deterministic_sums_at_points_and_frozen(device: torch.device, cpu, exactly) -> None:
+    shading = Shading(torch.float64, cpu)
+    got, points_got = (
+        shading.run(device, "frozen"),
+        value_and_gradients(shading.field.to(device), points(99, device, torch.float64)),
+    )
+    with cpu():
+        want = shading.run(torch.device("cpu"), "frozen")
+        points_want = value_and_gradients(shading.field.cpu(), points(99, torch.device("cpu"), torch.float64))
+    for a, b in zip((*got, *points_got), (*want, *points_want), strict=True):
+        assert relative(a, b) < 1e-9
+
+
+def test_a_gradient_that_is_not_finite_is_not_hidden_by_deterministic_sums(device: torch.device, exactly) -> None:
+    field = make_field(True, torch.float32).to(device)
+    rho = field(points(40, device, torch.float32))
+    rho.backward(torch.full_like(rho, float("nan")))
+    assert field.field_table.grad.isnan().any()

@@ -72,6 +72,7 @@ target_include_directories(bitymi_cuda PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
 set_target_properties(bitymi_cuda PROPERTIES
   POSITION_INDEPENDENT_CODE ON CUDA_STANDARD 17 CUDA_STANDARD_REQUIRED ON CUDA_RUNTIME_LIBRARY Static
   CUDA_VISIBILITY_PRESET hidden)
+target_compile_definitions(bitymi_cuda PRIVATE BITYMI_ARCHITECTURES="${CMAKE_CUDA_ARCHITECTURES}")
 target_compile_options(bitymi_cuda PRIVATE --expt-relaxed-constexpr -lineinfo -Xcompiler=-Wall)
 find_package(CUDAToolkit REQUIRED)
 nanobind_add_module(_cuda NB_STATIC NOMINSIZE ${cuda_bindings})

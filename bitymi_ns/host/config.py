@@ -18,7 +18,7 @@ from bitymi_ns.host import checkpoints
 from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
 from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
-from bitymi_ns.host.device import default_device_type, has_cuda_kernels
+from bitymi_ns.host.device import default_device_type, has_cuda_kernels, why_not_cuda
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
@@ -62,8 +62,7 @@ class BitymiTrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
         super().set_timestamp()
-        if self.machine.device_type != "cpu" and not has_cuda_kernels():
-            why = "there is no GPU" if not torch.cuda.is_available() else "this installation has no kernels for the GPU"
+        if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
         self._make_paths_absolute()

@@ -21,7 +21,7 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
-from bitymi_ns.train.trainer import training_step
+from bitymi_ns.train.trainer import LossWatch, training_step
 from bitymi_ns.train.views import ReducedViews, View, as_float, over_background
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ class TrainingRun:
         cameras = self.datamanager.train_dataset.cameras
         pixels = float((cameras.width * cameras.height).double().mean())
         self.strategy = Strategy(self.config, self.schedule, extent, self._on_resize, pixels)
+        self.watch = LossWatch()
         self.clock = Stopwatch()
         self._random_state: Tensor | None = None
         self._load(model.resume_state)
@@ -118,8 +119,9 @@ class TrainingRun:
         step, factor = self.step, self.schedule.resolution_factor(self.step)
         camera = to_camera(cameras, self.model.device)
         _, image, mask = self.views.at(int(batch["image_idx"]), factor)
+        arguments = (self.model.scene, camera, image, mask, self.schedule, step, self.config, self.watch)
         try:
-            terms, self._output = training_step(self.model.scene, camera, image, mask, self.schedule, step, self.config)
+            terms, self._output = training_step(*arguments)
         except TrainingDiverged as error:
             self._diverged(step, error)
         return terms
@@ -132,6 +134,8 @@ class TrainingRun:
         self._output = None
         optimizers = {name: self.optimizers.optimizers[name] for name in scene.surfels.keys()}
         try:
+            if step in self.curve_steps:
+                self.watch.finish(scene)
             report = self.strategy.step(step, scene, optimizers, lambda k, g: self.views.draw(k, g, factor))
         except ValueError as error:
             self._diverged(step, error)

@@ -56,8 +56,11 @@ class Camera:
         return other
 
     def to(self, device: torch.device | str) -> Camera:
-        """The same camera on another device."""
-        return self._with(viewmat=self.viewmat.to(device), K=self.K.to(device))
+        """The same camera on another device; the host does not wait for a copy from its memory."""
+        wait = self.K.device.type != "cpu"
+        return self._with(
+            viewmat=self.viewmat.to(device, non_blocking=not wait), K=self.K.to(device, non_blocking=not wait)
+        )
 
     def scaled(self, factor: float) -> Camera:
         """The camera of the same view with its image resized by `factor` (size rounded to whole pixels)."""

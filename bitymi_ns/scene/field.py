@@ -51,12 +51,22 @@ class HashField(nn.Module):
         self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3))
         # in the checkpoint: a loaded field lies where the trained one did
         self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
+        self._geometry = FieldGeometry(self.min_resolution, contract, tuple(mid), half)
+        self._read_from = self._state_of_domain()
 
     @property
     def geometry(self) -> FieldGeometry:
-        """Where the grid lies."""
-        *mid, half, contract = self.domain.tolist()
-        return FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
+        """Where the grid lies. Read back once: a step must not wait for the device to tell."""
+        now = self._state_of_domain()
+        if self._read_from[0] is not now[0] or self._read_from[1] != now[1]:
+            *mid, half, contract = self.domain.tolist()
+            self._geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
+            self._read_from = now
+        return self._geometry
+
+    def _state_of_domain(self) -> tuple[Tensor, int]:
+        """Changes when the buffer is replaced or written to."""
+        return self.domain, -1 if self.domain.is_inference() else self.domain._version
 
     @property
     def weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

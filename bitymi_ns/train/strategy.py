@@ -113,13 +113,13 @@ class Strategy:
             for name in STATISTICS:
                 setattr(self, name, getattr(self, name).to(device))
         height, width = output.rgb.shape[:2]
-        to_ndc = torch.tensor([0.5 * width, 0.5 * height], device=device)
         for total, gradient in (
             (self.grad_sum, projection.mean2d_grad),
             (self.abs_grad_sum, projection.mean2d_absgrad),
         ):
             if gradient is not None:  # no fragment at all, nothing to differentiate
-                size = (gradient * to_ndc).norm(dim=-1).nan_to_num(0.0, 0.0, 0.0)
+                ndc = (0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
+                size = torch.hypot(*ndc).nan_to_num(0.0, 0.0, 0.0)
                 total += torch.where(visible, size, 0.0)
         self.visible_count += visible
         radius = projection.radii.reshape(n, -1).amax(-1).float()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -61,6 +62,48 @@ class TrainLog:
     """Reports of the strategy, each with its `step`."""
 
 
+class LossWatch:
+    """Notices a loss that is not finite.
+
+    On a CUDA device the host does not wait for the numbers: they are looked at when they have arrived, a few steps
+    later.
+    """
+
+    def __init__(self) -> None:
+        self._underway: deque[tuple[int, tuple[str, ...], Tensor, torch.cuda.Event]] = deque()
+
+    def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
+        """Take in the terms of a step's loss.
+
+        Raises:
+            TrainingDiverged: a term of this step, or of an earlier one, is not finite.
+        """
+        names, values = tuple(terms), torch.stack([term.detach() for term in terms.values()])
+        if values.device.type != "cuda":
+            self._check(scene, step, names, values)
+            return
+        arrived = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
+        arrived.copy_(values, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record(torch.cuda.current_stream(values.device))
+        self._underway.append((step, names, arrived, event))
+        while self._underway and self._underway[0][3].query():
+            self._check(scene, *self._underway.popleft()[:3])
+
+    def finish(self, scene: Scene) -> None:
+        """Wait for all that is underway; raises what `note` raises."""
+        while self._underway:
+            self._underway[0][3].synchronize()
+            self._check(scene, *self._underway.popleft()[:3])
+
+    @staticmethod
+    def _check(scene: Scene, step: int, names: tuple[str, ...], values: Tensor) -> None:
+        for name, value in zip(names, values.tolist(), strict=True):
+            if not math.isfinite(value):
+                cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
+                raise TrainingDiverged(f"the {name} loss is {value} at step {step}: {cause}")
+
+
 def training_step(
     scene: Scene,
     camera: Camera,
@@ -69,6 +112,7 @@ def training_step(
     schedule: Schedule,
     step: int,
     config: TrainConfig,
+    watch: LossWatch | None = None,
 ) -> tuple[dict[str, Tensor], RenderOutput]:
     """Render a training view as the schedule asks for and compare it with its photograph.
 
@@ -79,6 +123,7 @@ def training_step(
         mask: [H, W] or [H, W, 1] bool at either size, True where the pixel counts; None = everywhere.
         schedule, step: resolution and freezing.
         config: training options.
+        watch: of the run; without one a step waits until its own loss is known.
 
     Returns:
         The weighted terms of the loss (their sum is the objective), and the rendered view.
@@ -95,10 +140,10 @@ def training_step(
     output = scene.render(view.camera, background=background, field_mode=mode)
     target = over_background(view.image, background)
     terms = objective(output, target, scene.surfels["beta_raw"], config.loss, view.mask)
-    for name, term in terms.items():
-        if not math.isfinite(term.item()):
-            cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
-            raise TrainingDiverged(f"the {name} loss is {term.item()} at step {step}: {cause}")
+    own = watch or LossWatch()
+    own.note(scene, step, terms)
+    if watch is None:
+        own.finish(scene)
     return terms, output
 
 
@@ -126,7 +171,7 @@ class Trainer:
     Attributes:
         step: number of steps done.
         seconds, cpu_seconds: time that training took, without evaluation.
-        loss: objective of the last step.
+        loss: objective of the last step; on a CUDA device, reading it waits for the step to end.
     """
 
     def __init__(
@@ -156,7 +201,8 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.cpu_seconds = 0.0
-        self.loss = math.nan
+        self.watch = LossWatch()
+        self._loss = torch.tensor(math.nan)
 
     def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
         """Do one step: the terms of its loss, the rendered view, and what the strategy did after it."""
@@ -167,7 +213,7 @@ class Trainer:
         for name, optimizer in self.optimizers.items():
             optimizer.param_groups[0]["lr"] = self.schedule.lr(name, step)
             optimizer.zero_grad(set_to_none=True)
-        terms, output = training_step(self.scene, camera, image, mask, self.schedule, step, self.config)
+        terms, output = training_step(self.scene, camera, image, mask, self.schedule, step, self.config, self.watch)
         total = torch.stack(list(terms.values())).sum()
         if total.requires_grad:
             total.backward()
@@ -178,11 +224,15 @@ class Trainer:
         report = self.strategy.step(
             step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
         )
-        self.loss = total.item()
+        self._loss = total.detach()
         self.step += 1
         self.seconds += time.perf_counter() - start
         self.cpu_seconds += time.process_time() - cpu_start
         return terms, output, report
+
+    @property
+    def loss(self) -> float:
+        return self._loss.item()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact resume needs: tensors, numbers and text only."""
@@ -254,6 +304,7 @@ def fit(
         if report:
             log.events.append({"step": trainer.step - 1, **report})
         if trainer.step in due:
+            trainer.watch.finish(scene)
             quality, fragments = evaluate(scene, eval_views, config)
             times = (trainer.seconds, trainer.cpu_seconds)
             log.entries.append(LogEntry(trainer.step, *times, len(scene), fragments, trainer.loss, quality))

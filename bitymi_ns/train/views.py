@@ -70,7 +70,7 @@ def background_color(
         return torch.ones(3, device=device)
     if kind == "random":
         generator = torch.Generator().manual_seed((seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
-        return torch.rand(3, generator=generator).to(device)
+        return torch.rand(3, generator=generator).to(device, non_blocking=True)
     raise ValueError(f"background must be black, white or random, not {kind!r}")
 
 
@@ -102,6 +102,9 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
 class ReducedViews:
     """Training views at the resolution of the moment; reduced pictures are kept until the resolution changes.
 
+    On a CUDA device the full-size pictures stay there as they came, up to a quarter of the memory that is free at the
+    start: else every step would wait for one to be copied.
+
     Args:
         views: at full size.
         device: where the pictures are wanted.
@@ -109,9 +112,12 @@ class ReducedViews:
 
     def __init__(self, views: Sequence[View], device: torch.device | str = "cpu") -> None:
         self._views = views
-        self._device = device
+        self._device = torch.device(device)
         self._factor = 1.0
         self._kept: dict[int, View] = {}
+        self._resident: dict[int, View] = {}
+        cuda = self._device.type == "cuda"
+        self._room = torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0
 
     def __len__(self) -> int:
         return len(self._views)
@@ -125,13 +131,24 @@ class ReducedViews:
         if factor != self._factor:
             self._factor, self._kept = factor, {}
         if index not in self._kept:
-            view = self._views[index]
-            camera = view.camera.to(self._device)
+            view = self._full_size(index)
+            camera = view.camera
             view = at_size(view, camera.scaled(factor) if factor < 1.0 else camera, self._device)
             if factor == 1.0:
                 return view
             self._kept[index] = view
         return self._kept[index]
+
+    def _full_size(self, index: int) -> View:
+        if index in self._resident:
+            return self._resident[index]
+        view = self._views[index]
+        pictures = [None if picture is None else picture.to(self._device) for picture in view[1:]]
+        moved = View(view.camera.to(self._device), *pictures)
+        size = sum(picture.nbytes for picture in pictures if picture is not None)
+        if size <= self._room:
+            self._resident[index], self._room = moved, self._room - size
+        return moved
 
     def draw(self, k: int, generator: torch.Generator, factor: float) -> list[View]:
         """`k` different views, or all of them when there are fewer; `generator` lives on the CPU."""

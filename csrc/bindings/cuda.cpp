@@ -1,6 +1,9 @@
 // bitymi_ns._cuda: the functions of bitymi_ns._cpu for arrays on a CUDA device, each with the stream that it runs on.
 // The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
+#include <nanobind/stl/string.h>
+
 #include "bindings/cuda.h"
+#include "cuda/device_check.h"
 
 using namespace nanobind::literals;
 
@@ -12,6 +15,8 @@ NB_MODULE(_emulated, m) {
 NB_MODULE(_cuda, m) {
   m.doc() = "CUDA kernels: see bitymi_ns.ops for their meaning.";
 #endif
+  m.def("device_problem", &bt::cuda::device_problem, "device"_a,
+        "Why the kernels cannot run on a CUDA device and what to do about it; empty when they can.");
   bt::cuda::bind_project(m);
   bt::cuda::bind_trace(m);
   bt::cuda::bind_baked(m);

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.bake.evaluate import evaluate_tiles
+from bitymi_ns.bake.packing import pack
 from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene import Camera, HashField, SceneConfig
 from tests.ops.golden import SURFEL_KEYS, extreme_scenes, random_scene
 from tests.ops.test_kernels import field_reference, make_field, relative
@@ -206,3 +210,43 @@ def test_a_gradient_that_is_not_finite_is_not_hidden_by_deterministic_sums(devic
     rho = field(points(40, device, torch.float32))
     rho.backward(torch.full_like(rho, float("nan")))
     assert field.field_table.grad.isnan().any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_bake_of_tiles_against_points(dtype: torch.dtype, device: torch.device, cpu) -> None:
+    """Rows of 4 to 64 texels, tiles of fewer than 32 and surfels without one, each with its own extent."""
+    sides = np.array([[4, 4], [64, 4], [0, 0], [8, 16], [4, 64], [32, 32], [0, 0]])
+    packing = pack(sides)
+    g = torch.Generator().manual_seed(3)
+    frames = torch.randn(len(sides), 9, generator=g, dtype=torch.float64).to(device, dtype)
+    extent = (1 + torch.rand(len(sides), generator=g, dtype=torch.float64)).to(device, dtype)
+    field = make_field(True, dtype).to(device)
+    tiles, pages = torch.from_numpy(packing.tiles), (packing.layers, packing.height, packing.width)
+    texels, bad = field_tiles(frames, extent, tiles, pages, field.geometry, *field.weights)
+    assert int(bad) == 0
+    want = torch.zeros(*pages, 3, dtype=dtype)
+    with cpu():
+        field.cpu()
+        for frame, e, (x, y, layer, r_u, r_v) in zip(frames.cpu(), extent.cpu(), packing.tiles.tolist(), strict=True):
+            u, v = (((torch.arange(r, dtype=dtype) + 0.5) / max(r, 1) * 2 - 1) * e for r in (r_u, r_v))
+            at = frame[:3] + u[None, :, None] * frame[3:6] + v[:, None, None] * frame[6:]
+            want[layer, y : y + r_v, x : x + r_u] = field(at.reshape(-1, 3)).detach().view(r_v, r_u, 3)
+    tolerance = 1e-10 if dtype == torch.float64 else 1e-3
+    torch.testing.assert_close(texels.cpu(), want, rtol=tolerance, atol=tolerance)
+
+
+def test_bake_by_the_kernel_equals_the_bake_by_points(device: torch.device, cpu) -> None:
+    g = torch.Generator().manual_seed(1)
+    n = 20
+    means, quats, scales = torch.randn(n, 3, generator=g), torch.randn(n, 4, generator=g), torch.rand(n, 2, generator=g)
+    packing = pack(2 ** np.random.default_rng(1).integers(2, 5, (n, 2)))
+    field = make_field(True, torch.float32)
+    with torch.no_grad():
+        field.field_table[0, 3] = float("nan")
+    done = []
+    arguments = (means.to(device), quats.to(device), scales.to(device), packing, 2.5)
+    got, bad = evaluate_tiles(field.to(device), *arguments, progress=lambda what, at, total: done.append((at, total)))
+    with cpu():
+        want, want_bad = evaluate_tiles(field.cpu(), means, quats, scales, packing, 2.5)
+    assert bad == want_bad > 0 and done[-1][0] == done[-1][1] == packing.tiles[:, 3:].prod(1).sum()
+    assert ((got - want).abs() < 1e-3).float().mean() > 0.999

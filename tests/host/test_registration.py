@@ -82,7 +82,7 @@ def test_a_cpu_gets_a_short_run_and_says_so() -> None:
 
 
 def test_a_gpu_gets_the_full_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(config, "has_cuda_kernels", lambda: True)
+    monkeypatch.setattr(config, "why_not_cuda", lambda: None)
     run = fresh()
     run.machine.device_type = "cuda"
     run.set_timestamp()
@@ -92,12 +92,12 @@ def test_a_gpu_gets_the_full_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_device_without_kernels_is_not_used(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(config, "has_cuda_kernels", lambda: False)
+    monkeypatch.setattr(config, "why_not_cuda", lambda: "the card is too old")
     run = fresh()
     run.machine.device_type = "cuda"
     run.set_timestamp()
     assert run.machine.device_type == "cpu" and run.max_num_iterations == 3000
-    assert "on the CPU instead of cuda" in capsys.readouterr().out
+    assert "on the CPU instead of cuda: the card is too old" in capsys.readouterr().out
 
 
 def test_a_given_length_is_kept() -> None:

@@ -1,0 +1,213 @@
+#!/usr/bin/env python
+"""Trains a capture on a CUDA card with the core packages alone (nerfstudio is not used), bakes it and draws the bundle:
+held-out PSNR against seconds of training, peak memory, bytes of the atlas, frames a second of trained and baked scene.
+
+`--device cpu` runs the same on the CPU, to try the script: take few steps and a --downscale.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import number, page, publish, say, table
+from gpu_common import Options, milliseconds
+from plain_capture import Capture, load_capture
+
+from bitymi_ns import bake
+from bitymi_ns.host.preset import Preset, build, load_preset
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.domain import build_scene
+from bitymi_ns.train.trainer import Trainer, evaluate
+from bitymi_ns.train.views import background_color, over_background
+
+
+@dataclass
+class Point:
+    """The state of a run after `step` steps."""
+
+    step: int
+    seconds: float
+    surfels: int
+    psnr: float
+
+
+@dataclass
+class Result:
+    """One run.
+
+    Attributes:
+        curve: held-out PSNR over the run.
+        peak: most bytes allocated on the card while training.
+        waits: how often the host waited for the card in a step, of the last steps; None on the CPU.
+        frame: median milliseconds of a held-out view of the trained scene.
+        baked_psnr, baked_frame: of the bundle.
+        atlas: bytes of the atlas.
+        bake_seconds: of the bake with encoding.
+    """
+
+    preset: str
+    curve: list[Point]
+    peak: int
+    waits: float | None
+    frame: float
+    baked_psnr: float
+    baked_frame: float
+    atlas: int
+    bake_seconds: float
+
+
+def new_scene(capture: Capture, preset: Preset) -> Scene:
+    """Surfels at the points of the capture, as the preset wants them."""
+    centers = torch.stack([view.camera.center for view in capture.train])
+    pixels = sum(view.camera.width * view.camera.height for view in capture.train)
+    bounded = capture.train[0].image.shape[-1] == 4
+    scene, _ = build_scene(
+        capture.points, capture.colours, centers, preset.scene, preset.train, bounded, image_pixels=pixels
+    )
+    return scene
+
+
+def waits_of(trainer: Trainer, steps: int) -> float:
+    """Mean number of times that the host waits for the card in a step, over the next steps."""
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(steps):
+                trainer.advance()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return sum("synchronizing" in str(w.message) for w in caught) / steps
+
+
+def run(name: str, capture: Capture, steps: int, points: int, device: torch.device, options: Options) -> Result:
+    """Trains, bakes and draws."""
+    preset = load_preset(name)
+    scene = new_scene(capture, preset).to(device)
+    trainer = Trainer(scene, capture.train, preset.train, steps)
+    due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
+    cuda = device.type == "cuda"
+    if cuda:
+        torch.cuda.reset_peak_memory_stats(device)
+    curve, seconds, waits = [], 0.0, None
+    while trainer.step < steps:
+        start = time.perf_counter()
+        if cuda and trainer.step == steps - 20:
+            waits = waits_of(trainer, 20)
+        else:
+            trainer.advance()
+        if cuda and trainer.step in due:
+            torch.cuda.synchronize(device)
+        seconds += time.perf_counter() - start
+        if trainer.step in due:
+            trainer.watch.finish(scene)
+            psnr, _ = evaluate(scene, capture.held_out, preset.train)
+            curve.append(Point(trainer.step, seconds, len(scene), psnr))
+            say(f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {psnr:.2f} dB, {len(scene):,} surfels")
+    peak = torch.cuda.max_memory_allocated(device) if cuda else 0
+    camera = capture.held_out[0].camera.to(device)
+    with torch.no_grad():
+        frame = milliseconds(lambda: scene.render(camera, field_mode="frozen"), options)
+    start = time.perf_counter()
+    made = bake.bake(
+        scene, [view.camera for view in capture.train], build(bake.BakeOptions, preset.bake, name, "bake.")
+    )
+    bake_seconds = time.perf_counter() - start
+    with tempfile.TemporaryDirectory() as folder:
+        bake.export(made, Path(folder) / "bundle")
+        baked = BakedScene.from_bundle(bake.read_bundle(Path(folder) / "bundle")).to(device)
+    baked_frame = milliseconds(lambda: baked.render(camera), options)
+    size = 0 if made.atlas is None else made.atlas.nbytes
+    return Result(
+        name, curve, peak, waits, frame, _psnr(baked, capture, preset, device), baked_frame, size, bake_seconds
+    )
+
+
+def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.device) -> float:
+    background = background_color("white" if preset.train.background == "white" else "black", 0, 0, device)
+    values = []
+    for camera, image, _ in capture.held_out:
+        rgb = baked.render(camera.to(device), background).rgb.clamp(0, 1)
+        target = over_background(image.to(device).float() / 255, background)
+        values.append(-10 * math.log10(max((rgb - target).square().mean().item(), 1e-10)))
+    return sum(values) / len(values)
+
+
+def report(results: list[Result], capture: Capture) -> str:
+    """Markdown."""
+    camera = capture.held_out[0].camera
+    rows = [
+        [
+            r.preset,
+            number(r.curve[-1].seconds, 1),
+            number(r.curve[-1].psnr, 2),
+            number(r.curve[-1].surfels, 0),
+            number(r.peak / 1e6, 0),
+            number(r.waits, 1),
+            number(1e3 / r.frame, 0),
+            number(r.bake_seconds, 1),
+            number(r.atlas / 1e6, 2),
+            number(r.baked_psnr, 2),
+            number(1e3 / r.baked_frame, 0),
+        ]
+        for r in results
+    ]
+    header = ("preset", "training s", "PSNR dB", "surfels", "peak MB", "waits a step", "frames/s")
+    header += ("bake s", "atlas MB", "baked PSNR dB", "baked frames/s")
+    text = (
+        f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n\n"
+    )
+    text += table(header, rows)
+    for r in results:
+        curve = [[number(p.step, 0), number(p.seconds, 1), number(p.surfels, 0), number(p.psnr, 2)] for p in r.curve]
+        text += f"\n\n#### {r.preset}\n\n" + table(("step", "seconds", "surfels", "PSNR dB"), curve)
+    return text
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
+    parser.add_argument(
+        "--presets", nargs="+", default=["bitymi", "bitymi-quality"], help="method_configs (%(default)s)"
+    )
+    parser.add_argument("--steps", type=int, help="length of a run; default: the preset's on a GPU")
+    parser.add_argument("--points", type=int, default=10, help="evaluations over a run (%(default)s)")
+    parser.add_argument("--downscale", type=int, default=1, help="whole factor by which photographs are reduced")
+    parser.add_argument("--device", default="cuda", help="cuda or cpu (%(default)s)")
+    parser.add_argument("--warm-up", type=int, default=10, help="frames before those that are timed (%(default)s)")
+    parser.add_argument("--runs", type=int, default=200, help="frames that are timed (%(default)s)")
+    parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
+    arguments = parser.parse_args()
+    device = torch.device(arguments.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        parser.error("no CUDA device is to be seen (or torch is a CPU build); --device cpu tries the script without")
+    try:
+        capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
+    except (OSError, KeyError, ValueError) as error:
+        parser.error(f"the capture {arguments.data} cannot be read: {error}")
+    options = Options(device, (), (), arguments.warm_up, arguments.runs, 0.0)
+    results = []
+    for name in arguments.presets:
+        steps = arguments.steps or load_preset(name).trainer.iterations
+        results.append(run(name, capture, steps, min(arguments.points, steps), device, options))
+    what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    notes = [f"Device: {what}.", f"Frames: median of {arguments.runs} after {arguments.warm_up}, launches included."]
+    publish(page(f"Training on a card: {arguments.data.name}", report(results, capture), notes), arguments.output)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,111 @@
+"""A capture with a transforms.json read without nerfstudio: photographs, poses and the sparse points."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import View
+
+PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
+    "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
+    "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
+
+
+@dataclass
+class Capture:
+    """What training needs.
+
+    Attributes:
+        train, held_out: views; every `interval`-th photograph is held out, the first one too.
+        points: [M, 3] sparse points.
+        colours: [M, 3] in [0, 1].
+    """
+
+    train: list[View]
+    held_out: list[View]
+    points: Tensor
+    colours: Tensor
+
+
+def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture:
+    """Reads an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and
+    their largest coordinate 1. The orientation stays.
+
+    Args:
+        folder: with transforms.json.
+        interval: of the photographs that are held out.
+        downscale: whole factor by which photographs are reduced.
+
+    Raises:
+        ValueError: the images have lens distortion, or the point cloud is of another kind.
+    """
+    meta = json.loads((folder / "transforms.json").read_text("utf8"))
+    frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
+    poses = torch.tensor(
+        [frame["transform_matrix"] for frame in frames], dtype=torch.float64
+    )  # camera to world, OpenGL
+    middle = poses[:, :3, 3].mean(0)
+    scale = 1.0 / float((poses[:, :3, 3] - middle).abs().max())
+    views = []
+    for frame, pose in zip(frames, poses, strict=True):
+        values = {**meta, **frame}
+        if any(float(values.get(k, 0)) for k in ("k1", "k2", "k3", "k4", "p1", "p2")):
+            raise ValueError(f"{folder}: the images have lens distortion; undistort the capture first")
+        image = Image.open(folder / frame["file_path"])
+        image = image.convert("RGBA" if "A" in image.mode else "RGB")
+        size = (image.width // downscale, image.height // downscale)
+        picture = torch.from_numpy(np.array(image if downscale == 1 else image.resize(size, Image.Resampling.BOX)))
+        views.append(View(_camera(values, pose, middle, scale, *size), picture))
+    points, colours = _points(folder / meta["ply_file_path"]) if "ply_file_path" in meta else (torch.zeros(0, 3),) * 2
+    points = ((points.double() - middle) * scale).float()
+    held_out = [view for i, view in enumerate(views) if i % interval == 0]
+    return Capture([view for i, view in enumerate(views) if i % interval], held_out, points, colours)
+
+
+def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, width: int, height: int) -> Camera:
+    rotation = pose[:3, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ ((pose[:3, 3] - middle) * scale)
+    x, y = width / values["w"], height / values["h"]
+    K = torch.tensor([[values["fl_x"] * x, 0, values["cx"] * x], [0, values["fl_y"] * y, values["cy"] * y], [0, 0, 1]])
+    return Camera(viewmat.float(), K.float(), width, height)
+
+
+def _points(path: Path) -> tuple[Tensor, Tensor]:
+    """Positions and colours of a PLY file whose one element is `vertex`."""
+    with open(path, "rb") as file:
+        header = []
+        while not header or header[-1] != "end_header":
+            line = file.readline()
+            if not line:
+                raise ValueError(f"{path} is no PLY file")
+            header.append(line.decode("ascii", "replace").strip())
+        body = file.read()
+    words = [line.split() for line in header]
+    count = next(int(w[2]) for w in words if w[:2] == ["element", "vertex"])
+    names = [(w[2], PLY_TYPES[w[1]]) for w in words if w[0] == "property"]
+    form = next(w[1] for w in words if w[0] == "format")
+    if form == "ascii":
+        table = np.array(body.split()[: count * len(names)], dtype=np.float64).reshape(count, len(names))
+        columns = {name: table[:, i] for i, (name, _) in enumerate(names)}
+    elif form == "binary_little_endian":
+        rows = np.frombuffer(body, dtype=names, count=count)
+        columns = {name: rows[name].astype(np.float64) for name, _ in names}
+    else:
+        raise ValueError(f"{path}: PLY files of the format {form} are not read")
+    xyz, rgb = (
+        np.stack([columns[name] for name in group], axis=1) for group in (("x", "y", "z"), ("red", "green", "blue"))
+    )
+    return torch.from_numpy(xyz).float(), torch.from_numpy(rgb / 255).float()

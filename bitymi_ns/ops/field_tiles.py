@@ -1,0 +1,65 @@
+"""The residual field at the texel centres of an atlas, by the CUDA kernels."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+from .field import FieldGeometry, kernel_field
+from .project import FRAME
+
+WARP = 32
+"""Texels that are evaluated together."""
+
+
+@torch.no_grad()
+def field_tiles(
+    frames: Tensor,
+    extent: Tensor,
+    tiles: Tensor,
+    pages: tuple[int, int, int],
+    geometry: FieldGeometry,
+    table: Tensor,
+    w1: Tensor,
+    w2: Tensor,
+    w3: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """rho at every texel centre, u = (i + 0.5) / r_u * 2 e - e and the same for v, x = mean + u s_u t_u + v s_v t_v.
+
+    Args:
+        frames: [N, 9] mean, s_u t_u, s_v t_v, world frame, on a CUDA device.
+        extent: [N] e, half side of the tile in scale units.
+        tiles: [N, 5] int32 x, y, layer, r_u, r_v in texels; r_u r_v = 0: no tile. They lie within the pages.
+        pages: layers, height and width of the pages.
+        geometry, table, w1, w2, w3: the field, as in `field`.
+
+    Returns:
+        [layers, height, width, 3], 0 outside the tiles and where the field is not finite; and [1] int32, the number of
+        texels where it is not.
+
+    Raises:
+        ValueError: shapes do not agree.
+    """
+    n = frames.shape[0]
+    shapes = {"frames": (frames, (n, FRAME)), "extent": (extent, (n,)), "tiles": (tiles, (n, 5))}
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    where = tiles.to(frames.device, torch.int32).contiguous()
+    warps = -(-(where[:, 3].long() * where[:, 4].long()) // WARP)
+    first = torch.cat([warps.new_zeros(1), warps.cumsum(0)])
+    texels, bad = frames.new_zeros(*pages, 3), torch.zeros(1, dtype=torch.int32, device=frames.device)
+    kernel("bake_tiles", frames)(
+        kernel_field(geometry, table, w1, w2, w3),
+        dense(frames, frames),
+        dense(extent, frames),
+        where,
+        first,
+        int(first[-1]),
+        pages[2],
+        pages[1],
+        texels,
+        bad,
+    )
+    return texels, bad

@@ -1,0 +1,65 @@
+"""Whole training steps on the device: the same loss and parameters as on the CPU."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.trainer import Trainer, evaluate
+from bitymi_ns.train.views import View
+from tests.ops.golden import random_scene
+
+STEPS = 3
+
+
+def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[View]]:
+    """A few discs with a texture, and photographs of other colours."""
+    case = random_scene(20, 5, width=20, height=16, scale=0.5)
+    config = SceneConfig(min_resolution=8)
+    field = HashField(config, (0.0, 0.0, 0.0), 4.0, True, 6, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.field_w3.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
+    scene = Scene(config, {key: value.to(dtype) for key, value in case.params.items()}, field.to(dtype))
+    g = torch.Generator().manual_seed(2)
+    camera = Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
+    return scene, [View(camera, torch.rand(16, 20, channels, generator=g)) for channels in (3, 4)]
+
+
+def train(device: torch.device) -> tuple[list[float], float, dict[str, torch.Tensor]]:
+    """Losses of the steps, PSNR after them, and the parameters on the CPU."""
+    scene, views = scene_and_views()
+    config = TrainConfig(background="random", resolution_schedule=0, freeze_after=1, freeze_every=2)
+    trainer = Trainer(scene.to(device), views, config, STEPS)
+    losses = []
+    for _ in range(STEPS):
+        trainer.advance()
+        losses.append(trainer.loss)
+    trainer.watch.finish(scene)
+    psnr, _ = evaluate(scene, views, config)
+    return losses, psnr, {name: p.detach().cpu() for name, p in scene.named_parameters()}
+
+
+def test_training_steps_equal_those_of_the_cpu(device: torch.device, cpu) -> None:
+    losses, psnr, parameters = train(device)
+    with cpu():
+        want_losses, want_psnr, want = train(torch.device("cpu"))
+    assert losses == pytest.approx(want_losses, rel=1e-4)
+    assert psnr == pytest.approx(want_psnr, abs=0.01)
+    for name, value in want.items():
+        # Adam's first steps are as long as the rate whatever the gradient: where that is all but 0 its sign may differ
+        close = torch.isclose(parameters[name], value, rtol=1e-3, atol=1e-4)
+        assert close.float().mean() > 0.97, name
+
+
+def test_a_loss_that_is_not_finite_ends_the_run(device: torch.device) -> None:
+    scene, views = scene_and_views()
+    broken = [View(views[0].camera, torch.full_like(views[0].image, math.nan))]
+    trainer = Trainer(scene.to(device), broken, TrainConfig(resolution_schedule=0), 10)
+    with pytest.raises(TrainingDiverged, match="loss is nan at step 0"):
+        trainer.advance()
+        trainer.watch.finish(scene)

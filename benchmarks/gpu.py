@@ -99,13 +99,14 @@ def main() -> int:
         if not torch.cuda.is_available():
             parser.error("no CUDA device is to be seen (or torch is a CPU build); --emulated tries the script without")
         build()
+    import gpu_appearance
     import gpu_baked
     import gpu_training
     from gpu_common import Options, Section, copy_bandwidth, missing
 
     from bitymi_ns.ops.backend import emulated_cuda
 
-    sections: tuple[Section, ...] = (*gpu_baked.SECTIONS, *gpu_training.SECTIONS)
+    sections: tuple[Section, ...] = (*gpu_baked.SECTIONS, *gpu_training.SECTIONS, *gpu_appearance.SECTIONS)
     names = [section.name for section in sections]
     if unknown := set(arguments.sections or ()) - set(names):
         parser.error(f"no section {', '.join(sorted(unknown))}: there are {', '.join(names)}")

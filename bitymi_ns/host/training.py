@@ -117,8 +117,8 @@ class TrainingRun:
     def losses(self, cameras: Cameras, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Render the step's view at the resolution of the schedule and compare it with its photograph."""
         step, factor = self.step, self.schedule.resolution_factor(self.step)
-        camera = to_camera(cameras, self.model.device)
-        _, image, mask = self.views.at(int(batch["image_idx"]), factor)
+        index = int(batch["image_idx"])
+        camera, (_, image, mask) = self.views.camera(index), self.views.at(index, factor)
         arguments = (self.model.scene, camera, image, mask, self.schedule, step, self.config, self.watch)
         try:
             terms, self._output = training_step(*arguments)

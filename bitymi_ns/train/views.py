@@ -123,8 +123,8 @@ class ReducedViews:
         return len(self._views)
 
     def camera(self, index: int) -> Camera:
-        """The camera of the full-size image of view number `index`."""
-        return self._views[index].camera
+        """The camera of the full-size image of view number `index`, on the device."""
+        return self._full_size(index).camera
 
     def at(self, index: int, factor: float) -> View:
         """View number `index`, its image resized by `factor`."""

@@ -125,7 +125,9 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
     bake_seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         bake.export(made, Path(folder) / "bundle")
-        baked = BakedScene.from_bundle(bake.read_bundle(Path(folder) / "bundle")).to(device)
+        baked = BakedScene.from_bundle(bake.read_bundle(Path(folder) / "bundle"))
+    if cuda:
+        baked = baked.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)
     size = 0 if made.atlas is None else made.atlas.nbytes
     return Result(

@@ -1,8 +1,9 @@
 // bitymi_ns._cuda: the functions of bitymi_ns._cpu for arrays on a CUDA device, each with the stream that it runs on.
 // The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
+#include "bindings/cuda.h"
+
 #include <nanobind/stl/string.h>
 
-#include "bindings/cuda.h"
 #include "cuda/device_check.h"
 
 using namespace nanobind::literals;

@@ -1,6 +1,6 @@
-#include "cuda/device_check.h"
-
+// What a kernel without work tells about the device.
 #include "cuda/device.h"
+#include "cuda/device_check.h"
 
 namespace bt::cuda {
 

@@ -50,8 +50,6 @@ inline void check(cudaError_t error, const char* what) {
 
 #include "cuda/emulator.h"
 
-#define BT_UNROLL
-
 #define BT_ALLOW_SHARED(kernel, bytes) ((void)(kernel), (void)(bytes))
 
 #define BT_LAUNCH(kernel, grid, block, shared, stream, ...) \

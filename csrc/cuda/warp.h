@@ -54,7 +54,7 @@ struct Adder<S, false> {
 };
 template <>
 __device__ inline void Adder<float, false>::add4(int64_t at, const float* v) const {
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && (__CUDACC_VER_MAJOR__ > 12 || __CUDACC_VER_MINOR__ >= 1)
   // one request of 16 bytes to the L2 instead of four of 4
   asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(__cvta_generic_to_global(to + at)), "f"(v[0]),
                "f"(v[1]), "f"(v[2]), "f"(v[3])

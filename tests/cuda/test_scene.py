@@ -1,0 +1,62 @@
+"""Whole views and their gradients on the CUDA kernels against the CPU kernels: every operation of a training step."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
+from tests.ops.golden import SceneCase, load_golden, random_scene
+
+
+def scene_of(case: SceneCase, device: torch.device, texture: bool) -> tuple[Scene, Camera]:
+    config = SceneConfig(texture="hash" if texture else "none", min_resolution=8)
+    field = None
+    if texture:
+        g = torch.Generator().manual_seed(0)
+        field = HashField(config, (0.1, -0.2, 0.3), 3.0, True, 8, g)
+        with torch.no_grad():
+            for parameter in field.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=g) * 0.5)
+    scene = Scene(config, case.params, field).to(device, torch.float64)
+    return scene, Camera(case.viewmat, case.K, case.width, case.height).to(device)
+
+
+def step(case: SceneCase, device: torch.device, texture: bool, mode: str) -> dict[str, Tensor]:
+    """Images and gradients of 0.8 L1 + 0.2 (1 - SSIM) and of the maps."""
+    scene, camera = scene_of(case, device, texture)
+    output = scene.render(camera, case.background.to(device), field_mode=mode, maps=True)
+    photo = torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
+    loss = 0.8 * (output.rgb - photo).abs().mean() + 0.2 * (1 - ops.ssim(output.rgb, photo))
+    loss = loss + output.beta.mean() + 0.1 * output.depth.mean() + (output.normal * photo).mean()
+    loss.backward()
+    result = {name: getattr(output, name).detach() for name in ("rgb", "alpha", "beta", "depth", "normal", "overdraw")}
+    for name, parameter in scene.named_parameters():
+        if parameter.grad is not None:
+            result[f"gradient of {name}"] = parameter.grad
+    return {name: value.cpu().double() for name, value in result.items()}
+
+
+@pytest.mark.parametrize(("texture", "mode"), [(False, "off"), (True, "frozen"), (True, "train")])
+@pytest.mark.parametrize("name", ["random", "inside_the_scene", "seed 5"])
+def test_a_training_step_equals_that_of_the_cpu(name: str, texture: bool, mode: str, device: torch.device, cpu) -> None:
+    case = random_scene(40, 5, 33, 21) if name == "seed 5" else load_golden(name)
+    got = step(case, device, texture, mode)
+    with cpu():
+        want = step(case, torch.device("cpu"), texture, mode)
+    assert got.keys() == want.keys()
+    assert any("field" in key for key in got) == (mode == "train")
+    for key, value in want.items():
+        assert (got[key] - value).abs().max() <= 1e-9 * value.abs().max(), key
+
+
+def test_an_empty_scene_is_its_background(device: torch.device) -> None:
+    case = random_scene(5, 0, 20, 18)
+    case.params = {key: value[:0] for key, value in case.params.items()}
+    scene, camera = scene_of(case, device, False)
+    output = scene.render(camera, case.background.to(device), maps=True)
+    assert len(output.fragments) == 0 and not output.overdraw.any()
+    assert torch.equal(output.rgb.detach(), case.background.to(device).expand_as(output.rgb))
+    output.rgb.sum().backward()

@@ -8,6 +8,7 @@ from .field import FieldGeometry, field
 from .project import Projection, project
 from .shade import shade
 from .ssim import ssim
+from .texel import TexelFragments, TexelTiles, add_texel_gradient, texel_image
 from .trace import Fragments, masked_counts, trace
 from .view_color import VIEW_COLORS, view_color
 
@@ -16,6 +17,9 @@ __all__ = [
     "FieldGeometry",
     "Fragments",
     "Projection",
+    "TexelFragments",
+    "TexelTiles",
+    "add_texel_gradient",
     "composite",
     "composite_image",
     "field",
@@ -23,6 +27,7 @@ __all__ = [
     "project",
     "shade",
     "ssim",
+    "texel_image",
     "trace",
     "view_color",
 ]

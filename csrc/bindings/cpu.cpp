@@ -57,6 +57,12 @@ FragmentArrays<S> fragments(int64_t n, const Array<int32_t>& surfel, const Array
   return {data(surfel, n, "surfel"), data(pixel, n, "pixel"), data(weight, n, "weight"),
           data(uv, 2 * n, "uv"),     data(depth, n, "depth"), data(sigma, n, "sigma")};
 }
+template <class S>
+TexelFragments<S> texel_fragments(const Array<const int32_t>& surfel, const Array<const int32_t>& pixel,
+                                  const Array<const S>& weight, const Array<const S>& uv) {
+  const int64_t n = int64_t(surfel.size());
+  return {n, surfel.data(), data(pixel, n, "pixel"), data(weight, n, "weight"), data(uv, 2 * n, "uv")};
+}
 // tile_start [tiles + 1] of f fragments
 int64_t tiles_of(const Array<const int64_t>& tile_start, int64_t f) {
   const int64_t tiles = int64_t(tile_start.size()) - 1;
@@ -107,6 +113,7 @@ void bind(nb::module_& m, const char* suffix) {
   using In = Array<const S>;
   using Out = Array<S>;
   using Ints = Array<int32_t>;
+  using ConstInts = Array<const int32_t>;
   using Starts = Array<const int64_t>;
 
   m.def(
@@ -350,6 +357,42 @@ void bind(nb::module_& m, const char* suffix) {
       "frames"_a.noconvert(), "field"_a.none(), "colors"_a.noconvert(), "dcolors"_a.noconvert(), "dbase"_a.noconvert(),
       "dtable"_a.noconvert().none(), "dw1"_a.noconvert().none(), "dw2"_a.noconvert().none(), "dw3"_a.noconvert().none(),
       "duv"_a.noconvert().none(), "dframes"_a.noconvert().none());
+
+  m.def(
+      name("texel_image_forward").c_str(),
+      [](Starts tile_start, ConstInts surfel, ConstInts pixel, In weight, In uv, double bound, In base, Starts first,
+         ConstInts size, In extent, In texels, Out image) {
+        const int64_t n = int64_t(first.size()), count = int64_t(surfel.size());
+        const int64_t tiles = tiles_of(tile_start, count), pixels = int64_t(image.size()) / 3;
+        const TexelFragments<S> f = texel_fragments<S>(surfel, pixel, weight, uv);
+        const TexelTiles<S> table = {first.data(), data(size, 2 * n, "size"), data(extent, n, "extent")};
+        const S* b = data(base, 3 * n, "base");
+        nb::gil_scoped_release release;
+        texel_image_forward(pixels, tile_start.data(), tiles, f, S(bound), b, table, texels.data(), image.data());
+      },
+      "tile_start"_a.noconvert(), "surfel"_a.noconvert(), "pixel"_a.noconvert(), "weight"_a.noconvert(),
+      "uv"_a.noconvert(), "bound"_a, "base"_a.noconvert(), "first"_a.noconvert(), "size"_a.noconvert(),
+      "extent"_a.noconvert(), "texels"_a.noconvert(), "image"_a.noconvert());
+
+  m.def(
+      name("texel_image_backward").c_str(),
+      [](Starts run_start, Starts order, ConstInts surfel, ConstInts pixel, In weight, In uv, double bound, In base,
+         Starts first, ConstInts size, In extent, In texels, In dimage, Maybe<S> dtexels, Maybe<S> dbase) {
+        const int64_t n = int64_t(first.size()), count = int64_t(surfel.size());
+        const int64_t runs = tiles_of(run_start, count);
+        const TexelFragments<S> f = texel_fragments<S>(surfel, pixel, weight, uv);
+        const TexelTiles<S> table = {first.data(), data(size, 2 * n, "size"), data(extent, n, "extent")};
+        const int64_t* o = data(order, runs, "order");
+        const S* b = data(base, 3 * n, "base");
+        S* dt = data_or_null(dtexels, int64_t(texels.size()), "dtexels");
+        S* db = data_or_null(dbase, 3 * n, "dbase");
+        nb::gil_scoped_release release;
+        texel_image_backward(n, run_start.data(), o, runs, f, S(bound), b, table, texels.data(), dimage.data(), dt, db);
+      },
+      "run_start"_a.noconvert(), "order"_a.noconvert(), "surfel"_a.noconvert(), "pixel"_a.noconvert(),
+      "weight"_a.noconvert(), "uv"_a.noconvert(), "bound"_a, "base"_a.noconvert(), "first"_a.noconvert(),
+      "size"_a.noconvert(), "extent"_a.noconvert(), "texels"_a.noconvert(), "dimage"_a.noconvert(),
+      "dtexels"_a.noconvert().none(), "dbase"_a.noconvert().none());
 
   m.def(
       name("ssim").c_str(),

@@ -2,6 +2,8 @@
 // with e the half side of the surfel's tile in scale units (eq. texel centres).
 #pragma once
 
+#include <cstdint>
+
 #include "core/surfel.h"
 
 namespace bt {
@@ -24,6 +26,34 @@ BT_HD T texel_position_scaled(T u, S span, S k) {
 template <class S>
 BT_HD S texel_centre(int i, int r, S extent) {
   return (S(i) + S(0.5)) * (S(2) * extent / S(r)) - extent;
+}
+
+// The texels between which the fetch interpolates, as offsets from the tile's first (rows along v), and their weights.
+template <class S>
+struct TexelCorners {
+  int64_t at[4];
+  S weight[4];
+};
+template <class S>
+BT_HD TexelCorners<S> texel_corners(S u, S v, int r_u, int r_v, S extent) {
+  const S x = texel_position(u, r_u, extent), y = texel_position(v, r_v, extent);
+  const int x0 = int(x), y0 = int(y);
+  const S fx = x - S(x0), fy = y - S(y0);
+  const int64_t corner = int64_t(y0) * r_u + x0, right = x0 + 1 < r_u ? 1 : 0, down = y0 + 1 < r_v ? r_u : 0;
+  return {{corner, corner + right, corner + down, corner + down + right},
+          {(S(1) - fx) * (S(1) - fy), fx * (S(1) - fy), (S(1) - fx) * fy, fx * fy}};
+}
+
+// Residual colour there, and its vector-Jacobian product: the fetch is linear in the texels.
+template <class S>
+BT_HD Vec3<S> texel_fetch(const S* tile, const TexelCorners<S>& c) {
+  Vec3<S> sum = c.weight[0] * load3(tile + 3 * c.at[0]);
+  for (int k = 1; k < 4; ++k) sum = sum + c.weight[k] * load3(tile + 3 * c.at[k]);
+  return sum;
+}
+template <class S>
+BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
+  for (int k = 0; k < 4; ++k) store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + c.weight[k] * g);
 }
 
 }  // namespace bt

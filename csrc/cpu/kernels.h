@@ -134,6 +134,30 @@ struct Patches {
 // Throws std::invalid_argument for a tile that does not lie on its page.
 void gather_patches(int layers, int height, int width, const uint8_t* bytes, const float* floats, int64_t n,
                     const int32_t* tiles, Patches& out);
+// Texels of all tiles in one list, rows along v: tile i of r_u x r_v texels begins at first[i]; 0, 0 = no tile.
+template <class S>
+struct TexelTiles {
+  const int64_t* first;  // [n], in texels
+  const int32_t* size;   // [n, 2]
+  const S* extent;       // [n] half side of the tile, scale units
+};
+template <class S>
+struct TexelFragments {
+  int64_t count;
+  const int32_t *surfel, *pixel;
+  const S *weight, *uv;  // uv [2, count]
+};
+// image [pixels, 3] = sum of w relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile w relu(base +
+// 0.5)
+template <class S>
+void texel_image_forward(int64_t pixels, const int64_t* tile_start, int64_t tiles, const TexelFragments<S>& f, S bound,
+                         const S* base, const TexelTiles<S>& table, const S* texels, S* image);
+// Adds to dtexels [texels, 3] and writes dbase [n, 3]; either may be null. Fragments i with run_start[r] <= i <
+// run_start[r + 1] belong to one surfel; `order` sorts the runs by surfel.
+template <class S>
+void texel_image_backward(int64_t n, const int64_t* run_start, const int64_t* order, int64_t runs,
+                          const TexelFragments<S>& f, S bound, const S* base, const TexelTiles<S>& table,
+                          const S* texels, const S* dimage, S* dtexels, S* dbase);
 
 // Forward-only renderer of a baked scene.
 struct Atlas {

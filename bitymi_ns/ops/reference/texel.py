@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -33,3 +35,34 @@ def texel(tile: Tensor, uv: Tensor) -> Tensor:
     top = tile[low[:, 1], low[:, 0]] * (1 - fu) + tile[low[:, 1], high[:, 0]] * fu
     bottom = tile[high[:, 1], low[:, 0]] * (1 - fu) + tile[high[:, 1], high[:, 0]] * fu
     return top * (1 - fv) + bottom * fv
+
+
+def texel_image(
+    weight: Tensor,
+    uv: Tensor,
+    surfel: Tensor,
+    pixel: Tensor,
+    base: Tensor,
+    tiles: Sequence[Tensor],
+    extent: Tensor,
+    bound: float,
+    pixels: int,
+) -> Tensor:
+    """Sum over the fragments of w ReLU(ReLU(base + 0.5) + texel(u, v)) a pixel, [pixels, 3].
+
+    Args:
+        weight, uv, surfel, pixel: [F], [2, F] in scale units, [F], [F] of the fragments.
+        base: [N, 3] view-dependent colours without the 0.5.
+        tiles: N tiles [r_v, r_u, 3]; one without texels is no tile.
+        extent: [N] half side of each tile, scale units.
+        bound: fragments of smaller weight have no residual.
+    """
+    image = base.new_zeros(pixels, 3)
+    for i, tile in enumerate(tiles):
+        mine = surfel == i
+        color = torch.relu(base[i] + 0.5).expand(int(mine.sum()), 3)
+        if tile.numel():
+            residual = texel(tile, uv[:, mine].T * (SUPPORT / extent[i]))
+            color = torch.where(weight[mine, None] >= bound, torch.relu(color + residual), color)
+        image = image.index_add(0, pixel[mine], weight[mine, None] * color)
+    return image

@@ -1,0 +1,167 @@
+"""Images from texels: what the baked renderer shows of a view whose fragments are known, differentiable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel
+from .trace import Fragments
+
+
+@dataclass(frozen=True)
+class TexelTiles:
+    """Where the tiles of the surfels lie in one list of texels, [T, 3].
+
+    Texel (i, j) of surfel s, i along u and j along v, is row first[s] + j r_u + i; its centre lies at
+    u = (i + 0.5) / r_u * 2e - e, v likewise. A tile of 1 x 1 texel is a constant.
+
+    Attributes:
+        first: [N] int64.
+        size: [N, 2] int32 (r_u, r_v); (0, 0) = no tile.
+        extent: [N] half side e of the tile in scale units, of the texels' dtype.
+    """
+
+    first: Tensor
+    size: Tensor
+    extent: Tensor
+
+    @classmethod
+    def of_sizes(cls, size: Tensor, extent: Tensor) -> TexelTiles:
+        """Tiles of the sizes [N, 2] and extents [N], one after the other."""
+        area = size.long().prod(dim=1)
+        return cls(area.cumsum(0) - area, size.to(torch.int32).contiguous(), extent.contiguous())
+
+    @property
+    def count(self) -> int:
+        """T: texels of all tiles."""
+        return int(self.size.long().prod(dim=1).sum())
+
+
+@dataclass(frozen=True)
+class TexelFragments:
+    """What the colours of a view depend on once its geometry stands still. Nothing here has a gradient.
+
+    Attributes:
+        weight: [F] blending weight.
+        uv: [2, F] surfel coordinates in scale units.
+        surfel, pixel: [F] int32, row of the surfel and y * width + x.
+        tile_start: [tiles + 1] int64, where the fragments of each screen tile begin.
+        run_start: [R + 1] int64; fragments run_start[r] to run_start[r + 1] - 1 are of one surfel.
+        order: [R] int64, the runs sorted by surfel: the backward pass gives every thread whole surfels, so that no two
+            add to one texel and its sums do not depend on the number of threads.
+        width, height: of the image, pixels.
+    """
+
+    weight: Tensor
+    uv: Tensor
+    surfel: Tensor
+    pixel: Tensor
+    tile_start: Tensor
+    run_start: Tensor
+    order: Tensor
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, fragments: Fragments, keep: Tensor | None = None) -> TexelFragments:
+        """The fragments of a view, or those of them that `keep` [F] bool names."""
+        _, _, weight, uv, _, _ = fragments.arrays
+        surfel, pixel, tile_start = fragments.surfel, fragments.pixel, fragments.tile_start
+        if keep is not None:
+            rows = torch.nonzero(keep).squeeze(1)
+            weight, uv, surfel, pixel = weight[rows], uv[:, rows].contiguous(), surfel[rows], pixel[rows]
+            tile_start = torch.searchsorted(rows, tile_start)
+        new = torch.ones(len(surfel) + 1, dtype=torch.bool)
+        new[1:-1] = surfel[1:] != surfel[:-1]
+        run_start = torch.nonzero(new).squeeze(1) if len(surfel) else torch.zeros(1, dtype=torch.int64)
+        order = torch.argsort(surfel[run_start[:-1]], stable=True)
+        return cls(weight, uv, surfel, pixel, tile_start, run_start, order, fragments.width, fragments.height)
+
+    def __len__(self) -> int:
+        return self.weight.shape[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        arrays = (self.weight, self.uv, self.surfel, self.pixel, self.tile_start, self.run_start, self.order)
+        return sum(array.numel() * array.element_size() for array in arrays)
+
+    @property
+    def arrays(self) -> tuple[Tensor, ...]:
+        """What the kernels take: surfel, pixel, weight, uv."""
+        return self.surfel, self.pixel, self.weight, self.uv
+
+
+class _TexelImage(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, base, texels, fragments, tiles, bound):
+        b, t, f = dense(base, texels), dense(texels, texels), fragments
+        image = t.new_empty(f.width * f.height, 3)
+        table = (tiles.first, tiles.size, tiles.extent)
+        kernel("texel_image_forward", t)(f.tile_start, *f.arrays, bound, b, *table, t, image)
+        ctx.save_for_backward(b, t)
+        ctx.fragments, ctx.tiles, ctx.bound = fragments, tiles, bound
+        return image
+
+    @staticmethod
+    def backward(ctx, dimage):
+        b, t = ctx.saved_tensors
+        dbase = torch.empty_like(b) if ctx.needs_input_grad[0] else None
+        dtexels = torch.zeros_like(t) if ctx.needs_input_grad[1] else None
+        add_texel_gradient(dimage, ctx.fragments, b, t, ctx.tiles, ctx.bound, dtexels, dbase)
+        return dbase, dtexels, None, None, None
+
+
+def texel_image(
+    fragments: TexelFragments, base: Tensor, texels: Tensor, tiles: TexelTiles, bound: float = 0.0
+) -> Tensor:
+    """Sum over a pixel's fragments of w ReLU(ReLU(f_view(d) + 0.5) + r(u, v)), eq. (color) with the texels' residual r:
+    bilinear between the four nearest texel centres, constant beyond the outer ones.
+
+    Differentiable in `base` and `texels`.
+
+    Args:
+        fragments: of an H x W view; weights and coordinates have the texels' dtype.
+        base: [N, 3] f_view of every surfel.
+        texels: [T, 3] residual colours.
+        tiles: where they lie.
+        bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
+
+    Returns:
+        [H * W, 3]; the background is not included.
+
+    Raises:
+        ValueError: the tiles are not those of these texels or surfels.
+    """
+    if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
+        raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
+    if tuple(base.shape) != (len(tiles.first), 3):
+        raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
+    return _TexelImage.apply(base, texels, fragments, tiles, bound)
+
+
+def add_texel_gradient(
+    dimage: Tensor,
+    fragments: TexelFragments,
+    base: Tensor,
+    texels: Tensor,
+    tiles: TexelTiles,
+    bound: float,
+    dtexels: Tensor | None,
+    dbase: Tensor | None = None,
+) -> None:
+    """The backward pass of `texel_image` for callers that sum over views: autograd would clear and add a whole atlas a
+    view.
+
+    Args:
+        dimage: [H * W, 3] gradient of the image.
+        fragments, base, texels, tiles, bound: as in `texel_image`.
+        dtexels: [T, 3], added to; None = not wanted.
+        dbase: [N, 3], written; None = not wanted.
+    """
+    f, table = fragments, (tiles.first, tiles.size, tiles.extent)
+    gradients = (dense(dimage, texels), dtexels, dbase)
+    kernel("texel_image_backward", texels)(f.run_start, f.order, *f.arrays, bound, base, *table, texels, *gradients)

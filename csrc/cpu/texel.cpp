@@ -1,0 +1,91 @@
+// Colours from texels, summed a pixel, and their backward pass: what the baked renderer shows, differentiable.
+#include "core/texel.h"
+
+#include "cpu/kernels.h"
+#include "cpu/threads.h"
+
+namespace bt {
+
+namespace {
+// What the fragments of one surfel share.
+template <class S>
+struct Patch {
+  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
+  int64_t first;        // texel
+  S extent;
+  Vec3<S> view;  // relu(f_view + 0.5)
+
+  Patch(const TexelTiles<S>& tiles, const S* base, int64_t id)
+      : size(tiles.size + 2 * id),
+        first(tiles.first[id]),
+        extent(tiles.extent[id]),
+        view{relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)), relu(base[3 * id + 2] + S(0.5))} {}
+  bool textured() const { return size[0] > 0; }
+  TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
+};
+}  // namespace
+
+template <class S>
+void texel_image_forward(int64_t pixels, const int64_t* tile_start, int64_t tiles, const TexelFragments<S>& f, S bound,
+                         const S* base, const TexelTiles<S>& table, const S* texels, S* image) {
+  std::fill(image, image + 3 * pixels, S(0));
+  parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
+    for (int64_t i = tile_start[first]; i < tile_start[last];) {
+      const int32_t id = f.surfel[i];
+      const Patch<S> patch(table, base, id);
+      for (; i < tile_start[last] && f.surfel[i] == id; ++i) {
+        Vec3<S> c = patch.view;
+        if (patch.textured() && f.weight[i] >= bound) {
+          const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
+          c = c + texel_fetch(texels + 3 * patch.first, corners);
+          c = {relu(c.x), relu(c.y), relu(c.z)};
+        }
+        S* to = image + 3 * int64_t(f.pixel[i]);
+        store3(to, load3(to) + f.weight[i] * c);
+      }
+    }
+  });
+}
+
+template <class S>
+void texel_image_backward(int64_t n, const int64_t* run_start, const int64_t* order, int64_t runs,
+                          const TexelFragments<S>& f, S bound, const S* base, const TexelTiles<S>& table,
+                          const S* texels, const S* dimage, S* dtexels, S* dbase) {
+  if (dbase) std::fill(dbase, dbase + 3 * n, S(0));
+  // `order` sorts the runs by surfel. A thread takes whole surfels: their tiles are its own, nothing is added twice.
+  std::vector<int64_t> cost(runs + 1, 0);
+  for (int64_t r = 0; r < runs; ++r) cost[r + 1] = cost[r] + run_start[order[r] + 1] - run_start[order[r]];
+  parallel_tiles(cost.data(), runs, 1 << 20, [&](int, int64_t begin, int64_t end) {
+    const auto surfel = [&](int64_t r) { return f.surfel[run_start[order[r]]]; };
+    while (begin > 0 && begin < runs && surfel(begin) == surfel(begin - 1)) ++begin;
+    while (end < runs && surfel(end) == surfel(end - 1)) ++end;
+    for (int64_t r = begin; r < end; ++r) {
+      const int64_t id = surfel(r);
+      const Patch<S> patch(table, base, id);
+      Vec3<S> sum = {S(0), S(0), S(0)};
+      for (int64_t i = run_start[order[r]]; i < run_start[order[r] + 1]; ++i) {
+        Vec3<S> g = f.weight[i] * load3(dimage + 3 * int64_t(f.pixel[i]));
+        if (patch.textured() && f.weight[i] >= bound) {
+          const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
+          const Vec3<S> c = patch.view + texel_fetch(texels + 3 * patch.first, corners);
+          g = {c.x > S(0) ? g.x : S(0), c.y > S(0) ? g.y : S(0), c.z > S(0) ? g.z : S(0)};
+          if (dtexels) texel_fetch_vjp(corners, g, dtexels + 3 * patch.first);
+        }
+        sum = sum + g;
+      }
+      if (!dbase) continue;
+      const S v[3] = {patch.view.x, patch.view.y, patch.view.z}, g[3] = {sum.x, sum.y, sum.z};
+      for (int c = 0; c < 3; ++c) dbase[3 * id + c] += v[c] > S(0) ? g[c] : S(0);
+    }
+  });
+}
+
+#define BT_INSTANTIATE(S)                                                                                              \
+  template void texel_image_forward<S>(int64_t, const int64_t*, int64_t, const TexelFragments<S>&, S, const S*,        \
+                                       const TexelTiles<S>&, const S*, S*);                                            \
+  template void texel_image_backward<S>(int64_t, const int64_t*, const int64_t*, int64_t, const TexelFragments<S>&, S, \
+                                        const S*, const TexelTiles<S>&, const S*, const S*, S*, S*);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt

@@ -4,6 +4,7 @@ from bitymi_ns.bake.bundle import Bundle, BundleError, World, check_target, read
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, bake, export
 from bitymi_ns.bake.progress import Progress, rich_progress
+from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bake.verify import Check, check_field, check_files
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "BundleError",
     "Check",
     "Progress",
+    "TuneOptions",
     "World",
     "bake",
     "check_field",
@@ -21,6 +23,7 @@ __all__ = [
     "export",
     "read_bundle",
     "rich_progress",
+    "tune_atlas",
     "verify_bundle",
     "write_bundle",
 ]

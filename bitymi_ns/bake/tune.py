@@ -1,0 +1,285 @@
+"""Fine-tuning of an atlas against the photographs: texels alone; geometry, opacity and view colours stand still."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.evaluate import size_classes, texel_index
+from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.surfel_table import view_color_kind
+from bitymi_ns.ops import (
+    TexelFragments,
+    TexelTiles,
+    add_texel_gradient,
+    composite_image,
+    project,
+    shade,
+    texel_image,
+    trace,
+    view_color,
+)
+from bitymi_ns.train.losses import photometric, psnr
+from bitymi_ns.train.views import View, as_float, over_background, training_order
+
+FEWEST_VIEWS = 4
+"""With fewer views none can be set aside: an atlas is then not tuned."""
+
+
+@dataclass
+class TuneOptions:
+    """How an atlas is fine-tuned."""
+
+    steps: int = 400
+    """Steps; each looks at one training view."""
+    rate: float = 0.1
+    """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
+    prior: float = 1.0
+    """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
+    of the rate, one never seen not at all."""
+    ssim_weight: float = 0.2
+    """Share of 1 - SSIM in the loss; the rest is L1."""
+    held_in_every: int = 8
+    """Every so-many-th training view is set aside; the texels kept are those that show these best."""
+    checks: int = 16
+    """How often these views are looked at over the run."""
+    patience: int = 4
+    """Looks without a gain after which the run ends."""
+    cache_bytes: int = 4 << 30
+    """Memory for the fragments of the views; what does not fit is traced anew at every step."""
+    seed: int = 0
+    """Of the order of the views."""
+
+    def check(self) -> None:
+        """Refuses values that make no sense."""
+        for name, least in (("steps", 1), ("held_in_every", 2), ("checks", 1), ("patience", 1), ("cache_bytes", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} of the fine-tuning must be at least {least}, not {getattr(self, name)}")
+        if not self.rate > 0 or not self.prior > 0 or not 0 <= self.ssim_weight <= 1:
+            raise ValueError("rate and prior of the fine-tuning must be positive, the SSIM weight between 0 and 1")
+
+
+@dataclass
+class TexelView:
+    """A photograph, and what the texels add to its picture.
+
+    Attributes:
+        fragments: those that show a texel.
+        base: [N, 3] f_view of every surfel.
+        rest: [H, W, 3] the picture without these fragments: the faint ones, and the background.
+        target: [H, W, 3] the photograph over the background.
+        mask: [H, W, 1] bool, True where the pixel counts; None = everywhere.
+    """
+
+    fragments: TexelFragments
+    base: Tensor
+    rest: Tensor
+    target: Tensor
+    mask: Tensor | None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return self.fragments.nbytes + sum(a.numel() * a.element_size() for a in (self.base, self.rest, self.target))
+
+
+class TexelScene:
+    """A baked scene as a list of texels, for pictures and gradients.
+
+    Attributes:
+        tiles: where the texels lie. A surfel without a tile has one texel, its constant residual.
+        texels: [T, 3] as baked.
+    """
+
+    def __init__(self, baked: Baked, background: Tensor) -> None:
+        """
+        Args:
+            baked: with an atlas.
+            background: [3] colour behind the scene.
+        """
+        if baked.texels is None:
+            raise ValueError("a scene without texture has no texels to tune")
+        self._baked, self._background = baked, background
+        self._kind = view_color_kind(baked.surfels)
+        rectangles = torch.from_numpy(baked.packing.tiles)
+        self.tiles = TexelTiles.of_sizes(rectangles[:, 3:].clamp(min=1), baked.extent.float())
+        self.texels = torch.empty(self.tiles.count, 3)
+        pages = baked.texels.reshape(-1, 3)
+        for rows, texel in self._places():
+            self.texels[rows] = pages[texel]
+        bare = rectangles[:, 3] == 0
+        self.texels[self.tiles.first[bare]] = baked.mean_residual[bare]
+
+    def _places(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Rows of the list and rows of the flattened pages that are the same texels, one pair a tile size."""
+        rectangles = torch.from_numpy(self._baked.packing.tiles)
+        for r_u, r_v, rows in size_classes(rectangles):
+            listed = self.tiles.first[rows, None] + torch.arange(r_u * r_v)
+            packing = self._baked.packing
+            paged = texel_index(rectangles[rows], (r_u, r_v), packing.width, packing.height)
+            yield listed.reshape(-1), paged.reshape(-1)
+
+    def baked(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
+        """The bake with these texels [T, 3], quantised and encoded anew."""
+        assert self._baked.texels is not None
+        pages = self._baked.texels.clone()
+        for rows, texel in self._places():
+            pages.view(-1, 3)[texel] = texels[rows]
+        bare = torch.from_numpy(self._baked.packing.tiles)[:, 3] == 0
+        constants = torch.where(bare[:, None], texels[self.tiles.first], self._baked.mean_residual)
+        return replace(self._baked, mean_residual=constants).with_texels(pages, progress)
+
+    @torch.no_grad()
+    def view(self, view: View) -> TexelView:
+        """Traces a view."""
+        p, camera = self._baked.surfels, view.camera.to("cpu")
+        geometry = (p[name] for name in ("means", "quats", "log_scales", "opacity_logits", "beta_raw"))
+        projection = project(*geometry, camera, self._baked.near, self._baked.prefilter == "pixel")
+        fragments = trace(projection)
+        base = view_color(self._kind, p, p["means"], camera.exact_center, projection.visible)
+        plain = composite_image(fragments, projection, shade(fragments, base, projection.frames))
+        chosen = TexelFragments.of(fragments, fragments.weight >= self._baked.weight_bound)
+        without = texel_image(chosen, base, self.texels, self.tiles, bound=math.inf)  # their colours without residual
+        rest = plain[:, :3] - without + (1 - plain[:, 3:4]) * self._background
+        size = (camera.height, camera.width)
+        target = over_background(as_float(view.image.cpu()), self._background)
+        mask = None if view.mask is None else view.mask.cpu().reshape(*size, 1)
+        return TexelView(chosen, base, rest.view(*size, 3), target.contiguous(), mask)
+
+    @torch.no_grad()
+    def render(self, view: TexelView, texels: Tensor) -> Tensor:
+        """[H, W, 3] the picture with these texels, as the baked renderer shows it before any quantisation."""
+        return texel_image(view.fragments, view.base, texels, self.tiles).view_as(view.rest) + view.rest
+
+    def add_gradient(self, view: TexelView, texels: Tensor, dimage: Tensor, out: Tensor) -> None:
+        """Adds the gradient [T, 3] of a picture's gradient [H, W, 3]."""
+        add_texel_gradient(dimage.reshape(-1, 3), view.fragments, view.base, texels, self.tiles, 0.0, out)
+
+
+class TexelViews(Sequence[TexelView]):
+    """Views of a scene, traced when they are needed and kept while there is memory for them."""
+
+    def __init__(self, scene: TexelScene, views: Sequence[View], memory: int) -> None:
+        self._scene, self._views, self._memory = scene, views, memory
+        self._kept: dict[int, TexelView] = {}
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> TexelView:  # type: ignore[override]
+        if index in self._kept:
+            return self._kept[index]
+        view = self._scene.view(self._views[index])
+        if view.nbytes <= self._memory:
+            self._memory -= view.nbytes
+            self._kept[index] = view
+        return view
+
+    def psnr(self, texels: Tensor) -> float:
+        """Mean dB over the views."""
+        values = [psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask) for view in self]
+        return sum(values) / len(values)
+
+
+def tune_atlas(
+    baked: Baked,
+    views: Sequence[View],
+    background: Tensor,
+    options: TuneOptions | None = None,
+    progress: Progress = no_progress,
+    eval_views: Sequence[View] = (),
+) -> Baked:
+    """Fine-tunes the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
+
+    A step moves texel t against the gradient g of one view's loss, taken as a sum over pixels:
+    t <- t - rate g / (m + prior), m = sum over all views and fragments of weight times bilinear weight, which is how
+    much of the pictures the texel makes up. This is the step of simultaneous algebraic reconstruction (SART) with the
+    loss's gradient for the residual: it needs no second moments, and a texel that is hardly seen hardly moves. The
+    texels kept are those that show the set-aside views best, the baked ones where none are better.
+
+    Args:
+        baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
+        views: training views; every `held_in_every`-th is set aside.
+        background: [3] colour behind the scene.
+        options: see `TuneOptions`.
+        progress: called after every step.
+        eval_views: views of which the gain is stated; they decide nothing.
+
+    Returns:
+        a new bake, encoded, with `statistics["finetune"]`; `baked` itself without change where there are fewer than 4
+        views.
+    """
+    options = options or TuneOptions()
+    options.check()
+    if len(views) < FEWEST_VIEWS:
+        return replace(baked, statistics={**baked.statistics, "finetune": {"steps": 0, "views": len(views)}})
+    started, cpu_started = time.perf_counter(), time.process_time()
+    scene = TexelScene(baked, background)
+    held_in = TexelViews(scene, views[:: options.held_in_every], options.cache_bytes // options.held_in_every)
+    rest = [view for i, view in enumerate(views) if i % options.held_in_every]
+    tuned = TexelViews(scene, rest, options.cache_bytes - options.cache_bytes // options.held_in_every)
+    texels, curve = _descend(scene, tuned, held_in, options, progress)
+    statistics: dict[str, Any] = {
+        "views": len(tuned),
+        "held_in_views": len(held_in),
+        "steps": curve[-1][0],
+        "best_step": max(curve, key=lambda point: point[1])[0],
+        "psnr_held_in": {"before": round(curve[0][1], 4), "after": round(max(psnr for _, psnr in curve), 4)},
+        "curve": [[step, round(psnr, 4)] for step, psnr in curve],
+        "seconds": round(time.perf_counter() - started, 2),
+        "cpu_seconds": round(time.process_time() - cpu_started, 2),
+    }
+    if "error" in baked.statistics:
+        statistics["error_before"] = baked.statistics["error"]  # of the texels as baked, against the field
+    if eval_views:
+        held_out = TexelViews(scene, eval_views, 0)
+        both = {"before": held_out.psnr(scene.texels), "after": held_out.psnr(texels)}
+        statistics["psnr_held_out"] = {name: round(value, 4) for name, value in both.items()}
+    result = scene.baked(texels, progress)
+    return replace(result, statistics={**result.statistics, "finetune": statistics})
+
+
+def _descend(
+    scene: TexelScene, views: TexelViews, held_in: TexelViews, options: TuneOptions, progress: Progress
+) -> tuple[Tensor, list[tuple[int, float]]]:
+    """The texels [T, 3] that show the set-aside views best, and the curve: (step, dB over these views)."""
+    inverse = 1.0 / (coverage(scene, views, progress) + options.prior)  # [T, 1]
+    texels, gradient = scene.texels.clone(), torch.zeros_like(scene.texels)
+    best, curve = scene.texels, [(0, held_in.psnr(scene.texels))]
+    every = -(-options.steps // options.checks)
+    for step in range(options.steps):
+        view = views[training_order(len(views), options.seed, step)]
+        rgb = scene.render(view, texels).requires_grad_()
+        photometric(rgb, view.target, options.ssim_weight, view.mask).backward()
+        pixels = rgb.numel() if view.mask is None else 3 * int(view.mask.sum())
+        gradient.zero_()
+        scene.add_gradient(view, texels, rgb.grad * pixels, gradient)  # the loss is a mean, the step wants a sum
+        rate = options.rate * 0.5 * (1.0 + math.cos(math.pi * step / options.steps))
+        texels.addcmul_(gradient, inverse, value=-rate)
+        progress("tuning texels", step + 1, options.steps)
+        if (step + 1) % every == 0 or step + 1 == options.steps:
+            curve.append((step + 1, held_in.psnr(texels)))
+            if curve[-1][1] == max(psnr for _, psnr in curve):
+                best = texels.clone()
+            elif all(psnr < max(p for _, p in curve) for _, psnr in curve[-options.patience :]):
+                break
+    return best, curve
+
+
+@torch.no_grad()
+def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progress) -> Tensor:
+    """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
+    weight times the bilinear weight; 0 where no view sees it."""
+    total = torch.zeros_like(scene.texels)
+    for index in range(len(views)):
+        view = views[index]
+        scene.add_gradient(view, scene.texels, torch.ones_like(view.rest), total)
+        progress("tracing the training views", index + 1, len(views))
+    return total.amax(dim=1, keepdim=True)  # a channel that the ReLU cuts off counts nothing

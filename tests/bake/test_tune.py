@@ -1,0 +1,169 @@
+"""Fine-tuning of an atlas: photographs come from an atlas that is known, the bake starts from a wrong one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
+from bitymi_ns.bake.tune import TexelScene, TexelViews, coverage
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import View
+
+BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
+OPTIONS = TuneOptions(steps=60, rate=0.3, held_in_every=4)
+
+
+def cameras() -> list[Camera]:
+    """Twelve views around the scene of conftest."""
+    views = []
+    for i in range(12):
+        angle = torch.tensor(0.5236 * i)
+        viewmat = torch.eye(4)
+        viewmat[0, 0], viewmat[0, 2] = angle.cos(), angle.sin()
+        viewmat[2, 0], viewmat[2, 2] = -angle.sin(), angle.cos()
+        viewmat[2, 3] = 6.0
+        views.append(Camera(viewmat, torch.tensor([[60.0, 0.0, 24.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]]), 48, 40))
+    return views
+
+
+def render(baked: Baked, camera: Camera) -> Tensor:
+    """What the baked renderer shows of the texels before quantisation."""
+    atlas = torch.cat([baked.texels, torch.ones_like(baked.texels[..., :1])], dim=-1)
+    tiles = torch.from_numpy(baked.packing.tiles)
+    scene = BakedScene(
+        baked.surfels, "sv", tiles, atlas, extent=baked.extent, mean_residual=baked.mean_residual, near=baked.near,
+        weight_bound=baked.weight_bound, prefilter=baked.prefilter,
+    )  # fmt: skip
+    return scene.render(camera, BACKGROUND).rgb
+
+
+@pytest.fixture(scope="module")
+def truth(scene) -> Baked:
+    """A scene of large surfels with a waving residual; the first surfel's is constant."""
+    made = scene(60)
+    made.surfels["log_scales"] += 1.5
+    made.surfels["opacity_logits"] += 1.0
+    made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])  # no view sees it
+    baked = bake(made, options=BakeOptions(format="fp16", r_max=8))
+    baked.weight_bound = 0.02
+    baked.packing.tiles[0] = 0
+    baked.mean_residual[0] = 0.3
+    return baked
+
+
+@pytest.fixture(scope="module")
+def views(truth: Baked) -> list[View]:
+    """Photographs of it."""
+    return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
+
+
+@pytest.fixture(scope="module")
+def wrong(truth: Baked) -> Baked:
+    """The same scene with another constant for a residual."""
+    grey = replace(truth, mean_residual=torch.full_like(truth.mean_residual, 0.1))
+    return grey.with_texels(torch.full_like(truth.texels, 0.1))
+
+
+def test_tuning_finds_what_the_photographs_show(truth: Baked, wrong: Baked, views: list[View]) -> None:
+    tuned = tune_atlas(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
+    statistics = tuned.statistics["finetune"]
+    assert statistics["views"] == 7 and statistics["held_in_views"] == 3
+    for which in ("psnr_held_in", "psnr_held_out"):
+        assert statistics[which]["after"] > statistics[which]["before"] + 3
+    error = (tuned.mean_residual - truth.mean_residual)[0].abs()
+    assert (error < 0.05).all()  # a surfel without a tile gets its constant
+    assert tuned.atlas.psnr is not None and tuned.atlas.payload != wrong.atlas.payload
+    assert (wrong.texels == 0.1).all() and "finetune" not in wrong.statistics  # the bake itself is as it was
+    stated = statistics["psnr_held_out"]["after"]
+    seen = [((render(tuned, v.camera).clamp(0, 1) - v.image) ** 2).mean().log10() * -10 for v in views[10:]]
+    assert float(sum(seen) / 2) == pytest.approx(stated, abs=0.01)
+
+
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
+    baked = replace(truth, prefilter=prefilter)
+    scene = TexelScene(baked, BACKGROUND)
+    for camera in cameras()[:2]:
+        want = render(baked, camera)
+        got = scene.render(scene.view(View(camera, want)), scene.texels)
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
+
+
+def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
+    scene = TexelScene(wrong, BACKGROUND)
+    seen = coverage(scene, TexelViews(scene, [v for i, v in enumerate(views) if i % 4], 1 << 30))[:, 0]
+    tuned = TexelScene(tune_atlas(wrong, views, BACKGROUND, OPTIONS), BACKGROUND).texels
+    moved = (tuned - 0.1).abs().amax(1)
+    last = scene.tiles.first[59]
+    assert not moved[last:].any() and not moved[seen == 0].any()
+    few, many = (seen > 0) & (seen < 0.02), seen > 5
+    assert few.sum() > 50 and many.sum() > 50
+    assert moved[few].mean() < 0.2 * moved[many].mean()
+
+
+def test_it_ends_with_the_best_texels_of_the_held_in_views(wrong: Baked, views: list[View]) -> None:
+    wild = replace(OPTIONS, rate=50.0, steps=40, patience=2)
+    statistics = tune_atlas(wrong, views, BACKGROUND, wild).statistics["finetune"]
+    assert statistics["steps"] < 40  # no gain: it gives up
+    assert statistics["psnr_held_in"]["after"] == max(psnr for _, psnr in statistics["curve"])
+    perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
+    kept = tune_atlas(wrong, perfect, BACKGROUND, wild)
+    assert kept.statistics["finetune"]["best_step"] == 0
+    torch.testing.assert_close(kept.texels, wrong.texels, rtol=0, atol=0)
+
+
+def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: list[View]) -> None:
+    few = replace(OPTIONS, steps=8)
+    results = [tune_atlas(wrong, views, BACKGROUND, replace(few, cache_bytes=b)) for b in (0, 200_000, 1 << 30)]
+    assert all(torch.equal(r.texels, results[0].texels) for r in results)
+
+
+def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
+    few = replace(OPTIONS, steps=12)
+    mask = torch.ones(40, 48, 1, dtype=torch.bool)
+    mask[:, :24] = False
+    spoilt = [View(v.camera, torch.where(mask, v.image, float("nan")), mask) for v in views]
+    tuned = tune_atlas(wrong, spoilt, BACKGROUND, few)
+    assert tuned.texels.isfinite().all() and not torch.equal(tuned.texels, wrong.texels)
+    statistics = tuned.statistics["finetune"]["psnr_held_in"]
+    assert statistics["after"] > statistics["before"]
+    clear = [View(v.camera, torch.cat([v.image, torch.zeros(40, 48, 1)], -1)) for v in views]
+    plain = [View(v.camera, BACKGROUND.expand(40, 48, 3)) for v in views]
+    same = [tune_atlas(wrong, each, BACKGROUND, few).texels for each in (clear, plain)]
+    assert torch.equal(*same)
+
+
+def test_too_few_views_leave_the_atlas_alone(wrong: Baked, views: list[View]) -> None:
+    same = tune_atlas(wrong, views[:3], BACKGROUND)
+    assert same.texels is wrong.texels and same.statistics["finetune"] == {"steps": 0, "views": 3}
+
+
+def test_a_scene_without_texture_is_refused(scene, views: list[View]) -> None:
+    with pytest.raises(ValueError, match="without texture"):
+        tune_atlas(bake(scene(20, field=None)), views, BACKGROUND)
+
+
+def test_an_interruption_leaves_the_bake_as_it_was(wrong: Baked, views: list[View]) -> None:
+    def interrupt(step: str, done: int, total: int) -> None:
+        if step == "tuning texels" and done == 3:
+            raise KeyboardInterrupt
+
+    before = wrong.texels.clone()
+    with pytest.raises(KeyboardInterrupt):
+        tune_atlas(wrong, views, BACKGROUND, OPTIONS, interrupt)
+    assert torch.equal(wrong.texels, before)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"steps": 0}, {"held_in_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}]
+)
+def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
+    tune = partial(tune_atlas, wrong, views, BACKGROUND)
+    with pytest.raises(ValueError, match=f"{next(iter(bad))}.*fine-tuning|fine-tuning.*{next(iter(bad))[:4]}|SSIM"):
+        tune(replace(TuneOptions(), **bad))

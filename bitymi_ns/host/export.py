@@ -23,7 +23,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.table import Table
 
-from bitymi_ns.bake import BakeOptions, BundleError, bake, export, read_bundle, rich_progress
+from bitymi_ns.bake import BakeOptions, BundleError, TuneOptions, bake, export, read_bundle, rich_progress, tune_atlas
 from bitymi_ns.bake.bundle import World
 from bitymi_ns.bake.folder import check_target
 from bitymi_ns.bake.manifest import MANIFEST, dump
@@ -35,7 +35,7 @@ from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
-from bitymi_ns.train.views import as_float, over_background
+from bitymi_ns.train.views import View, as_float, over_background
 
 INTERRUPTED = 130
 
@@ -55,7 +55,10 @@ class ExportAtlas(BakeOptions):
     overwrite: bool = False
     """Replace a bundle that is there already."""
     exact: bool = False
-    """Keep everything: the paper's rule for the size of every tile, no cap by views, no surfel dropped as unseen."""
+    """Keep everything: the paper's rule for the size of every tile, no cap by views, no surfel dropped as unseen, and
+    texels as the field gives them, without fine-tuning."""
+    finetune_steps: int = TuneOptions.steps
+    """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
     compare: bool = True
     """Render the held-out views from the bundle and from the trained scene and state the difference."""
 
@@ -89,6 +92,17 @@ class ExportAtlas(BakeOptions):
         try:
             with rich_progress() as progress:
                 baked = bake(model.scene, views, options, progress)
+                if self.finetune_steps and not self.exact and baked.atlas is not None:
+                    photos = photographs(views, datamanager.train_view)
+                    held_out = [to_camera(datamanager.eval_view(i)[0]) for i in range(len(datamanager.eval_dataset))]
+                    baked = tune_atlas(
+                        baked,
+                        photos,
+                        model.background.cpu(),
+                        TuneOptions(steps=self.finetune_steps),
+                        progress,
+                        photographs(held_out, datamanager.eval_view) if self.compare else (),
+                    )
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
@@ -142,6 +156,12 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
             "give the config.yml of a bitymi training run"
         )
     return config, pipeline
+
+
+def photographs(cameras: list[Camera], view: Callable[[int], tuple[Any, dict[str, Any]]]) -> list[View]:
+    """The cameras with their images and masks, which `view` gives by index."""
+    batches = (view(index)[1] for index in range(len(cameras)))
+    return [View(camera, b["image"], b.get("mask")) for camera, b in zip(cameras, batches, strict=True)]
 
 
 @torch.no_grad()
@@ -233,6 +253,14 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
         table.add_row("Occupancy", f"{100 * atlas['occupancy']:.1f} %")
         if atlas.get("psnr") is not None:
             table.add_row("Quantisation", f"{atlas['psnr']:.2f} dB over the texels")
+    tuned = statistics.get("finetune")
+    if tuned and tuned["steps"]:
+        table.add_row("Fine-tuning", f"{tuned['steps']} steps, {tuned['seconds']:.0f} s")
+        for name, views in (("psnr_held_in", "... set-aside training views"), ("psnr_held_out", "... held-out views")):
+            if name in tuned:
+                table.add_row(views, f"{tuned[name]['before']:.2f} -> {tuned[name]['after']:.2f} dB")
+    elif tuned:
+        table.add_row("Fine-tuning", f"none: {tuned['views']} training views are too few to set some aside")
     table.add_row("Files", f"{sum(f['bytes'] for f in info['files'].values()) / 1e6:.2f} MB in total")
     held_out = statistics.get("held_out")
     if held_out:
@@ -247,7 +275,8 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
 def print_savings(table: Table, info: dict[str, Any]) -> None:
     """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
     statistics = info["statistics"]
-    texels, error = statistics["texels"], statistics["error"]
+    texels = statistics["texels"]
+    error = statistics.get("error") or statistics["finetune"]["error_before"]
     kept, count = texels["kept"], info["surfels"]["count"]
     table.add_row("Tiles", f"{statistics['surfels']['trained']:,} -> {count - statistics['surfels']['without_tile']:,}")
     table.add_row("Texels by the paper's rule", f"{texels['nyquist']:,}")
@@ -260,7 +289,8 @@ def print_savings(table: Table, info: dict[str, Any]) -> None:
     tolerance = f"tolerance {error['tolerance']:g}" if error["tolerance"] else "no tolerance"
     rms = error["rms"]
     table.add_row("Error of a tile", f"median {rms['p50']:.2f}, 99 % {rms['p99']:.2f}, at most {rms['p100']:.2f} steps")
-    table.add_row("", f"({tolerance}; weighted root mean square against the field, as stored)")
+    when = "as stored" if "error" in statistics else "before the fine-tuning"
+    table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.bake import check_files
+from bitymi_ns.bake import check_files, tune
 from bitymi_ns.cli import main
 from bitymi_ns.host import export as host_export
 from bitymi_ns.host.config import BitymiTrainerConfig
@@ -34,9 +34,12 @@ def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> Non
 
 @pytest.fixture(scope="session")
 def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The trained room as a bundle. Not to be changed. After so few steps little of the residual is worth a tile."""
+    """The trained room as a bundle, its texels as they were learned. Not to be changed.
+
+    After so few steps little of the residual is worth a tile.
+    """
     folder = tmp_path_factory.mktemp("bundles") / "room-bc7"
-    run_export(trained, folder, tolerance=TOLERANCE)
+    run_export(trained, folder, tolerance=TOLERANCE, finetune_steps=0)
     return folder
 
 
@@ -62,7 +65,7 @@ def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> N
     assert held_out["views"] == 2
     assert held_out["psnr_baked_against_neural"] > 35
     assert held_out["psnr_baked_against_photos"] == pytest.approx(held_out["psnr_neural_against_photos"], abs=0.2)
-    assert info["statistics"]["options"]["format"] == "bc7"
+    assert info["statistics"]["options"]["format"] == "bc7" and "finetune" not in info["statistics"]
     assert torch.tensor(info["world"]["transform"]).shape == (3, 4)
 
 
@@ -94,9 +97,37 @@ def test_a_bundle_needs_neither_checkpoint_nor_its_old_place(
     assert outputs["rgb"].shape == (36, 48, 3) and {"depth", "normal", "overdraw"} <= outputs.keys()
 
 
+def test_the_texels_are_fine_tuned(
+    trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=30)
+    statistics = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]
+    tuned = statistics["finetune"]
+    assert tuned["steps"] <= 30 and tuned["views"] + tuned["held_in_views"] == 10 and tuned["cpu_seconds"] > 0
+    held_in, held_out = tuned["psnr_held_in"], tuned["psnr_held_out"]
+    assert held_in["after"] >= held_in["before"]  # after 60 steps of training there may be no gain
+    assert held_out["before"] == pytest.approx(statistics["held_out"]["psnr_neural_against_photos"], abs=0.2)
+    stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "tuned.json")["psnr"]
+    assert stored == pytest.approx(held_out["after"], abs=0.1)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "tuning texels" in out and "Fine-tuning" in out
+
+
+def test_ctrl_c_in_the_fine_tuning_leaves_nothing(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tune, "photometric", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        run_export(trained, tmp_path / "b", tolerance=TOLERANCE)
+    assert stop.value.code == 130 and list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("format", ["uint8", "fp16"])
 def test_other_formats(trained: BitymiTrainerConfig, tmp_path: Path, format: str) -> None:
-    run_export(trained, tmp_path / format, format=format, tolerance=TOLERANCE)
+    run_export(trained, tmp_path / format, format=format, tolerance=TOLERANCE, finetune_steps=0)
     info = json.loads((tmp_path / format / "bundle.json").read_text())
     assert info["atlas"]["format"] == format
 
@@ -145,7 +176,7 @@ def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerCo
     with pytest.raises(InputError, match="exists.*--overwrite True"):
         run_export(trained, copied)
     assert (copied / "bundle.json").read_bytes() == before
-    run_export(trained, copied, overwrite=True, r_max=8, compare=False)
+    run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)
     info = json.loads((copied / "bundle.json").read_text())
     assert info["statistics"]["options"]["r_max"] == 8 and "held_out" not in info["statistics"]
 

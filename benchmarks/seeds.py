@@ -98,7 +98,7 @@ def run(seed: int, options: argparse.Namespace) -> Result:
     except TrainingDiverged as error:
         note = str(error)
     psnr, _ = evaluate(scene, held_out, config)
-    rollbacks = getattr(trainer, "rollbacks", 0)
+    rollbacks = trainer.guard.rollbacks
     finite = not describe_broken(scene) and math.isfinite(psnr)
     return Result(seed, psnr, len(scene), finite, rollbacks, time.process_time() - start, note)
 

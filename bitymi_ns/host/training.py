@@ -17,6 +17,7 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
 from bitymi_ns.host.errors import fail
 from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.guard import COMPARED_VIEWS, Guard
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.schedules import Schedule
@@ -58,6 +59,9 @@ class TrainingRun:
         pixels = float((cameras.width * cameras.height).double().mean())
         self.strategy = Strategy(self.config, self.schedule, extent, self._on_resize, pixels)
         self.watch = LossWatch()
+        self.guard = Guard(
+            model.scene, self.optimizers.optimizers, self.strategy, self.schedule, self.config, self._announce
+        )
         self.clock = Stopwatch()
         self._random_state: Tensor | None = None
         self._load(model.resume_state)
@@ -73,6 +77,7 @@ class TrainingRun:
             "method_name": trainer.config.method_name,
         }
         self._output: Any = None
+        self._loss = torch.zeros(())
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
         self.views = ReducedViews(_TrainViews(self.datamanager), model.device)
 
@@ -88,6 +93,7 @@ class TrainingRun:
         """Everything beside parameters and optimisers that decides how the run goes on."""
         return {
             "strategy": self.strategy.state_dict(),
+            "guard": self.guard.state_dict(),
             "random": torch.get_rng_state(),
             "seconds": self.clock.seconds,
             "cpu_seconds": self.clock.cpu_seconds,
@@ -97,6 +103,8 @@ class TrainingRun:
         if not state:
             return
         self.strategy.load_state_dict(state["strategy"])
+        if "guard" in state:  # checkpoints of earlier versions have none
+            self.guard.load_state_dict(state["guard"])
         self._random_state = state["random"]
         self.clock = Stopwatch(state["seconds"], state["cpu_seconds"])
 
@@ -109,8 +117,18 @@ class TrainingRun:
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
+        factor = self.schedule.resolution_factor(step)
+        try:
+            self.guard.before(
+                step, lambda: [self.views.at(i, factor) for i in range(min(len(self.views), COMPARED_VIEWS))]
+            )
+        except TrainingDiverged as error:
+            self._diverged(step, error)
+        self._set_rates()
+
+    def _set_rates(self) -> None:
         for name, optimizer in self.optimizers.optimizers.items():
-            rate = self.schedule.lr(name, step)
+            rate = self.guard.factor * self.schedule.lr(name, self.step)
             for group in optimizer.param_groups:
                 group["lr"] = rate
 
@@ -121,9 +139,17 @@ class TrainingRun:
         camera, (_, image, mask) = self.views.camera(index), self.views.at(index, factor)
         arguments = (self.model.scene, camera, image, mask, self.schedule, step, self.config, self.watch)
         try:
-            terms, self._output = training_step(*arguments)
+            while True:
+                try:
+                    terms, self._output = training_step(*arguments)
+                    break
+                except TrainingDiverged as error:
+                    self.watch.forget()
+                    self.guard.failed(step, error)
+                    self._set_rates()
         except TrainingDiverged as error:
             self._diverged(step, error)
+        self._loss = terms["photometric"].detach()
         return terms
 
     def after(self, step: int) -> None:
@@ -131,12 +157,16 @@ class TrainingRun:
         scene, factor = self.model.scene, self.schedule.resolution_factor(step)
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(self._output)
+        broken = self._output.projection.broken
         self._output = None
         optimizers = {name: self.optimizers.optimizers[name] for name in scene.surfels.keys()}
         try:
             if step in self.curve_steps:
                 self.watch.finish(scene)
             report = self.strategy.step(step, scene, optimizers, lambda k, g: self.views.draw(k, g, factor))
+            report |= self.guard.after(step, self._loss, broken)
+            if "rolled_back" in report:
+                self.watch.forget()
         except ValueError as error:
             self._diverged(step, error)
         self.clock.stop()
@@ -151,6 +181,9 @@ class TrainingRun:
             "(--pipeline.model.train.lr.*) may help.",
             error,
         )
+
+    def _announce(self, text: str) -> None:
+        CONSOLE.print(f"[bold yellow]{text}", soft_wrap=True)
 
     def _on_resize(self, name: str, parameter: Parameter) -> None:
         self.optimizers.parameters[name] = [parameter]  # used by gradient clipping

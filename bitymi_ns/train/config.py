@@ -120,12 +120,27 @@ class AdamConfig:
 
 
 @dataclass
+class GuardConfig:
+    """What happens when training diverges."""
+
+    rollbacks: int = 5
+    """How often a run may go back to its last good state; 0 = a loss that is not finite ends it."""
+    rates: float = 0.3
+    """Factor of all learning rates when it does; its square, cube, ... when that was not enough."""
+    window: int = 300
+    """Steps over which the loss is judged."""
+    min_window: int = 20
+    """Fewest steps of a window, however short the run."""
+
+
+@dataclass
 class TrainConfig:
     """How a scene is trained."""
 
     loss: LossConfig = field(default_factory=LossConfig)
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     lr: LearningRates = field(default_factory=LearningRates)
+    guard: GuardConfig = field(default_factory=GuardConfig)
     freeze_after: int = 5000
     """From this step on the texture field learns on one step in `freeze_every` only."""
     freeze_every: int = 10

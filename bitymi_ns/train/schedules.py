@@ -90,8 +90,12 @@ class Schedule:
         densify = self.config.densify
         if not 0.0 < densify.reset_opacity < 1.0:
             raise ValueError(f"reset_opacity must be between 0 and 1, not {densify.reset_opacity}")
-        deepest = -0.5 * self.reset_every * self.lr("opacity_logits", 0)
+        deepest = max(-500.0, -0.5 * self.reset_every * self.lr("opacity_logits", 0))  # exp() overflows beyond
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
+
+    def recovering(self, step: int) -> bool:
+        """Whether the last opacity reset may still show: half of the time to the next one is not over."""
+        return any(reset < step <= reset + max(1, self.reset_every // 2) for reset in self.reset_steps)
 
     def is_final_prune_step(self, step: int) -> bool:
         """Whether the multi-view prune of the finished geometry takes place after this step."""

@@ -231,9 +231,7 @@ class Strategy:
         surfels = scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
-        finite = torch.ones(len(scene), dtype=torch.bool, device=surfels["means"].device)
-        for p in surfels.values():
-            finite &= p.detach().reshape(len(p), -1).isfinite().all(-1)
+        finite = _finite_rows(scene)
         if not bool(finite.any()):
             raise TrainingDiverged(f"no surfel is left whose parameters are all finite: {describe_broken(scene)}")
         logits = surfels["opacity_logits"]
@@ -246,6 +244,18 @@ class Strategy:
         pruned = ~finite | self._spare(invisible, logits, int(finite.sum()), among=finite)
         self._remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
+
+    @torch.no_grad()
+    def broken_share(self, scene: Scene) -> float:
+        """Share of the surfels with a parameter that is not finite."""
+        return float((~_finite_rows(scene)).double().mean()) if len(scene) else 0.0
+
+    @torch.no_grad()
+    def drop_broken(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> int:
+        """Remove the surfels with a parameter that is not finite; returns how many they were."""
+        broken = ~_finite_rows(scene)
+        self._remove(broken, scene, optimizers)
+        return int(broken.sum())
 
     def _spare(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
         """Take back as much of `pruned` [N] as `min_surfels` asks for, the most opaque first.
@@ -289,6 +299,14 @@ class Strategy:
         if len(self.grad_sum) == len(pruned):
             for name in STATISTICS:
                 setattr(self, name, getattr(self, name)[keep.to(self.grad_sum.device)])
+
+
+def _finite_rows(scene: Scene) -> Tensor:
+    """[N] bool: every parameter of the surfel is finite."""
+    finite = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
+    for p in scene.surfels.values():
+        finite &= p.detach().reshape(len(p), -1).isfinite().all(-1)
+    return finite
 
 
 def _strongest(wanted: Tensor, importance: Tensor, gradient: Tensor, k: int) -> Tensor:

@@ -17,6 +17,7 @@ from torch.optim import Adam
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import AdamConfig, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.guard import COMPARED_VIEWS, Guard
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import objective, psnr
 from bitymi_ns.train.schedules import Schedule
@@ -95,6 +96,10 @@ class LossWatch:
         while self._underway:
             self._underway[0][3].synchronize()
             self._check(scene, *self._underway.popleft()[:3])
+
+    def forget(self) -> None:
+        """Look at nothing that is underway: the run has gone back to before it."""
+        self._underway.clear()
 
     @staticmethod
     def _check(scene: Scene, step: int, names: tuple[str, ...], values: Tensor) -> None:
@@ -198,6 +203,7 @@ class Trainer:
         pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
         self.strategy = Strategy(config, self.schedule, extent, view_pixels=pixels)
         self.optimizers = make_optimizers(scene)
+        self.guard = Guard(scene, self.optimizers, self.strategy, self.schedule, config)
         self.step = 0
         self.seconds = 0.0
         self.cpu_seconds = 0.0
@@ -210,10 +216,19 @@ class Trainer:
         step, factor = self.step, self.schedule.resolution_factor(self.step)
         index = training_order(len(self.views), self.config.seed, step)
         camera, (_, image, mask) = self.views.camera(index), self.views.at(index, factor)
-        for name, optimizer in self.optimizers.items():
-            optimizer.param_groups[0]["lr"] = self.schedule.lr(name, step)
-            optimizer.zero_grad(set_to_none=True)
-        terms, output = training_step(self.scene, camera, image, mask, self.schedule, step, self.config, self.watch)
+        self.guard.before(step, lambda: [self.views.at(i, factor) for i in range(min(len(self.views), COMPARED_VIEWS))])
+        terms, output = None, None
+        while terms is None:
+            for name, optimizer in self.optimizers.items():
+                optimizer.param_groups[0]["lr"] = self.guard.factor * self.schedule.lr(name, step)
+                optimizer.zero_grad(set_to_none=True)
+            try:
+                terms, output = training_step(
+                    self.scene, camera, image, mask, self.schedule, step, self.config, self.watch
+                )
+            except TrainingDiverged as error:
+                self.watch.forget()
+                self.guard.failed(step, error)
         total = torch.stack(list(terms.values())).sum()
         if total.requires_grad:
             total.backward()
@@ -225,6 +240,9 @@ class Trainer:
             step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
         )
         self._loss = total.detach()
+        report |= self.guard.after(step, terms["photometric"].detach(), output.projection.broken)
+        if "rolled_back" in report:
+            self.watch.forget()
         self.step += 1
         self.seconds += time.perf_counter() - start
         self.cpu_seconds += time.process_time() - cpu_start
@@ -244,6 +262,7 @@ class Trainer:
             "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
             "optimizers": {name: copy.deepcopy(optimizer.state_dict()) for name, optimizer in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),
+            "guard": self.guard.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -255,6 +274,7 @@ class Trainer:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.strategy.load_state_dict(state["strategy"])
+        self.guard.load_state_dict(state["guard"])
         self.step = state["step"]
         self.seconds, self.cpu_seconds = state["seconds"], state["cpu_seconds"]
 

@@ -1,0 +1,229 @@
+"""Keeps a run from ending in a broken scene: notices divergence, goes back to the last good state, lowers the rates.
+
+What counts as divergence:
+- a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could mend them);
+- surfels that are not finite, beyond a hundredth of them (fewer are dropped and counted);
+- views drawn worse than blank ones, over a whole window of steps: the mean photometric loss exceeds by a quarter both
+  that of every view in its own mean colour and that of the scene as the run found it. After an opacity reset nothing is
+  judged until half of the time to the next one, by when opacities can be made up for (`Schedule.reset_opacity`).
+
+Going back restores parameters, optimisers and the strategy's statistics as they were a whole window before the last
+good one ended; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power
+of it each time that the run goes back again without a good window between.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.optim import Optimizer
+
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.resize import replace_rows
+from bitymi_ns.train.views import View, as_float, background_color, over_background
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import Scene
+    from bitymi_ns.train.schedules import Schedule
+    from bitymi_ns.train.strategy import Strategy
+
+WORSE = 1.25
+"""A window is bad when its mean loss is this many times what it is compared with."""
+BROKEN_SHARE = 0.01
+"""Surfels that are not finite are dropped up to this share of all; beyond, the run goes back."""
+COMPARED_VIEWS = 8
+"""Views on which the blank picture and the first scene are judged."""
+
+
+class Guard:
+    """Watches one run.
+
+    Attributes:
+        factor: of all learning rates; 1 until the run has gone back for the first time.
+        rollbacks: how often it has.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        optimizers: Mapping[str, Optimizer],
+        strategy: Strategy,
+        schedule: Schedule,
+        config: TrainConfig,
+        announce: Callable[[str], None] = warnings.warn,
+    ) -> None:
+        """
+        Args:
+            scene, optimizers, strategy: what is restored; an optimiser a name.
+            schedule: of the run.
+            config: training options.
+            announce: told in a sentence whenever the run goes back, or surfels are dropped.
+        """
+        self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
+        self.schedule, self.config, self.announce = schedule, config, announce
+        self.window = max(config.guard.min_window, schedule.scaled(config.guard.window))
+        self.factor, self.rollbacks = 1.0, 0
+        self._streak = 0  # times in a row, without a good window between
+        self._limit = math.nan
+        self._sum, self._count = 0.0, 0
+        self._states: list[tuple[int, dict[str, Any]]] = []  # the older one is known to be good
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed run needs; it can go back no farther than to where it was resumed."""
+        return {
+            "factor": self.factor,
+            "rollbacks": self.rollbacks,
+            "streak": self._streak,
+            "limit": self._limit,
+            "sum": self._sum,
+            "count": self._count,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """The inverse of `state_dict`."""
+        self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
+        self._streak = int(state["streak"])
+        self._limit, self._sum, self._count = float(state["limit"]), float(state["sum"]), int(state["count"])
+        self._states = []
+
+    @property
+    def on(self) -> bool:
+        """Whether the run may go back at all."""
+        return self.config.guard.rollbacks > 0
+
+    def before(self, step: int, views: Sequence[View] | Callable[[], Sequence[View]]) -> None:
+        """Call before each step: notes the state that the run starts from, and what its first scene is worth.
+
+        Args:
+            step: index of the step.
+            views: some training views at the resolution of the step, or a function that gives them.
+        """
+        if not self.on or self._states:
+            return
+        if math.isnan(self._limit):
+            self._limit = WORSE * self._untrained(views() if callable(views) else views)
+        self._states = [(step, self._capture())]
+
+    @torch.no_grad()
+    def _untrained(self, views: Sequence[View]) -> float:
+        """Loss of blank pictures or of the scene as it is, whichever is larger."""
+        weight, blank, first = self.config.loss.ssim_weight, [0.0], [0.0]
+        kind = "white" if self.config.background == "white" else "black"
+        for camera, image, mask in views[:COMPARED_VIEWS]:
+            device = self.scene.surfels["means"].device
+            background = background_color(kind, self.config.seed, 0, device)
+            target = over_background(as_float(image.to(device)), background)
+            plain = target.mean((0, 1)).expand_as(target).contiguous()
+            drawn = self.scene.render(camera.to(device), background=background, field_mode="frozen").rgb
+            for losses, picture in ((blank, plain), (first, drawn)):
+                losses.append(photometric(picture, target, weight, mask).item())
+        number = max(1, len(blank) - 1)
+        return max(sum(blank), sum(first)) / number
+
+    def failed(self, step: int, error: TrainingDiverged) -> None:
+        """Call when a step could not be done because its loss is not finite; then do it again.
+
+        Raises:
+            TrainingDiverged: nothing can be restored, or it has been tried too often.
+        """
+        cause = describe_broken(self.scene)
+        if not self.on or not cause:
+            raise error
+        if self.strategy.broken_share(self.scene) <= BROKEN_SHARE and self._field_is_finite():
+            self._drop(step)
+        else:
+            self._go_back(step, cause)
+
+    def after(self, step: int, loss: float, not_finite: int) -> dict[str, float]:
+        """Call after each step, when optimisers and strategy are done with it.
+
+        Args:
+            step: index of the step.
+            loss: photometric loss of the step.
+            not_finite: surfels that could not be drawn because they are not finite.
+
+        Returns:
+            What was done, by name; empty when all is well.
+
+        Raises:
+            TrainingDiverged: the run has gone back too often, or may not.
+        """
+        if not self.on:
+            return {}
+        if self.schedule.recovering(step):
+            self._sum, self._count = 0.0, 0
+        else:
+            self._sum, self._count = self._sum + loss, self._count + 1
+        if not_finite > BROKEN_SHARE * len(self.scene):
+            return self._go_back(step, describe_broken(self.scene) or f"{not_finite} surfels are not finite")
+        last = step + 1 >= self.schedule.max_steps
+        if self._count < self.window and not last:
+            return {}
+        mean = self._sum / self._count if self._count else 0.0
+        enough = self._count >= min(self.window, self.config.guard.min_window)
+        self._sum, self._count = 0.0, 0
+        if enough and mean > self._limit:
+            return self._go_back(step, f"the views are drawn worse than blank ones (loss {mean:.3f})")
+        cause = describe_broken(self.scene)
+        if cause and (self.strategy.broken_share(self.scene) > BROKEN_SHARE or not self._field_is_finite()):
+            return self._go_back(step, cause)
+        if cause:
+            return self._drop(step)
+        self._streak = 0
+        if not last:
+            self._states = [*self._states[-1:], (step + 1, self._capture())]
+        return {}
+
+    def _field_is_finite(self) -> bool:
+        return self.scene.field is None or not describe_broken(self.scene.field)
+
+    def _drop(self, step: int) -> dict[str, float]:
+        dropped = self.strategy.drop_broken(self.scene, self.optimizers)
+        self.announce(f"step {step}: {dropped} surfels were no longer finite and were dropped")
+        return {"not_finite": float(dropped), "surfels": float(len(self.scene))}
+
+    def _go_back(self, step: int, cause: str) -> dict[str, float]:
+        options = self.config.guard
+        if self.rollbacks >= options.rollbacks or not self._states:
+            tried = f" It went back {self.rollbacks} times, to learning rates times {self.factor:.2g}." * bool(
+                self.rollbacks
+            )
+            raise TrainingDiverged(f"training diverged at step {step}: {cause}.{tried} Lower the learning rates")
+        origin, state = self._states[0]
+        self.rollbacks += 1
+        self._streak += 1
+        self.factor *= options.rates**self._streak
+        self._restore(state)
+        self._states = [(origin, state)]
+        self._sum, self._count = 0.0, 0
+        self.announce(
+            f"step {step}: training diverged ({cause}); back to the state before step {origin}, "
+            f"with learning rates times {self.factor:.2g} from here on"
+        )
+        return {"rolled_back": float(step - origin), "rates": self.factor, "surfels": float(len(self.scene))}
+
+    def _capture(self) -> dict[str, Any]:
+        return {
+            "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
+            "optimizers": {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()},
+            "strategy": self.strategy.state_dict(),
+        }
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        # new Parameters: autograd remembers the size of those that a living graph has used
+        surfels = self.scene.surfels
+        rows = {name: state["scene"][f"surfels.{name}"] for name in surfels.keys()}
+        none = torch.zeros(0, dtype=torch.int64, device=surfels["means"].device)
+        replace_rows(surfels, self.optimizers, none, rows, self.strategy.on_resize)
+        self.scene.load_state_dict(state["scene"])
+        self.scene.zero_grad(set_to_none=True)
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
+        self.strategy.load_state_dict(state["strategy"])

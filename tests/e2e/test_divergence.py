@@ -1,0 +1,39 @@
+"""ns-train with learning rates far too high: a message, and a scene that can be used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from nerfstudio.scripts import train as ns_train
+
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+
+
+@pytest.mark.parametrize("factor", [10.0, 1000.0])
+def test_a_diverging_run_says_so_and_leaves_a_finite_scene(
+    start: Callable[..., BitymiTrainerConfig], factor: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = start()
+    rates = config.pipeline.model.train.lr
+    for name, value in vars(rates).items():
+        if not name.startswith("short_run"):
+            changed = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+            setattr(rates, name, changed)
+    config.max_num_iterations = 100
+    message = ""
+    try:
+        ns_train.main(config)
+    except InputError as error:
+        message = str(error)
+        assert "training cannot go on" in message and "lower learning rates" in message
+    said = " ".join((capsys.readouterr().out + message).split())
+    if factor >= 1000:
+        assert "training diverged" in said
+    for path in sorted(config.get_checkpoint_dir().glob("*.ckpt")):
+        state = torch.load(path, weights_only=True)["pipeline"]
+        for name, value in state.items():
+            if isinstance(value, torch.Tensor):
+                assert value.isfinite().all(), (path.name, name)

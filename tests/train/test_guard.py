@@ -1,0 +1,144 @@
+"""Runs that diverge: they recover or say why, and never end with a scene that is not finite."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import pytest
+import torch
+
+from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, TrainConfig
+from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.trainer import Trainer, evaluate
+
+
+def multiplied(factor: float) -> LearningRates:
+    keep = {"short_run_power", "short_run_max"}
+    values = {
+        name: value
+        if name in keep
+        else tuple(factor * v for v in value)
+        if isinstance(value, tuple)
+        else factor * value
+        for name, value in vars(LearningRates()).items()
+    }
+    return LearningRates(**values)
+
+
+def config_of(factor: float = 1.0, **guard: float) -> TrainConfig:
+    densify = DensifyConfig(max_surfels=300, min_interval=20, min_reset_interval=10_000, max_per_pixel=0)
+    return TrainConfig(densify=densify, lr=multiplied(factor), guard=GuardConfig(**guard), resolution_schedule=0)
+
+
+def run(trainer: Trainer, steps: int) -> list[dict[str, float]]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return [trainer.advance()[2] for _ in range(steps)]
+
+
+def test_a_healthy_run_is_left_alone(make_scene, views):
+    log = {}
+    for rollbacks in (5, 0):
+        scene = make_scene()
+        trainer = Trainer(scene, views, config_of(rollbacks=rollbacks), 60)
+        run(trainer, 60)
+        assert trainer.guard.rollbacks == 0 and trainer.guard.factor == 1.0
+        log[rollbacks] = scene.surfels["means"].detach().clone()
+    torch.testing.assert_close(log[5], log[0], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("factor", [10.0, 100.0, 10_000.0])
+def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scene, views, factor):
+    scene, config = make_scene(), config_of(factor)
+    start, _ = evaluate(scene, views, config)
+    trainer = Trainer(scene, views, config, 120)
+    try:
+        reports = run(trainer, 120)
+    except TrainingDiverged as error:
+        assert "Lower the learning rates" in str(error) and "training diverged at step" in str(error)
+        reports = []
+    assert not describe_broken(scene)
+    psnr, _ = evaluate(scene, views, config)
+    assert math.isfinite(psnr) and psnr > start - 3.0
+    assert sum("rolled_back" in report for report in reports) == trainer.guard.rollbacks or not reports
+
+
+def test_a_field_that_breaks_on_the_way_is_restored(make_scene, views):
+    scene = make_scene()
+    trainer = Trainer(scene, views, config_of(), 120)
+    run(trainer, 50)
+    good = scene.field.field_table.detach().clone()
+    with torch.no_grad():
+        scene.field.field_w3[4] = math.nan
+    with pytest.warns(
+        UserWarning, match=r"step 5\d: training diverged .*field_w3 is not finite.*learning rates times 0.3"
+    ):
+        for _ in range(20):
+            trainer.advance()
+    assert trainer.guard.rollbacks == 1 and not describe_broken(scene)
+    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(0.3 * trainer.schedule.lr("means", 69))
+    assert (scene.field.field_table - good).abs().max() < 0.5
+    run(trainer, 50)
+    assert evaluate(scene, views, trainer.config)[0] > 15
+
+
+def test_a_few_broken_surfels_are_dropped_and_counted(make_scene, views):
+    scene = make_scene(every=2)
+    trainer = Trainer(scene, views, config_of(), 200)
+    run(trainer, 30)
+    before = len(scene)
+    with torch.no_grad():
+        scene.surfels["sv_rgb"][3] = math.nan  # the loss is not finite
+        scene.surfels["quats"][7] = math.inf  # not drawn, no loss
+    with pytest.warns(UserWarning, match="2 surfels were no longer finite and were dropped"):
+        trainer.advance()
+    assert len(scene) == before - 2 and not describe_broken(scene) and trainer.guard.rollbacks == 0
+    run(trainer, 20)
+
+
+def test_many_surfels_that_cannot_be_drawn_take_the_run_back(make_scene, views):
+    scene = make_scene()
+    trainer = Trainer(scene, views, config_of(), 200)
+    run(trainer, 30)
+    with torch.no_grad():
+        scene.surfels["means"][:20] = math.nan
+    with pytest.warns(UserWarning, match="means is not finite in 20 of .* rows"):
+        report = trainer.advance()[2]
+    assert report["rolled_back"] > 0 and report["rates"] == pytest.approx(0.3) and not describe_broken(scene)
+    run(trainer, 5)
+
+
+def test_it_does_not_go_back_for_ever(make_scene, views):
+    scene = make_scene()
+    trainer = Trainer(scene, views, config_of(rollbacks=2, rates=0.5), 120)
+    run(trainer, 5)
+    with pytest.raises(TrainingDiverged, match="It went back 2 times, to learning rates times 0.12. Lower"):
+        for _ in range(3):
+            with torch.no_grad():
+                scene.field.field_w1[0] = math.inf
+            run(trainer, 1)
+
+
+def test_images_that_are_not_finite_are_named_and_nothing_goes_back(make_scene, views):
+    scene = make_scene(texture=False)
+    broken = [views[0]._replace(image=torch.full((48, 48, 3), math.nan))]
+    trainer = Trainer(scene, broken, config_of(), 120)
+    with pytest.raises(TrainingDiverged, match="look for NaN in the images"):
+        trainer.advance()
+    assert trainer.guard.rollbacks == 0
+
+
+def test_a_resumed_run_keeps_its_lowered_rates(make_scene, views):
+    scene, config = make_scene(), config_of()
+    trainer = Trainer(scene, views, config, 120)
+    run(trainer, 30)
+    with torch.no_grad():
+        scene.field.field_w3[4] = math.nan
+    run(trainer, 2)
+    resumed = Trainer(make_scene(every=5), views, config, 120)
+    resumed.load_state_dict(trainer.state_dict())
+    assert (resumed.guard.factor, resumed.guard.rollbacks) == (pytest.approx(0.3), 1)
+    run(resumed, 10)
+    run(trainer, 10)
+    torch.testing.assert_close(resumed.scene.surfels["means"], trainer.scene.surfels["means"], rtol=1e-4, atol=1e-6)

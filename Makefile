@@ -3,6 +3,7 @@
 # make test    the test suite
 # make bench   quality, speed and size on the demo scene and on your captures, with a report (hours; it resumes):
 #              make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"] [METHODS="bitymi bitymi-quality"]
+# make sanitize  the kernels' tests under the address and undefined-behaviour sanitizers (minutes)
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
@@ -15,6 +16,7 @@ STEPS  ?=
 SEEDS  ?=
 METHODS ?= bitymi bitymi-quality
 WORK   ?= outputs/bench
+TESTS  ?= tests/ops tests/stress tests/scene
 
 TORCH       := torch==2.13.0
 TORCHVISION := torchvision==0.28.0
@@ -27,7 +29,7 @@ CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test bench lint format clean
+.PHONY: setup demo test sanitize bench lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -74,6 +76,12 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -q
+
+sanitize: setup
+	$(BIN)/cmake -S . -B build/sanitize -G Ninja -DBITYMI_SANITIZE=ON -DBITYMI_CUDA=OFF \
+	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja >/dev/null
+	$(BIN)/cmake --build build/sanitize
+	$(BIN)/python scripts/sanitize.py build/sanitize $(TESTS)
 
 $(WORK)/captures/demo/transforms.json: | setup
 	$(BIN)/bitymi sample --output-dir $(@D)

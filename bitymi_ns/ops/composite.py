@@ -51,10 +51,16 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
         ValueError: tensors on different devices, or colours of a wrong shape.
     """
     on_same_device(fragments.weight, colors=colors, geom=projection.geom)
+    if len(projection.geom) != fragments.surfels:
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(projection.geom)}")
+    if tuple(colors.shape) != (len(fragments), 3):
+        raise ValueError(f"colors must have shape {[len(fragments), 3]}, not {list(colors.shape)}")
     return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)
 
 
 def composite(fragments: Fragments, values: Tensor) -> Tensor:
     """Sums of w times any values [F, C] a pixel: [H * W, C]."""
+    if values.dim() != 2 or len(values) != len(fragments):
+        raise ValueError(f"values must have a row for each of the {len(fragments)} fragments, not {list(values.shape)}")
     out = values.new_zeros(fragments.width * fragments.height, values.shape[1])
     return out.index_add(0, fragments.pixel, fragments.weight[:, None] * values)

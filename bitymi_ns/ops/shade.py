@@ -7,6 +7,7 @@ from torch import Tensor
 
 from .backend import dense, kernel
 from .field import FieldGeometry, backward_memory, kernel_field
+from .project import FRAME
 from .trace import Fragments
 
 
@@ -74,6 +75,8 @@ def shade(
     Returns:
         [F, 3].
     """
-    if base.shape[0] != frames.shape[0]:
-        raise ValueError(f"base has {base.shape[0]} rows and frames {frames.shape[0]}")
+    n = fragments.surfels
+    for name, tensor, shape in (("base", base, (n, 3)), ("frames", frames, (n, FRAME))):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
     return _Shade.apply(base, frames, fragments.uv, fragments, geometry, bound, move_surfels, *params)

@@ -31,6 +31,7 @@ class Fragments:
         width, height: of the image, pixels.
         layout: how kernels find their way in the list: tile_start for those of the CPU, for those of CUDA a handle
             on the pairs of surfel and tile (csrc/cuda/pairs.h).
+        surfels: number N of rows of the projection that they belong to.
     """
 
     weight: Tensor
@@ -43,6 +44,7 @@ class Fragments:
     width: int
     height: int
     layout: Any
+    surfels: int
 
     def __len__(self) -> int:
         return self.weight.shape[0]
@@ -96,8 +98,8 @@ def trace(projection: Projection, rim: float = 1e-3) -> Fragments:
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
     weight, uv, depth, surfel, pixel, sigma, tile_start, layout = _Trace.apply(projection.geom, projection, rim)
-    camera = projection.camera
-    return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height, layout)
+    camera, n = projection.camera, len(projection.geom)
+    return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height, layout, n)
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
@@ -115,6 +117,8 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
         ValueError: the mask has another number of pixels or lies on another device.
     """
     on_same_device(fragments.surfel, mask=mask)
+    if n != fragments.surfels:
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {n}")
     if mask.numel() != fragments.width * fragments.height:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
     counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)

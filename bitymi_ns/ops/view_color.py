@@ -62,6 +62,8 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
     if kind == "sh" and terms not in (1, 4, 9, 16):
         raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
+    if kind == "sv" and terms < 1:
+        raise ValueError("Spherical Voronoi colours need at least one site a surfel")
     if terms > 32:
         raise ValueError(f"at most 32 sites or lobes a surfel, not {terms}")
     return terms

@@ -13,6 +13,8 @@ class TrainingDiverged(ValueError):
 def describe_broken(module: nn.Module) -> str:
     """Name the first parameter that is not finite, and its row; empty when all are finite."""
     for name, parameter in module.named_parameters():
+        if len(parameter) == 0:
+            continue
         broken = ~torch.isfinite(parameter.detach().reshape(len(parameter), -1)).all(-1)
         if bool(broken.any()):
             rows = broken.nonzero().flatten()

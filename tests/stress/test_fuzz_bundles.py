@@ -1,0 +1,156 @@
+"""Damaged bundles: an error that names the damage, or a bundle that renders; never a crash."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.bake import BundleError, read_bundle, write_bundle
+from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.ply import parse_ply, write_ply
+from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.scene import Camera
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.stability.scenes import random_scene
+
+MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
+EXAMPLES = 60 * MORE
+FORMATS = ("bc7", "uint8", "fp16")
+N, SIDE = 12, 16
+
+
+@pytest.fixture(scope="module", params=FORMATS)
+def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of a small bundle, by name."""
+    params = {key: value.float() for key, value in random_scene(N, 0).params.items()}
+    packing = pack([[8, 4]] * N)
+    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
+    atlas = encode(texels, packing, request.param, Range(-0.5, 2.0, "test"))
+    folder = tmp_path_factory.mktemp("bundles") / request.param
+    write_bundle(folder, params, packing.tiles, atlas)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def load_and_draw(folder: Path, verify: bool) -> bool:
+    """Whether the bundle could be opened; what can be opened can be drawn."""
+    try:
+        loaded = read_bundle(folder, verify=verify)
+    except BundleError as error:
+        assert str(error)
+        return False
+    K = torch.tensor([[20.0, 0, SIDE / 2], [0, 20.0, SIDE / 2], [0, 0, 1]])
+    output = BakedScene.from_bundle(loaded).render(Camera(torch.eye(4), K, SIDE, SIDE), torch.zeros(3), maps=True)
+    assert output.rgb.shape == (SIDE, SIDE, 3)
+    return True
+
+
+def put(folder: Path, files: dict[str, bytes]) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def without_hash(manifest: bytes, files: dict[str, bytes]) -> bytes:
+    """The manifest with sizes and hashes that fit, as of a bundle that was damaged before it was signed."""
+    info = json.loads(manifest)
+    for name in info["files"]:
+        info["files"][name] = {"bytes": len(files[name]), "sha256": hashlib.sha256(files[name]).hexdigest()}
+    return json.dumps(info).encode()
+
+
+def test_an_undamaged_bundle_opens(bundle: dict[str, bytes], tmp_path: Path) -> None:
+    assert load_and_draw(put(tmp_path / "b", bundle), verify=True)
+
+
+@pytest.mark.parametrize("name", ["bundle.json", "surfels.ply", "atlas.ktx2"])
+def test_bit_flips(bundle: dict[str, bytes], name: str, tmp_path: Path) -> None:
+    """With hashes: every flip in a file is found. Without, or with hashes that were made after the damage, what is
+    read has been checked well enough to be drawn."""
+    rng = random.Random(f"flip {name}")
+    folder = put(tmp_path / "b", bundle)
+    for example in range(EXAMPLES):
+        data = bytearray(bundle[name])
+        # half of the flips in the head, where the structure is
+        end = len(data) if example % 2 else min(len(data), 600)
+        for _ in range(rng.choice((1, 1, 3, 20))):
+            data[rng.randrange(end)] ^= 1 << rng.randrange(8)
+        (folder / name).write_bytes(data)
+        opened = load_and_draw(folder, verify=True)
+        if name != "bundle.json":
+            assert not opened or bytes(data) == bundle[name]
+            load_and_draw(folder, verify=False)
+            spoiled = {**bundle, name: bytes(data)}
+            (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], spoiled))
+            load_and_draw(folder, verify=True)
+            (folder / "bundle.json").write_bytes(bundle["bundle.json"])
+
+
+@pytest.mark.parametrize("name", ["bundle.json", "surfels.ply", "atlas.ktx2"])
+def test_truncation_and_growth(bundle: dict[str, bytes], name: str, tmp_path: Path) -> None:
+    rng = random.Random(f"cut {name}")
+    folder = put(tmp_path / "b", bundle)
+    whole = bundle[name]
+    lengths = [0, 1, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(EXAMPLES // 2))]
+    for data in [whole[:length] for length in lengths] + [whole + b"\0", whole + whole, whole * 3]:
+        (folder / name).write_bytes(data)
+        # JSON may be followed by white space, and by nothing else
+        assert not load_and_draw(folder, verify=False) or (name == "bundle.json" and data.strip() == whole.strip())
+        if name != "bundle.json":
+            (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], {**bundle, name: data}))
+            load_and_draw(folder, verify=True)
+            (folder / "bundle.json").write_bytes(bundle["bundle.json"])
+
+
+def test_values_of_the_manifest(bundle: dict[str, bytes], tmp_path: Path) -> None:
+    """Every value of bundle.json in turn is replaced by ones of other types and sizes."""
+    strange = (None, True, -1, 0, 10**30, 1.5, "x", "", [], {}, [[]], 1e308, "../../etc/passwd", [1, 2, 3])
+    folder = put(tmp_path / "b", bundle)
+    whole = json.loads(bundle["bundle.json"])
+
+    def places(value, path=()):
+        yield path
+        for key in value if isinstance(value, dict) else ():
+            yield from places(value[key], (*path, key))
+
+    rng = random.Random("manifest")
+    paths = [path for path in places(whole) if path and path[0] != "statistics"]
+    for path in paths:
+        for value in rng.sample(strange, min(len(strange), 4 * MORE)):
+            info = json.loads(bundle["bundle.json"])
+            at = info
+            for key in path[:-1]:
+                at = at[key]
+            at[path[-1]] = value
+            (folder / "bundle.json").write_text(json.dumps(info))
+            load_and_draw(folder, verify=True)
+        del at[path[-1]]
+        (folder / "bundle.json").write_text(json.dumps(info))
+        load_and_draw(folder, verify=True)
+
+
+def test_columns_of_extreme_values(bundle: dict[str, bytes], tmp_path: Path) -> None:
+    """Numbers of surfels.ply that are NaN, infinite or huge: drawn without these surfels, or refused."""
+    columns = dict(parse_ply(bundle["surfels.ply"]))
+    rng = random.Random("columns")
+    for name in columns:
+        for value in rng.sample((math.nan, math.inf, 3e38, -1.0, 0.0, 2.0**31 - 1), min(6, MORE)):
+            spoiled = {key: column.copy() for key, column in columns.items()}
+            row = rng.randrange(N)
+            if spoiled[name].dtype == np.int32:
+                spoiled[name][row] = int(np.clip(np.nan_to_num(value), -(2**31), 2**31 - 1))
+            else:
+                spoiled[name][row] = value
+            folder = put(tmp_path / "b", bundle)
+            write_ply(folder / "surfels.ply", spoiled)
+            files = {**bundle, "surfels.ply": (folder / "surfels.ply").read_bytes()}
+            (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], files))
+            load_and_draw(folder, verify=True)

@@ -17,7 +17,7 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
 from bitymi_ns.host.errors import fail
 from bitymi_ns.train.errors import TrainingDiverged
-from bitymi_ns.train.guard import COMPARED_VIEWS, Guard
+from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.schedules import Schedule
@@ -117,13 +117,7 @@ class TrainingRun:
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
-        factor = self.schedule.resolution_factor(step)
-        try:
-            self.guard.before(
-                step, lambda: [self.views.at(i, factor) for i in range(min(len(self.views), COMPARED_VIEWS))]
-            )
-        except TrainingDiverged as error:
-            self._diverged(step, error)
+        self.guard.before(step, self.views)
         self._set_rates()
 
     def _set_rates(self) -> None:

@@ -27,7 +27,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import View, as_float, background_color, over_background
+from bitymi_ns.train.views import ReducedViews, View, as_float, background_color, over_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -38,7 +38,7 @@ WORSE = 1.25
 """A window is bad when its mean loss is this many times what it is compared with."""
 BROKEN_SHARE = 0.01
 """Surfels that are not finite are dropped up to this share of all; beyond, the run goes back."""
-COMPARED_VIEWS = 8
+COMPARED_VIEWS = 4
 """Views on which the blank picture and the first scene are judged."""
 
 
@@ -98,17 +98,19 @@ class Guard:
         """Whether the run may go back at all."""
         return self.config.guard.rollbacks > 0
 
-    def before(self, step: int, views: Sequence[View] | Callable[[], Sequence[View]]) -> None:
+    def before(self, step: int, views: ReducedViews) -> None:
         """Call before each step: notes the state that the run starts from, and what its first scene is worth.
 
         Args:
             step: index of the step.
-            views: some training views at the resolution of the step, or a function that gives them.
+            views: the training views. They are compared at full size: small pictures may hold no window of SSIM, and
+                then have smaller losses.
         """
         if not self.on or self._states:
             return
         if math.isnan(self._limit):
-            self._limit = WORSE * self._untrained(views() if callable(views) else views)
+            compared = [views.at(i, 1.0) for i in range(min(len(views), COMPARED_VIEWS))]
+            self._limit = WORSE * self._untrained(compared)
         self._states = [(step, self._capture())]
 
     @torch.no_grad()
@@ -116,7 +118,7 @@ class Guard:
         """Loss of blank pictures or of the scene as it is, whichever is larger."""
         weight, blank, first = self.config.loss.ssim_weight, [0.0], [0.0]
         kind = "white" if self.config.background == "white" else "black"
-        for camera, image, mask in views[:COMPARED_VIEWS]:
+        for camera, image, mask in views:
             device = self.scene.surfels["means"].device
             background = background_color(kind, self.config.seed, 0, device)
             target = over_background(as_float(image.to(device)), background)

@@ -17,7 +17,7 @@ from torch.optim import Adam
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import AdamConfig, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
-from bitymi_ns.train.guard import COMPARED_VIEWS, Guard
+from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import objective, psnr
 from bitymi_ns.train.schedules import Schedule
@@ -216,7 +216,7 @@ class Trainer:
         step, factor = self.step, self.schedule.resolution_factor(self.step)
         index = training_order(len(self.views), self.config.seed, step)
         camera, (_, image, mask) = self.views.camera(index), self.views.at(index, factor)
-        self.guard.before(step, lambda: [self.views.at(i, factor) for i in range(min(len(self.views), COMPARED_VIEWS))])
+        self.guard.before(step, self.views)
         terms, output = None, None
         while terms is None:
             for name, optimizer in self.optimizers.items():

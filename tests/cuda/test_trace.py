@@ -271,7 +271,7 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
     leaves = [case.params[key].to(device) for key in SURFEL_KEYS]
     projection = ops.project(*leaves, Camera(case.viewmat, case.K, 20, 20))
     fragments = ops.trace(projection)
-    with pytest.raises(ValueError, match="colors has"):
+    with pytest.raises(ValueError, match="colors must have shape"):
         ops.composite_image(fragments, projection, torch.zeros(3, 3, device=device).double())
     elsewhere = torch.zeros(len(fragments), 3, device="meta")
     with pytest.raises(ValueError, match="colors is on device 'meta'"):

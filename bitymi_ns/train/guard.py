@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.train.config import TrainConfig
@@ -72,7 +73,8 @@ class Guard:
         self.factor, self.rollbacks = 1.0, 0
         self._streak = 0  # times in a row, without a good window between
         self._limit = math.nan
-        self._sum, self._count = 0.0, 0
+        # on the scene's device, so that no step has to wait for numbers: of the losses, and the most surfels that broke
+        self._sum, self._broken, self._count = torch.zeros(()), torch.zeros(1, dtype=torch.int32), 0
         self._states: list[tuple[int, dict[str, Any]]] = []  # the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
@@ -82,7 +84,7 @@ class Guard:
             "rollbacks": self.rollbacks,
             "streak": self._streak,
             "limit": self._limit,
-            "sum": self._sum,
+            "sum": float(self._sum),
             "count": self._count,
         }
 
@@ -90,7 +92,7 @@ class Guard:
         """The inverse of `state_dict`."""
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
         self._streak = int(state["streak"])
-        self._limit, self._sum, self._count = float(state["limit"]), float(state["sum"]), int(state["count"])
+        self._limit, self._sum, self._count = float(state["limit"]), torch.tensor(state["sum"]), int(state["count"])
         self._states = []
 
     @property
@@ -143,13 +145,14 @@ class Guard:
         else:
             self._go_back(step, cause)
 
-    def after(self, step: int, loss: float, not_finite: int) -> dict[str, float]:
+    def after(self, step: int, loss: Tensor, broken: Tensor) -> dict[str, float]:
         """Call after each step, when optimisers and strategy are done with it.
 
         Args:
             step: index of the step.
-            loss: photometric loss of the step.
-            not_finite: surfels that could not be drawn because they are not finite.
+            loss: scalar, photometric loss of the step, without graph. On a CUDA device it is looked at when a window
+                ends, and so is the next one; on the CPU at once.
+            broken: [1] int32, surfels that could not be drawn because they are not finite.
 
         Returns:
             What was done, by name; empty when all is well.
@@ -160,17 +163,22 @@ class Guard:
         if not self.on:
             return {}
         if self.schedule.recovering(step):
-            self._sum, self._count = 0.0, 0
+            self._sum, self._count = torch.zeros_like(loss), 0
         else:
-            self._sum, self._count = self._sum + loss, self._count + 1
-        if not_finite > BROKEN_SHARE * len(self.scene):
-            return self._go_back(step, describe_broken(self.scene) or f"{not_finite} surfels are not finite")
+            self._sum, self._count = self._sum.to(loss) + loss, self._count + 1
+        self._broken = torch.maximum(self._broken.to(broken), broken)
         last = step + 1 >= self.schedule.max_steps
-        if self._count < self.window and not last:
+        ends = self._count >= self.window or last
+        if ends or broken.device.type == "cpu":
+            most = int(self._broken)
+            self._broken = torch.zeros_like(broken)
+            if most > BROKEN_SHARE * len(self.scene):
+                return self._go_back(step, describe_broken(self.scene) or f"{most} surfels are not finite")
+        if not ends:
             return {}
-        mean = self._sum / self._count if self._count else 0.0
+        mean = float(self._sum) / self._count if self._count else 0.0
         enough = self._count >= min(self.window, self.config.guard.min_window)
-        self._sum, self._count = 0.0, 0
+        self._sum, self._count = torch.zeros_like(loss), 0
         if enough and mean > self._limit:
             return self._go_back(step, f"the views are drawn worse than blank ones (loss {mean:.3f})")
         cause = describe_broken(self.scene)
@@ -204,7 +212,7 @@ class Guard:
         self.factor *= options.rates**self._streak
         self._restore(state)
         self._states = [(origin, state)]
-        self._sum, self._count = 0.0, 0
+        self._sum, self._count = torch.zeros_like(self._sum), 0
         self.announce(
             f"step {step}: training diverged ({cause}); back to the state before step {origin}, "
             f"with learning rates times {self.factor:.2g} from here on"

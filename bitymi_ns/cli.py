@@ -88,10 +88,12 @@ class Stability:
 
     def run(self) -> None:
         from bitymi_ns.stability import page
-        from bitymi_ns.stability.backends import BACKENDS
+        from bitymi_ns.stability.backends import BACKENDS, missing
 
         if self.backend not in BACKENDS:
             raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")
+        if why := missing(BACKENDS[self.backend]):
+            raise ValueError(f"the backend '{self.backend}' cannot be used here: {why}")
         rows = page.write(self.output, BACKENDS[self.backend], lambda text: print(text, file=sys.stderr))
         worse = [row.label for row in rows if "**" in row.verdict]
         print(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")

@@ -6,6 +6,10 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
+import torch
+
+from bitymi_ns.ops.backend import emulated_cuda, module
+
 
 @dataclass(frozen=True)
 class Backend:
@@ -22,5 +26,22 @@ class Backend:
     use: Callable[[], AbstractContextManager[object]] = nullcontext
 
 
-BACKENDS: dict[str, Backend] = {"cpu": Backend("cpu", "cpu")}
-"""By name; tests/stress runs every case on each of them."""
+BACKENDS: dict[str, Backend] = {
+    "cpu": Backend("cpu", "cpu"),
+    "cuda": Backend("cuda", "cuda"),
+    "emulated": Backend("emulated", "cpu", emulated_cuda),
+}
+"""By name; tests/stress runs every case on each that there is. `emulated`: the CUDA kernels, run on the host."""
+
+
+def missing(backend: Backend) -> str:
+    """Why a backend cannot be used here; empty when it can."""
+    device = torch.device(backend.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        return "no CUDA device (or torch without CUDA)"
+    try:
+        with backend.use():
+            module(device)
+    except RuntimeError as error:
+        return str(error)
+    return ""

@@ -122,7 +122,12 @@ class Shading:
         leaves = [t.to(device).requires_grad_() for t in (self.base.clone(), self.projection.frames.clone())]
         moved["uv"] = moved["uv"].clone().requires_grad_()
         fragments = ops.Fragments(
-            **moved, tile_start=f.tile_start.to(device), width=f.width, height=f.height, layout=f.layout
+            **moved,
+            tile_start=f.tile_start.to(device),
+            width=f.width,
+            height=f.height,
+            layout=f.layout,
+            surfels=f.surfels,
         )
         params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]
         geometry = None if mode == "plain" else self.field.geometry

@@ -6,11 +6,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from bitymi_ns.stability.backends import BACKENDS, Backend
+from bitymi_ns.stability.backends import BACKENDS, Backend, missing
 
 
 @pytest.fixture(params=sorted(BACKENDS))
 def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
     chosen = BACKENDS[request.param]
+    if why := missing(chosen):
+        pytest.skip(why)
     with chosen.use():
         yield chosen

@@ -55,7 +55,8 @@ def page_edges(width: int, height: int, r_u: int, r_v: int) -> list[tuple[int, i
 
 @pytest.mark.parametrize("sides", [(4, 4), (8, 4), (4, 16)])
 def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend) -> None:
-    """Whatever no tile owns is NaN: a texel fetched beside a tile, above a page or below it would show."""
+    """Whatever no tile owns is NaN: a texel fetched beside a tile, above a page or below it would show. Texture units
+    fetch a neighbour of weight 0 at the outer texel centres, where 0 times NaN would; for them it is a large number."""
     r_u, r_v = sides
     width, height, layers = 64, 48, 3
     places = [(x, y, layer) for layer in range(layers) for x, y in page_edges(width, height, r_u, r_v)]
@@ -65,7 +66,8 @@ def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend
     case.params["opacity_logits"].fill_(1.0)
     case.params["means"][:, 2] = case.params["means"][:, 2].clamp(min=1.0)
     generator = torch.Generator().manual_seed(0)
-    atlas, patches, tiles = torch.full((layers, height, width, 4), math.nan), [], []
+    nothing = math.nan if backend.name == "cpu" else 1e3
+    atlas, patches, tiles = torch.full((layers, height, width, 4), nothing), [], []
     for x, y, layer in places:
         patch = torch.rand(r_v, r_u, 3, generator=generator) - 0.5
         atlas[layer, y : y + r_v, x : x + r_u] = torch.cat([patch, torch.ones(r_v, r_u, 1)], -1)
@@ -87,7 +89,9 @@ def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend
     assert len(drawn) == n, "every tile is seen"
     assert got.isfinite().all()
     error = (got - want.rgb).abs().amax(-1)
-    assert (error < 1e-4).double().mean() > 0.999 and error.max() < 2e-2, error.max()
+    # texture units weigh texels in steps of 1/256
+    assert (error < (1e-4 if backend.name == "cpu" else 4e-3)).double().mean() > 0.999, error.max()
+    assert error.max() < 2e-2
 
 
 def test_pixels_at_the_edges_of_wide_and_tall_images_are_drawn(backend: Backend) -> None:

@@ -5,7 +5,7 @@ from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, bake, export
 from bitymi_ns.bake.progress import Progress, rich_progress
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
-from bitymi_ns.bake.verify import Check, check_field, check_files
+from bitymi_ns.bake.verify import Check, check_field, check_files, check_view_color
 
 __all__ = [
     "BakeOptions",
@@ -20,6 +20,7 @@ __all__ = [
     "check_field",
     "check_files",
     "check_target",
+    "check_view_color",
     "export",
     "read_bundle",
     "rich_progress",

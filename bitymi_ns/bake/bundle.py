@@ -20,6 +20,7 @@ from bitymi_ns.bake.folder import check_target, complete_folder
 from bitymi_ns.bake.manifest import (
     ATLAS,
     FORMAT,
+    FULL_VERSION,
     MANIFEST,
     SURFELS,
     VERSION,
@@ -31,12 +32,15 @@ from bitymi_ns.bake.manifest import (
 from bitymi_ns.bake.quantise import EncodedAtlas, decode_pages
 from bitymi_ns.bake.surfel_table import (
     EXTENT_COLUMN,
+    TERMS,
     from_columns,
     mean_residuals,
+    term_columns,
     tile_extents,
     to_columns,
     view_color_kind,
 )
+from bitymi_ns.ops.view_color import check_lean
 
 __all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
 
@@ -45,6 +49,12 @@ COLOR_BIAS = 0.5
 SUPPORT = 3.0  # radius of the kernel in scale units
 _MANIFEST_LIMIT = 64 << 20
 _CHUNK = 1 << 22
+_LEAN_FORMULAS = {
+    "sv": "(view_base + sum exp(b . d) rgb) / (1 + sum exp(b . d)); a term is b, rgb; d from the camera to the surfel",
+    "sh": "view_base is the coefficient of degree 0, terms are those that follow",
+    "sb": "view_base is the base colour, a term is a lobe",
+    "sg": "view_base is the base colour, a term is a lobe",
+}
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,8 @@ class Bundle:
     """A loaded bundle.
 
     Attributes:
-        surfels: per-surfel parameters as in docs/architecture.md, float32 on the CPU.
+        surfels: per-surfel parameters as in docs/architecture.md, float32 on the CPU; the view colour may be lean
+            (`ops.view_color.LEAN`).
         view_color: sv, sh, sb or sg.
         tiles: [N, 5] int32 (x, y, layer, r_u, r_v), zeros for a surfel without a tile.
         atlas: [layers, height, width, 4] uint8 (bc7, uint8) or float32 (fp16); None when the scene has no texture, or
@@ -111,6 +122,7 @@ def write_bundle(
     near: float = 0.2,
     weight_bound: float = 0.0,
     prefilter: str = "low_pass",
+    view_color: str | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     world: World | None = None,
     statistics: Mapping[str, Any] | None = None,
@@ -122,7 +134,7 @@ def write_bundle(
 
     Args:
         folder: the bundle's folder.
-        surfels: per-surfel parameters, N rows each, all finite.
+        surfels: per-surfel parameters, N rows each, all finite; the view colour all or lean.
         tiles: [N, 5] int32.
         atlas: the encoded atlas, None for a scene without texture.
         extent: [N] half side of each tile in scale units, None = 3, the kernel's support.
@@ -131,6 +143,7 @@ def write_bundle(
         near: nearest drawn depth.
         weight_bound: fragments of smaller blending weight get no residual.
         prefilter: low_pass or pixel (`SceneConfig.prefilter`).
+        view_color: sv, sh, sb or sg; lean colours need it, None = the kind whose parameters are there.
         background: colour behind the surfels.
         world: place in the capture's own frame.
         statistics: anything worth knowing about the bake, for people and reports.
@@ -145,16 +158,18 @@ def write_bundle(
         BundleError: the target exists, the disk is full, the parameters are not finite.
     """
     folder = Path(folder)
-    _check_surfels(surfels, tiles)
+    kind = view_color or view_color_kind(surfels)
+    _check_surfels(surfels, tiles, kind)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS):
             raise BundleError(f"extra_files may not replace {name}")
-    info = _describe(surfels, atlas, near, weight_bound, prefilter, background, world or World(), statistics)
+    info = _describe(surfels, kind, atlas, near, weight_bound, prefilter, background, world or World(), statistics)
     try:
         with complete_folder(folder, overwrite) as new:
-            columns = to_columns(surfels, tiles, mean_residual, extent)
-            ply.write_ply(new / SURFELS, columns, comments=[GENERATOR, "2D Beta surfels; see bundle.json"])
+            columns = to_columns(surfels, tiles, mean_residual, extent, kind)
+            terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
+            ply.write_ply(new / SURFELS, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
             if atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
             for name, data in (extra_files or {}).items():
@@ -190,8 +205,12 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
         if name not in (SURFELS, ATLAS):
             _checked(folder / name, entry, verify, keep=False)
     try:
-        columns = ply.parse_ply(_checked(folder / SURFELS, info["files"][SURFELS], verify))
-        surfels, tiles = from_columns(columns, info["surfels"]["view_color"])
+        elements = ply.parse_ply(_checked(folder / SURFELS, info["files"][SURFELS], verify))
+        columns, terms = elements["vertex"], elements.get(TERMS)
+        stated = info["surfels"].get("terms")
+        if stated != (None if terms is None else len(next(iter(terms.values())))):
+            raise BundleError(f"{folder / SURFELS}: {MANIFEST} states another number of view-colour terms: {stated}")
+        surfels, tiles = from_columns(columns, info["surfels"]["view_color"], terms)
         extent = tile_extents(columns, float(info["atlas"]["extent"]) if info["atlas"] else SUPPORT)
         mean_residual = mean_residuals(columns)
     except ply.PlyError as error:
@@ -213,6 +232,7 @@ def verify_bundle(folder: str | Path) -> dict[str, Any]:
 
 def _describe(
     surfels: Mapping[str, Tensor],
+    kind: str,
     atlas: EncodedAtlas | None,
     near: float,
     weight_bound: float,
@@ -222,12 +242,12 @@ def _describe(
     statistics: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """bundle.json without its list of files."""
-    kind = view_color_kind(surfels)
-    means = surfels["means"].detach()
+    means, lean = surfels["means"].detach(), "view_terms" in surfels
+    version = VERSION if lean else FULL_VERSION
     empty = len(means) == 0
     described: dict[str, Any] = {
         "format": FORMAT,
-        "version": f"{VERSION[0]}.{VERSION[1]}",
+        "version": f"{version[0]}.{version[1]}",
         "generator": GENERATOR,
         "surfels": {
             "file": SURFELS,
@@ -257,7 +277,10 @@ def _describe(
         },
         "statistics": dict(statistics or {}),
     }
-    if kind == "sv":
+    if lean:
+        described["surfels"]["terms"] = len(surfels["view_terms"])
+        described["surfels"]["view_terms"] = _LEAN_FORMULAS[kind]
+    elif kind == "sv":
         described["surfels"]["sites"] = surfels["sv_log_tau"].shape[1]
         described["surfels"]["activations"] |= {"sv_sites": "unit", "sv_log_tau": "exp"}
     if atlas is not None:
@@ -279,9 +302,14 @@ def _describe(
     return described
 
 
-def _check_surfels(surfels: Mapping[str, Tensor], tiles: npt.NDArray[np.int32]) -> None:
+def _check_surfels(surfels: Mapping[str, Tensor], tiles: npt.NDArray[np.int32], kind: str) -> None:
+    if "view_terms" in surfels:
+        try:
+            check_lean(kind, surfels, len(tiles))
+        except ValueError as error:
+            raise BundleError(str(error)) from error
     for name, value in surfels.items():
-        if len(value) != len(tiles):
+        if name != "view_terms" and len(value) != len(tiles):
             raise BundleError(f"{name} has {len(value)} rows, the tiles have {len(tiles)}")
         finite = torch.isfinite(value).flatten(1).all(1) if value.dim() > 1 else torch.isfinite(value)
         if not finite.all():

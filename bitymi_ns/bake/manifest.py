@@ -12,7 +12,10 @@ import numpy as np
 from torch import Tensor
 
 FORMAT = "bitymi-bundle"
-VERSION = (1, 1)
+VERSION = (2, 0)
+"""The newest version that is read. Lean view colours are version 2, which readers of version 1 refuse."""
+FULL_VERSION = (1, 1)
+"""Version of a bundle whose surfels have all parameters."""
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 _NUMBER_LIMIT = 1e30
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -102,6 +105,8 @@ def parse(data: bytes, source: str = MANIFEST) -> dict[str, Any]:
         )
     fields.integer("surfels.count")
     fields.text("surfels.view_color", "sv", "sh", "sb", "sg")
+    if "terms" in fields.get("surfels"):  # lean view colours
+        fields.integer("surfels.terms")
     fields.number("color_bias")
     for name in ("alpha_max", "alpha_min", "t_min", "near", "weight_bound", "low_pass"):
         fields.number(f"render.{name}")

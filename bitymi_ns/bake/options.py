@@ -24,8 +24,11 @@ class BakeOptions:
     """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
     4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
     tolerance: float = 0.5
-    """Largest error of a tile: root mean square over its visible part, weighted by what a fragment there can contribute
-    to a pixel, in 8-bit steps. Every tile takes the smallest grid that keeps it, or none. 0: the sizes of the rule."""
+    """Largest error that is left out, in 8-bit steps, weighted by what a fragment can contribute to a pixel. Of a tile:
+    root mean square over its visible part; it takes the smallest grid that keeps this, or none. Of a surfel's view
+    colour: the largest one at the directions of the training views that see it, and at others between and around them;
+    it keeps as few Spherical Voronoi sites as that takes, or one colour (of other view colours all or one colour). 0:
+    the sizes of the rule, and all of the view colours."""
     cap_by_views: bool = True
     """Give no tile more texels than pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = True

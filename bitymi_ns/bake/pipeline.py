@@ -16,13 +16,16 @@ from torch import Tensor
 from bitymi_ns.bake.bundle import World, write_bundle
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
+from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
-from bitymi_ns.bake.plan import Field, make_plan
+from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, encode
 from bitymi_ns.bake.reduce import reduce_tiles
-from bitymi_ns.bake.visibility import largest_transmittance
+from bitymi_ns.bake.surfel_table import view_color_kind
+from bitymi_ns.bake.visibility import Visibility, visibility
+from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
 
 OPACITY_FLOOR = 1.0 / 255.0  # below it a surfel is skipped at every pixel
@@ -41,7 +44,8 @@ class Baked:
     """A baked scene, before it is written.
 
     Attributes:
-        surfels: parameters of the surfels that are kept, N rows, CPU.
+        surfels: parameters of the surfels that are kept, N rows, CPU; view colours are lean (`ops.view_color.LEAN`)
+            where they were reduced.
         rows: [N] int64, their rows in the scene.
         packing: where the tiles lie.
         texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
@@ -53,6 +57,7 @@ class Baked:
         options: what it was baked with.
         statistics: what was left out, what it cost, and the error of the quantisation.
         prefilter: as the scene was drawn.
+        view_color: sv, sh, sb or sg.
     """
 
     surfels: dict[str, Tensor]
@@ -67,6 +72,7 @@ class Baked:
     options: BakeOptions
     statistics: dict[str, Any] = field(default_factory=dict)
     prefilter: str = "low_pass"
+    view_color: str = "sv"
 
     def with_texels(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
         """The same bake with other residual colours (fine-tuned ones, say), quantised and encoded anew."""
@@ -111,14 +117,15 @@ def bake(
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
     prefilter = str(getattr(scene.config, "prefilter", "low_pass"))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
-    transmittance = None
-    if cameras and (options.drop_unseen or (options.tolerance > 0 and scene.field is not None)):
-        transmittance = largest_transmittance(surfels, cameras, near, prefilter, progress)
+    transmittance = views = None
+    if cameras and (options.drop_unseen or options.tolerance > 0):
+        views = visibility(surfels, cameras, near, prefilter, progress)
         if options.drop_unseen:
-            seen = transmittance > 0
+            seen = views.transmittance > 0
             left_out["unseen"] = int((~seen).sum())
-            kept, transmittance = kept[seen], transmittance[seen]
+            kept, views = kept[seen], views.of(seen)
             surfels = {name: value[seen] for name, value in surfels.items()}
+        transmittance = views.transmittance
     if len(kept) == 0:
         raise ValueError(f"no surfel is left to bake of {len(scene.surfels['means'])}: left out {left_out}")
     statistics: dict[str, Any] = {"surfels": {"trained": len(scene.surfels["means"]), "kept": len(kept)}}
@@ -151,6 +158,9 @@ def bake(
         stored = None if atlas is None else atlas.decoded()
         errors = tile_errors(scene.field, plan, packing.tiles, mean_residual, stored, options.chunk, progress)
         statistics["error"] = {"tolerance": options.tolerance, **errors.summary()}
+    kind = view_color_kind(surfels)
+    if options.tolerance > 0:
+        surfels, statistics["view_color"] = _lean_surfels(surfels, views, cameras, options.tolerance, progress)
     statistics["seconds"] = round(time.perf_counter() - started, 3)
     surfels = {name: value.cpu() for name, value in surfels.items()}
     return Baked(
@@ -166,6 +176,7 @@ def bake(
         options,
         statistics,
         prefilter,
+        kind,
     )
 
 
@@ -194,6 +205,7 @@ def export(
         near=baked.near,
         weight_bound=baked.weight_bound,
         prefilter=baked.prefilter,
+        view_color=baked.view_color,
         background=background,
         world=world,
         statistics={**baked.statistics, **(statistics or {})},
@@ -201,6 +213,32 @@ def export(
         loose_files=loose_files,
         overwrite=overwrite,
     )
+
+
+def _lean_surfels(
+    surfels: Mapping[str, Tensor],
+    views: Visibility | None,
+    cameras: Sequence[Camera],
+    tolerance: float,
+    progress: Progress = no_progress,
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Surfels with lean view colours, and what was left out; see `lean_color.reduce_view_color`.
+
+    Args:
+        surfels: N rows.
+        views: what the cameras see of them; None without cameras.
+        cameras: training views.
+        tolerance: 8-bit steps.
+        progress: called after every chunk of work.
+    """
+    kind, means = view_color_kind(surfels), surfels["means"]
+    seen = means.new_zeros(0, len(means), dtype=torch.bool) if views is None else views.seen
+    opacity, _ = kernel_parameters(surfels, None if views is None else views.transmittance)
+    at = (seen, centers_of(cameras, means), opacity)
+    lean = reduce_view_color(surfels, kind, *at, tolerance, progress)
+    error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
+    kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind]}
+    return kept | lean.parameters(), {"kind": kind, **describe(kind, surfels, lean, error, tolerance)}
 
 
 def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:

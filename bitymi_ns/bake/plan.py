@@ -73,7 +73,7 @@ def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | Non
 
     Args:
         surfels: opacity_logits [N], beta_raw [N].
-        transmittance: [N] of `largest_transmittance`; None = nothing is in front of any surfel.
+        transmittance: [N] of `Visibility`; None = nothing is in front of any surfel.
     """
     opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
     if transmittance is not None:
@@ -107,7 +107,7 @@ def make_plan(
         options: sizes and tolerance; without a tolerance every tile has the extent of the options and is probed at the
             texels of the rule.
         cameras: training views, for the cap.
-        transmittance: [N] of `largest_transmittance`, None = 1.
+        transmittance: [N] of `Visibility`, None = 1.
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
     """

@@ -4,6 +4,9 @@ The names of 3D Gaussian splatting come first, so that its viewers show a sensib
 (logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour by
 name, `<parameter>_<i>` in C order, the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv, the half side of
 the tile in scale units, tile_extent, and the mean residual residual_0..2, which is that of a surfel without a tile.
+
+Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms, the number of the surfel's terms, instead;
+the terms themselves, surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
 """
 
 from __future__ import annotations
@@ -15,12 +18,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.directions import sphere
 from bitymi_ns.bake.ply import PlyError
+from bitymi_ns.ops import view_color
+from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, MAX_TERMS, check_lean
 
 SH_C0 = 0.28209479177387814
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
 EXTENT_COLUMN = "tile_extent"
+COUNT_COLUMN = "view_terms"
+TERMS = "view_term"
 
 # Trailing shape of every view-colour parameter; -1 is read from the number of columns.
 VIEW_COLORS: dict[str, dict[str, tuple[int, ...]]] = {
@@ -39,12 +47,17 @@ def view_color_kind(surfels: Mapping[str, Tensor]) -> str:
     raise ValueError(f"no view colour among the surfels' parameters {sorted(surfels)}")
 
 
-def mean_view_color(surfels: Mapping[str, Tensor]) -> Tensor:
+def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
     """Mean of f_view over all directions, without the bias 0.5: [N, 3].
 
-    Exact for sh, sb and sg; a mean over 32 directions for sv. For display only.
+    Exact for sh, sb and sg; a mean over 32 directions for sv and for lean colours, whose kind must be given. For
+    display only.
     """
-    kind = view_color_kind(surfels)
+    kind = kind or view_color_kind(surfels)
+    if kind == "sv" or "view_terms" in surfels:
+        n, origin = len(surfels["means"]), torch.zeros(3)
+        parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in sphere(32)]
+        return torch.stack(parts).mean(0)
     if kind == "sh":
         return surfels["sh_dc"] * SH_C0
     if kind == "sb":  # mean over the sphere of max(0, d.mu)^p is 1 / (2 (p + 1))
@@ -52,19 +65,11 @@ def mean_view_color(surfels: Mapping[str, Tensor]) -> Tensor:
         power = 4.0 * lobes[..., 5].exp()
         rgb = torch.nn.functional.softplus(lobes[..., :3], beta=10.0 * float(np.log(2.0)))
         return surfels["sb_base"] + (rgb / (2.0 * (power + 1.0))[..., None]).sum(1)
-    if kind == "sg":  # mean over the sphere of exp(l (d.mu - 1)) is (1 - exp(-2l)) / 2l
-        lobes = surfels["sg_lobes"]  # [N, L, 7]
-        sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
-        share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
-        return surfels["sg_base"] + (lobes[..., 4:] * share[..., None]).sum(1)
-    sites = torch.nn.functional.normalize(surfels["sv_sites"], dim=-1)  # [N, K, 3]
-    sites = sites * surfels["sv_log_tau"].exp()[..., None]
-    total = torch.zeros_like(surfels["sv_rgb"][:, 0])
-    directions = _sphere(32).to(sites)
-    for direction in directions:
-        weight = torch.softmax(sites @ direction, dim=1)  # [N, K]
-        total += torch.einsum("nk,nkc->nc", weight, surfels["sv_rgb"])
-    return total / len(directions)
+    # mean over the sphere of exp(l (d.mu - 1)) is (1 - exp(-2l)) / 2l
+    lobes = surfels["sg_lobes"]  # [N, L, 7]
+    sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
+    share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
+    return surfels["sg_base"] + (lobes[..., 4:] * share[..., None]).sum(1)
 
 
 def to_columns(
@@ -72,18 +77,21 @@ def to_columns(
     tiles: npt.NDArray[np.int32],
     mean_residual: Tensor | None = None,
     extent: Tensor | None = None,
+    kind: str | None = None,
 ) -> dict[str, npt.NDArray]:
-    """The columns of surfels.ply.
+    """The columns of surfels.ply; those of the terms of lean view colours are `term_columns`.
 
     Args:
         surfels: the per-surfel parameters of docs/architecture.md, N rows each.
         tiles: [N, 5] int32.
         mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers; None = 0, no column.
         extent: [N] half side of each tile in scale units; None = no column.
+        kind: sv, sh, sb or sg; None = the one whose parameters are there.
     """
-    kind = view_color_kind(surfels)
-    surfels = {name: value.detach().float().cpu() for name, value in surfels.items()}
-    color = mean_view_color(surfels)
+    kind = kind or view_color_kind(surfels)
+    lean = "view_terms" in surfels
+    surfels = {name: _plain(value) for name, value in surfels.items()}
+    color = mean_view_color(surfels, kind)
     if mean_residual is not None:
         color = color + mean_residual
     color = color.nan_to_num(0.0).clamp(-0.5, 0.5) / SH_C0  # (mean colour - 0.5) / SH_C0
@@ -97,10 +105,12 @@ def to_columns(
         _numbered("rot", 4): quats,
         ("beta",): surfels["beta_raw"][:, None],
     }
-    for name in VIEW_COLORS[kind]:
+    for name in ("view_base",) if lean else VIEW_COLORS[kind]:
         values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
         groups[_numbered(name, values.shape[1])] = values
     columns = {name: values[:, i].numpy() for names, values in groups.items() for i, name in enumerate(names)}
+    if lean:
+        columns[COUNT_COLUMN] = surfels["view_span"][:, 1].numpy()
     columns |= {name: tiles[:, i] for i, name in enumerate(TILE_COLUMNS)}
     if extent is not None:
         columns[EXTENT_COLUMN] = extent.detach().float().cpu().numpy()
@@ -108,6 +118,16 @@ def to_columns(
         residual = mean_residual.detach().float().cpu().numpy()
         columns |= {name: residual[:, i] for i, name in enumerate(_numbered("residual", 3))}
     return columns
+
+
+def term_columns(surfels: Mapping[str, Tensor]) -> dict[str, npt.NDArray]:
+    """The columns of the terms of lean view colours, surfel after surfel: term_0, term_1, ...; [T] float32."""
+    first, count = surfels["view_span"].long().cpu().unbind(1)
+    terms = surfels["view_terms"].detach().float().cpu()
+    start = count.cumsum(0) - count  # a span may lie anywhere, the file has them in order
+    inside = torch.arange(int(count.sum())) - start.repeat_interleave(count)
+    ordered = terms[first.repeat_interleave(count) + inside]
+    return {name: ordered[:, i].numpy() for i, name in enumerate(_numbered("term", terms.shape[1]))}
 
 
 def tile_extents(columns: Mapping[str, npt.NDArray], default: float) -> Tensor:
@@ -132,8 +152,15 @@ def mean_residuals(columns: Mapping[str, npt.NDArray]) -> Tensor:
     return _stack(columns, names)
 
 
-def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[str, Tensor], Tensor]:
+def from_columns(
+    columns: Mapping[str, npt.NDArray], kind: str, terms: Mapping[str, npt.NDArray] | None = None
+) -> tuple[dict[str, Tensor], Tensor]:
     """Surfels and tiles from the columns of surfels.ply.
+
+    Args:
+        columns: of the element `vertex`.
+        kind: sv, sh, sb or sg.
+        terms: columns of the element `view_term`, for lean view colours; None = the file has none.
 
     Returns:
         surfels: the per-surfel parameters, float32 (quaternions have length 1).
@@ -144,7 +171,7 @@ def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[st
     """
     if kind not in VIEW_COLORS:
         raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
-
+    tiles = _stack(columns, TILE_COLUMNS, np.int32)
     surfels = {
         "means": _stack(columns, ("x", "y", "z")),
         "quats": _stack(columns, _numbered("rot", 4)),
@@ -153,6 +180,8 @@ def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[st
         "beta_raw": _stack(columns, ("beta",))[:, 0].contiguous(),
     }
     count = len(surfels["means"])
+    if terms is not None:
+        return surfels | _lean_from_columns(columns, terms, kind), tiles
     for name, shape in VIEW_COLORS[kind].items():
         found = [int(column[len(name) + 1 :]) for column in columns if _is_number_of(column, name)]
         width = int(np.prod([size for size in shape if size > 0]))
@@ -162,7 +191,30 @@ def from_columns(columns: Mapping[str, npt.NDArray], kind: str) -> tuple[dict[st
         surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
     if kind == "sv" and len({surfels[name].shape[1] for name in VIEW_COLORS["sv"]}) != 1:
         raise PlyError("the Spherical Voronoi parameters disagree about the number of sites")
-    return surfels, _stack(columns, TILE_COLUMNS, np.int32)
+    return surfels, tiles
+
+
+def _lean_from_columns(
+    columns: Mapping[str, npt.NDArray], terms: Mapping[str, npt.NDArray], kind: str
+) -> dict[str, Tensor]:
+    names = _numbered("term", LEAN_WIDTH[kind])
+    if set(terms) != set(names):
+        raise PlyError(f"the element {TERMS} needs the properties {names[0]} to {names[-1]}, not {sorted(terms)}")
+    count = _stack(columns, (COUNT_COLUMN,), np.int32)[:, 0].long()
+    if ((count < 0) | (count > MAX_TERMS)).any() or int(count.sum()) != len(terms[names[0]]):
+        raise PlyError(f"{COUNT_COLUMN} does not count the {len(terms[names[0]])} rows of {TERMS}")
+    span = torch.stack([count.cumsum(0) - count, count], dim=1).int()
+    lean = dict(zip(LEAN, (_stack(columns, _numbered("view_base", 3)), span, _stack(terms, names)), strict=True))
+    try:
+        check_lean(kind, lean, len(count))
+    except ValueError as error:
+        raise PlyError(str(error)) from error
+    return lean
+
+
+def _plain(value: Tensor) -> Tensor:
+    value = value.detach().cpu()
+    return value.float() if value.is_floating_point() else value
 
 
 def _stack(columns: Mapping[str, npt.NDArray], names: tuple[str, ...], dtype: type = np.float32) -> Tensor:
@@ -182,12 +234,3 @@ def _numbered(name: str, count: int) -> tuple[str, ...]:
 def _is_number_of(column: str, name: str) -> bool:
     rest = column[len(name) + 1 :]
     return column.startswith(f"{name}_") and rest.isascii() and rest.isdecimal() and len(rest) < 6
-
-
-def _sphere(count: int) -> Tensor:
-    """Directions spread evenly over the sphere along a Fibonacci spiral: [count, 3]."""
-    i = torch.arange(count, dtype=torch.float64)
-    z = 1.0 - (2.0 * i + 1.0) / count
-    angle = i * torch.pi * (3.0 - 5.0**0.5)
-    radius = (1.0 - z * z).sqrt()
-    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1).float()

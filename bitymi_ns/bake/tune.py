@@ -14,7 +14,6 @@ from torch import Tensor
 from bitymi_ns.bake.evaluate import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.progress import Progress, no_progress
-from bitymi_ns.bake.surfel_table import view_color_kind
 from bitymi_ns.ops import (
     TexelFragments,
     TexelTiles,
@@ -107,7 +106,6 @@ class TexelScene:
         if baked.texels is None:
             raise ValueError("a scene without texture has no texels to tune")
         self._baked, self._background = baked, background
-        self._kind = view_color_kind(baked.surfels)
         rectangles = torch.from_numpy(baked.packing.tiles)
         self.tiles = TexelTiles.of_sizes(rectangles[:, 3:].clamp(min=1), baked.extent.float())
         self.texels = torch.empty(self.tiles.count, 3)
@@ -143,7 +141,7 @@ class TexelScene:
         geometry = (p[name] for name in ("means", "quats", "log_scales", "opacity_logits", "beta_raw"))
         projection = project(*geometry, camera, self._baked.near, self._baked.prefilter == "pixel")
         fragments = trace(projection)
-        base = view_color(self._kind, p, p["means"], camera.exact_center, projection.visible)
+        base = view_color(self._baked.view_color, p, p["means"], camera.exact_center, projection.visible)
         plain = composite_image(fragments, projection, shade(fragments, base, projection.frames))
         chosen = TexelFragments.of(fragments, fragments.weight >= self._baked.weight_bound)
         without = texel_image(chosen, base, self.texels, self.tiles, bound=math.inf)  # their colours without residual

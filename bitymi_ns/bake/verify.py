@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,11 @@ from torch import Tensor
 
 from bitymi_ns.bake.bundle import Bundle, BundleError, file_problem, read_bundle, read_manifest
 from bitymi_ns.bake.errors import tile_errors
+from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bake.manifest import MANIFEST
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.plan import Field, make_plan
-from bitymi_ns.bake.visibility import largest_transmittance
+from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
+from bitymi_ns.bake.visibility import visibility
 from bitymi_ns.scene.camera import Camera
 
 _SLACK = 1.02  # sums in another order, rotations that were written with length 1
@@ -72,7 +73,8 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     near, weight_bound = float(render["near"]), float(render["weight_bound"])
     transmittance = None
     if cameras and options.tolerance > 0:
-        transmittance = largest_transmittance(bundle.surfels, cameras, near, render.get("prefilter", "low_pass"))
+        seen = visibility(bundle.surfels, cameras, near, render.get("prefilter", "low_pass"))
+        transmittance = seen.transmittance
     plan = make_plan(bundle.surfels, field, options, cameras, transmittance, near, weight_bound)
     tiled = bundle.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.extent, plan.extent)
@@ -84,6 +86,45 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
         ok &= measured <= bound * _SLACK + _SLACK_STEPS
         lines.append(f"{name} {measured:.3f} (stated {bound:.3f})")
     return Check("error against the field", ok, ", ".join(lines) + " steps")
+
+
+def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
+    """Measures lean view colours against the trained ones anew, and compares with the error that bundle.json states.
+
+    Args:
+        bundle: what `check_files` read.
+        surfels: per-surfel parameters of the scene that was baked; a surfel of the bundle is found by its geometry.
+        cameras: its training views.
+    """
+    name = "error of the view colours"
+    if "view_terms" not in bundle.surfels:
+        return Check(name, True, "none: all of them are kept")
+    stated = bundle.info["statistics"].get("view_color")
+    if stated is None:
+        return Check(name, True, "not stated")
+    trained = {name: value.detach().float().cpu() for name, value in surfels.items()}
+    places = {key: row for row, key in enumerate(_keys(trained))}
+    rows = [places.get(key) for key in _keys(bundle.surfels)]
+    if None in rows:
+        return Check(name, False, f"surfel {rows.index(None)} is none of the trained scene")
+    trained = {name: value[torch.tensor(rows)] for name, value in trained.items()}
+    means, render = bundle.surfels["means"], bundle.info["render"]
+    seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
+    if cameras:
+        views = visibility(trained, cameras, float(render["near"]), render.get("prefilter", "low_pass"))
+        seen, transmittance = views.seen, views.transmittance
+    opacity, _ = kernel_parameters(trained, transmittance)
+    at = (means, seen, centers_of(cameras, means), opacity)
+    found = float(view_color_errors(bundle.view_color, trained, bundle.surfels, *at).amax())
+    bound, tolerance = float(stated["error"]["p100"]), float(stated["tolerance"])
+    ok = found <= bound * _SLACK + _SLACK_STEPS
+    return Check(name, ok, f"largest {found:.3f} (stated {bound:.3f}, tolerance {tolerance:g}) steps")
+
+
+def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
+    """The numbers of every surfel that a bundle holds bit for bit."""
+    parts = [surfels["means"], surfels["log_scales"], surfels["opacity_logits"][:, None], surfels["beta_raw"][:, None]]
+    return [row.tobytes() for row in torch.cat(parts, dim=1).numpy()]
 
 
 def bake_options(bundle: Bundle) -> BakeOptions:
@@ -131,6 +172,11 @@ def _statements(bundle: Bundle) -> Check:
         "surfels without_tile": statistics.get("surfels", {}).get("without_tile"),
     }
     found["surfels without_tile"] = int((~tiled).sum())
+    lean = statistics.get("view_color")
+    if lean is not None and "view_terms" in bundle.surfels:
+        stated |= {"view colour sites": lean["sites"]["after"], "surfels of one colour": lean["one_color"]}
+        found["view colour sites"] = len(bundle) + len(bundle.surfels["view_terms"])
+        found["surfels of one colour"] = int((bundle.surfels["view_span"][:, 1] == 0).sum())
     for name, value in stated.items():
         if value is not None and value != found[name]:
             return Check("statistics", False, f"{name}: {value:,} stated, {found[name]:,} found")
@@ -138,4 +184,6 @@ def _statements(bundle: Bundle) -> Check:
     detail = "agree with the files"
     if error is not None:
         detail += f"; error of a tile at most {error['rms']['p100']:.3f} steps, tolerance {error['tolerance']}"
+    if lean is not None:
+        detail += f"; of a view colour at most {lean['error']['p100']:.3f}, tolerance {lean['tolerance']:g}"
     return Check("statistics", True, detail)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,17 +13,33 @@ from bitymi_ns.ops import project, trace
 from bitymi_ns.scene.camera import Camera
 
 
+@dataclass(frozen=True)
+class Visibility:
+    """What the views see of N surfels.
+
+    Attributes:
+        transmittance: [N] float32 in [0, 1], the largest one in front of a blended fragment of the surfel, over all
+            views: a fragment's weight is sigma T; the kernel gives sigma, this gives T. 0 for one that no view blends.
+        seen: [V, N] bool, whether the view blends a fragment of the surfel.
+    """
+
+    transmittance: Tensor
+    seen: Tensor
+
+    def of(self, rows: Tensor) -> Visibility:
+        """The same of some of the surfels."""
+        return Visibility(self.transmittance[rows], self.seen[:, rows])
+
+
 @torch.no_grad()
-def largest_transmittance(
+def visibility(
     surfels: Mapping[str, Tensor],
     cameras: Sequence[Camera],
     near: float,
     prefilter: str = "low_pass",
     progress: Progress = no_progress,
-) -> Tensor:
-    """The largest transmittance in front of a blended fragment of every surfel, over all views.
-
-    A fragment's weight is sigma T; the kernel gives sigma, this gives T. It is 0 for a surfel that no view blends.
+) -> Visibility:
+    """Which views see every surfel, and through what.
 
     Args:
         surfels: the per-surfel parameters of docs/architecture.md, N rows, all of them finite and drawable.
@@ -30,16 +47,16 @@ def largest_transmittance(
         near: nearest drawn depth.
         prefilter: as the scene is drawn, low_pass or pixel.
         progress: called after every view.
-
-    Returns:
-        [N] float32 in [0, 1].
     """
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
     largest = means.new_zeros(len(means))
+    seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
         fragments = trace(project(means, *geometry, camera.to(means.device), near, prefilter == "pixel"))
         in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
-        largest.scatter_reduce_(0, fragments.surfel.long(), in_front, "amax")
+        rows = fragments.surfel.long()
+        largest.scatter_reduce_(0, rows, in_front, "amax")
+        seen[done - 1, rows] = True
         progress("looking through the training views", done, len(cameras))
-    return largest
+    return Visibility(largest, seen)

@@ -108,13 +108,16 @@ def results_table(matrix: Matrix, cells: Cells) -> tuple[str, list[str]]:
 
 
 BUNDLE_HEADER = (
-    "scene", "row", "bundle", "surfels", "texels a surfel", "atlas bytes", "of the first", "dPSNR", "PSNR to neural",
-    "dFLIP", "render ms", "tile error p99",
+    "scene", "row", "bundle", "surfels", "sites a surfel", "one colour", "texels a surfel", "atlas bytes",
+    "of the first", "dPSNR", "PSNR to neural", "dFLIP", "render ms", "tile error p99", "colour error p99",
 )  # fmt: skip
 BUNDLE_NOTES = (
     "dPSNR and dFLIP: against the photographs, bundle minus trained scene; PSNR to neural: bundle against trained "
     "scene on the held-out views, as the exporter measures it.",
     "Tile error: root mean square of a tile against the field as stored, in 8-bit steps, 99th percentile.",
+    "Sites a surfel: what is left of the view colour (or coefficients, lobes); one colour: share of the surfels with "
+    "nothing but a constant; colour error: largest over the directions of the training views and others between, times "
+    "the blending weight, in 8-bit steps, 99th percentile. Bundles that keep all have none of these.",
 )
 
 
@@ -133,7 +136,7 @@ def bundles_table(matrix: Matrix, cells: Cells) -> str:
             statistics = exported["value"]["statistics"]
             kept, texels = statistics["surfels"]["kept"], statistics.get("texels", {})
             texels = texels.get("kept", texels.get("after_cap_by_views"))
-            size = results.get("atlas_bytes")
+            size, lean = results.get("atlas_bytes"), statistics.get("view_color")
             first = size if first is None else first
             flips = (results.get("flip"), before.get("flip"))
             lines.append(
@@ -141,6 +144,8 @@ def bundles_table(matrix: Matrix, cells: Cells) -> str:
                     *_names(run),
                     bundle.name,
                     number(kept, 0),
+                    number(lean["sites"]["after"] / kept if lean else None, 2),
+                    number(lean["one_color"] / kept if lean else None, 3),
                     number(None if texels is None else texels / kept, 0),
                     number(size, 0),
                     number(size / first, 3) if size and first else "",
@@ -149,6 +154,7 @@ def bundles_table(matrix: Matrix, cells: Cells) -> str:
                     "" if None in flips else difference(flips[0] - flips[1], 4),
                     number(results.get("render_ms"), 1),
                     number(statistics.get("error", {}).get("rms", {}).get("p99")),
+                    number(lean["error"]["p99"] if lean else None),
                 ]
             )
     return _without_empty(BUNDLE_HEADER, lines)

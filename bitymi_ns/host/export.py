@@ -26,7 +26,7 @@ from rich.table import Table
 from bitymi_ns.bake import BakeOptions, BundleError, TuneOptions, bake, export, read_bundle, rich_progress, tune_atlas
 from bitymi_ns.bake.bundle import World
 from bitymi_ns.bake.folder import check_target
-from bitymi_ns.bake.manifest import MANIFEST, dump
+from bitymi_ns.bake.manifest import MANIFEST, SURFELS, dump
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.host.bundle_config import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
@@ -55,8 +55,8 @@ class ExportAtlas(BakeOptions):
     overwrite: bool = False
     """Replace a bundle that is there already."""
     exact: bool = False
-    """Keep everything: the paper's rule for the size of every tile, no cap by views, no surfel dropped as unseen, and
-    texels as the field gives them, without fine-tuning."""
+    """Keep everything: the paper's rule for the size of every tile, no cap by views, no surfel dropped as unseen, all
+    sites of the view colours, and texels as the field gives them, without fine-tuning."""
     finetune_steps: int = TuneOptions.steps
     """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
     compare: bool = True
@@ -243,6 +243,7 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
     if texels is not None:
         print_savings(table, info)
+    print_view_color(table, info)
     atlas = statistics.get("atlas")
     if atlas is None:
         table.add_row("Atlas", "none (the scene has no texture)" if texels is None else "none (no tile is needed)")
@@ -291,6 +292,26 @@ def print_savings(table: Table, info: dict[str, Any]) -> None:
     table.add_row("Error of a tile", f"median {rms['p50']:.2f}, 99 % {rms['p99']:.2f}, at most {rms['p100']:.2f} steps")
     when = "as stored" if "error" in statistics else "before the fine-tuning"
     table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
+
+
+def print_view_color(table: Table, info: dict[str, Any]) -> None:
+    """What the surfels keep of their view colours, and what that saves and costs."""
+    lean, stored = info["statistics"].get("view_color"), info["files"][SURFELS]["bytes"]
+    if lean is None:
+        table.add_row("View colour", "all of it is kept")
+        table.add_row("Surfel bytes", f"{stored:,}")
+        return
+    sites, error, count = lean["sites"], lean["error"], info["surfels"]["count"]
+    name = {"sv": "Sites", "sh": "Coefficients"}.get(lean["kind"], "Lobes and base colours")
+    table.add_row(name, f"{sites['before']:,} -> {sites['after']:,} ({100 * sites['after'] / sites['before']:.1f} %)")
+    table.add_row("Surfels of one colour", f"{lean['one_color']:,} ({100 * lean['one_color'] / count:.1f} %)")
+    whole = stored + lean["bytes"]["before"] - lean["bytes"]["after"]
+    table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
+    table.add_row(
+        "Error of a view colour",
+        f"median {error['p50']:.2f}, 99 % {error['p99']:.2f}, at most {error['p100']:.2f} steps",
+    )
+    table.add_row("", f"(tolerance {lean['tolerance']:g}; weighted, largest over directions and channels)")
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.bake import Bundle, Check, check_field
+from bitymi_ns.bake import Bundle, Check, check_field, check_view_color
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import held_out_psnr, load_trained
@@ -28,10 +28,10 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
         _, pipeline = load_trained(config, step)
     model, datamanager = pipeline.model, pipeline.datamanager
-    checks = []
+    cameras = datamanager.undistorted_train_cameras()
+    train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
+    checks = [check_view_color(bundle, model.scene.surfels, train)]
     if model.scene.field is not None:
-        cameras = datamanager.undistorted_train_cameras()
-        train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
         checks.append(check_field(bundle, model.scene.field.cpu(), train))
     if len(datamanager.eval_dataset):
         scene, background = BakedScene.from_bundle(bundle), model.background.cpu()

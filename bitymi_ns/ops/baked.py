@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .backend import function, module
-from .view_color import VIEW_COLORS, check_view_color
+from .view_color import LEAN, VIEW_COLORS, check_lean, check_view_color
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -75,7 +75,7 @@ class BakedArrays:
 
     Attributes:
         surfels: means [N, 3], quats [N, 4], log_scales [N, 2], opacity_logits [N], beta_raw [N] and the parameters of
-            the view colour (ops.VIEW_COLORS).
+            the view colour (ops.VIEW_COLORS, or ops.view_color.LEAN).
         view_color: sv, sh, sb or sg.
         tiles: [N, 5] int32: x, y, page, r_u, r_v in texels; r_u = 0: no tile.
         texture: the atlas, None = no tiles.
@@ -103,9 +103,10 @@ class BakedArrays:
 
     def __post_init__(self) -> None:
         for name, value in self.surfels.items():
-            if value.dtype != torch.float32:
+            if value.dtype != torch.float32 and name != "view_span":
                 raise TypeError(f"the CUDA renderer takes float32 surfels, but {name} is {value.dtype}")
-        check_view_color(self.view_color, self.surfels, len(self.tiles))
+        check = check_lean if "view_terms" in self.surfels else check_view_color
+        check(self.view_color, self.surfels, len(self.tiles))
 
     @property
     def device(self) -> torch.device:
@@ -116,14 +117,18 @@ class BakedArrays:
     def arguments(self) -> tuple[Any, ...]:
         """The scene as the kernel takes it; kept, so that a recorded CUDA graph never points at memory that is gone."""
         p = {name: value.detach().contiguous() for name, value in self.surfels.items()}
-        colors = [p[name] for name in VIEW_COLORS[self.view_color]]
-        terms = colors[1].shape[1] + (1 if self.view_color == "sh" else 0)
+        terms, full, lean = 0, (None, None, None), (None, None, None)
+        if "view_terms" in p:
+            lean = tuple(p[name] for name in LEAN)
+        else:
+            colors = [p[name] for name in VIEW_COLORS[self.view_color]]
+            terms = colors[1].shape[1] + (1 if self.view_color == "sh" else 0)
+            full = (*colors, None)[:3]
         geometry = (p["means"], p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
         pages = None if self.texture is None else self.texture.pages
         optional = [None if t is None else t.detach().float().contiguous() for t in (self.extent, self.mean_residual)]
-        a, b, c = (*colors, None)[:3]
         fixed = (self.offset, self.scale, self.weight_bound, self.near, self.prefilter, self.transmittance_min)
-        return (*geometry, self.view_color, terms, a, b, c, self.tiles.contiguous(), *optional, pages, *fixed)
+        return (*geometry, self.view_color, terms, *full, *lean, self.tiles.contiguous(), *optional, pages, *fixed)
 
 
 @dataclass

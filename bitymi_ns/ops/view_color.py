@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .backend import dense, kernel
 
+MAX_TERMS = 32
 VIEW_COLORS: dict[str, tuple[str, ...]] = {
     "sv": ("sv_sites", "sv_log_tau", "sv_rgb"),
     "sh": ("sh_dc", "sh_rest"),
@@ -16,6 +17,11 @@ VIEW_COLORS: dict[str, tuple[str, ...]] = {
     "sg": ("sg_base", "sg_lobes"),
 }
 """Names of the per-surfel parameters of each kind (docs/architecture.md gives their shapes)."""
+LEAN = ("view_base", "view_span", "view_terms")
+"""Names of the parameters of lean view colours, of which every surfel has as many terms as it needs."""
+LEAN_WIDTH = {"sv": 6, "sh": 3, "sb": 6, "sg": 7}
+"""Numbers a term. sv: b, rgb relative to the first site (csrc/core/view_color.h); sh: the coefficients of one function,
+from degree 1 on; sb, sg: a lobe."""
 
 
 class _ViewColor(torch.autograd.Function):
@@ -64,9 +70,30 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
         raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
     if kind == "sv" and terms < 1:
         raise ValueError("Spherical Voronoi colours need at least one site a surfel")
-    if terms > 32:
-        raise ValueError(f"at most 32 sites or lobes a surfel, not {terms}")
+    if terms > MAX_TERMS:
+        raise ValueError(f"at most {MAX_TERMS} sites or lobes a surfel, not {terms}")
     return terms
+
+
+def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
+    """Checks the lean view colours of n surfels; waits for a device.
+
+    Raises:
+        ValueError: a shape or dtype is wrong, a span lies outside the terms, or harmonics end within a degree.
+    """
+    if kind not in VIEW_COLORS:
+        raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
+    base, span, terms = (params[name] for name in LEAN)
+    if tuple(base.shape) != (n, 3) or tuple(span.shape) != (n, 2) or span.dtype != torch.int32:
+        raise ValueError(f"view_base must be [{n}, 3] and view_span [{n}, 2] int32")
+    if terms.dim() != 2 or terms.shape[1] != LEAN_WIDTH[kind]:
+        raise ValueError(f"view_terms must be [terms, {LEAN_WIDTH[kind]}], not {list(terms.shape)}")
+    first, count = span.long().unbind(1)
+    bad = (first < 0) | (count < 0) | (count > MAX_TERMS) | (first + count > len(terms))
+    if kind == "sh":
+        bad |= ~torch.isin(count, count.new_tensor([0, 3, 8, 15]))
+    if bad.any():
+        raise ValueError(f"view_span of surfel {int(bad.nonzero()[0])} does not fit the {len(terms)} terms")
 
 
 def view_color(
@@ -76,7 +103,9 @@ def view_color(
 
     Args:
         kind: sv (Spherical Voronoi, the paper's), sh, sb or sg.
-        params: the parameters named in VIEW_COLORS[kind]; more are ignored.
+        params: the parameters named in VIEW_COLORS[kind]; or those of lean colours (`LEAN`), which have no gradient:
+            view_base [N, 3], view_span [N, 2] int32 (first term, how many), view_terms [terms, LEAN_WIDTH[kind]]. More
+            are ignored.
         means: [N, 3] world positions.
         center: [3] camera centre, world; used in float64 (`Camera.exact_center`).
         active: [N] bool; rows that are not active give 0 and get no gradient. None = all.
@@ -87,8 +116,16 @@ def view_color(
     Raises:
         ValueError: unknown kind, or a parameter has the wrong shape.
     """
-    terms = check_view_color(kind, params, means.shape[0])
-    given = [params[name] for name in VIEW_COLORS[kind]]
     n = means.shape[0]
     flags = means.new_ones(n, dtype=torch.uint8) if active is None else active.to(means.device, torch.uint8)
+    if "view_terms" in params:
+        base, span, terms = (params[name] for name in LEAN)
+        x, out = dense(means, means), means.new_empty(n, 3)
+        origin = dense(center, center.double()).to(means.device)
+        kernel("lean_color", means)(
+            kind, dense(base, means), span.contiguous(), dense(terms, means), x, origin, flags, out
+        )
+        return out
+    terms = check_view_color(kind, params, n)
+    given = [params[name] for name in VIEW_COLORS[kind]]
     return _ViewColor.apply(kind, terms, flags, center, means, *given)

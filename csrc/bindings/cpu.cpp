@@ -63,6 +63,14 @@ TexelFragments<S> texel_fragments(const Array<const int32_t>& surfel, const Arra
   const int64_t n = int64_t(surfel.size());
   return {n, surfel.data(), data(pixel, n, "pixel"), data(weight, n, "weight"), data(uv, 2 * n, "uv")};
 }
+// span [n, 2] of lean view colours lies within the terms, which have `size` numbers
+void check_spans(const int32_t* span, int64_t n, int64_t size, int width) {
+  for (int64_t i = 0; i < n; ++i) {
+    const int64_t first = span[2 * i], count = span[2 * i + 1];
+    if (first < 0 || count < 0 || count > kMaxTerms || (first + count) * width > size)
+      throw std::invalid_argument("the terms of surfel " + std::to_string(i) + "'s view colour are not there");
+  }
+}
 // tile_start [tiles + 1] of f fragments
 int64_t tiles_of(const Array<const int64_t>& tile_start, int64_t f) {
   const int64_t tiles = int64_t(tile_start.size()) - 1;
@@ -272,6 +280,23 @@ void bind(nb::module_& m, const char* suffix) {
         view_color_forward(n, p, x, o, active.data(), to);
       },
       "kind"_a, "terms"_a, "a"_a.noconvert(), "b"_a.noconvert(), "c"_a.noconvert().none(), "means"_a.noconvert(),
+      "center"_a.noconvert(), "active"_a.noconvert(), "out"_a.noconvert());
+
+  m.def(
+      name("lean_color").c_str(),
+      [](const std::string& kind, In base, Array<const int32_t> span, In terms, In means, Array<const double> center,
+         Array<const uint8_t> active, Out out) {
+        const int64_t n = int64_t(active.size());
+        const int number = kind_number(kind);
+        const LeanColors<S> p = {number, data(base, 3 * n, "base"), terms.data(), data(span, 2 * n, "span")};
+        check_spans(p.span, n, int64_t(terms.size()), lean_width(number));
+        const S* x = data(means, 3 * n, "means");
+        const double* o = data(center, 3, "center");
+        S* to = data(out, 3 * n, "out");
+        nb::gil_scoped_release release;
+        lean_color(n, p, x, o, active.data(), to);
+      },
+      "kind"_a, "base"_a.noconvert(), "span"_a.noconvert(), "terms"_a.noconvert(), "means"_a.noconvert(),
       "center"_a.noconvert(), "active"_a.noconvert(), "out"_a.noconvert());
 
   m.def(

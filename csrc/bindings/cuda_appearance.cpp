@@ -41,6 +41,18 @@ void bind(nb::module_& m, const char* suffix) {
       "kind"_a, "terms"_a, "a"_a.noconvert(), "b"_a.noconvert(), "c"_a.noconvert().none(), "means"_a.noconvert(),
       "center"_a.noconvert(), "active"_a.noconvert(), "out"_a.noconvert(), "stream"_a = 0);
   m.def(
+      name("lean_color").c_str(),
+      [](const std::string& kind, In base, Array<const int32_t> span, In terms, In means, Array<const double> center,
+         Array<const uint8_t> active, Out out, uintptr_t stream) {
+        const int64_t n = int64_t(active.size());
+        const int number = kind_number(kind);
+        const LeanColors<S> p = {number, data(base, 3 * n, "base"), terms.data(), data(span, 2 * n, "span")};
+        lean_color(n, p, data(means, 3 * n, "means"), data(center, 3, "center"), active.data(), data(out, 3 * n, "out"),
+                   stream_of(stream));
+      },
+      "kind"_a, "base"_a.noconvert(), "span"_a.noconvert(), "terms"_a.noconvert(), "means"_a.noconvert(),
+      "center"_a.noconvert(), "active"_a.noconvert(), "out"_a.noconvert(), "stream"_a = 0);
+  m.def(
       name("view_color_backward").c_str(),
       [](const std::string& kind, int terms, In a, In b, Maybe<const S> c, In means, Array<const double> center,
          Array<const uint8_t> active, In dout, Out da, Out db, Maybe<S> dc, Out dmeans, uintptr_t stream) {

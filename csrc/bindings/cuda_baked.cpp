@@ -30,12 +30,13 @@ Parameters parameters(const std::string& kind, int64_t terms) {
 }
 
 void frame(Floats means, Floats quats, Floats log_scales, Floats opacity_logits, Floats beta_raw,
-           const std::string& kind, int terms, Floats a, Floats b, MaybeFloats c, Array<const int32_t> tiles,
-           MaybeFloats extent, MaybeFloats mean_residual, Maybe<const int64_t> pages, double offset, double scale,
-           double weight_bound, double near, bool prefilter, double transmittance_min, Floats viewmats, Floats Ks,
-           int width, int height, MaybeFloats background, Maybe<float> rgb, Maybe<float> alpha, Maybe<int32_t> packed,
-           Maybe<float> beta, Maybe<float> depth, Maybe<float> normal, Maybe<int32_t> overdraw, int stages,
-           Array<uint8_t> memory, int64_t capacity, uintptr_t stream) {
+           const std::string& kind, int terms, MaybeFloats a, MaybeFloats b, MaybeFloats c, MaybeFloats base,
+           Maybe<const int32_t> span, MaybeFloats lean, Array<const int32_t> tiles, MaybeFloats extent,
+           MaybeFloats mean_residual, Maybe<const int64_t> pages, double offset, double scale, double weight_bound,
+           double near, bool prefilter, double transmittance_min, Floats viewmats, Floats Ks, int width, int height,
+           MaybeFloats background, Maybe<float> rgb, Maybe<float> alpha, Maybe<int32_t> packed, Maybe<float> beta,
+           Maybe<float> depth, Maybe<float> normal, Maybe<int32_t> overdraw, int stages, Array<uint8_t> memory,
+           int64_t capacity, uintptr_t stream) {
   const int64_t n = int64_t(opacity_logits.size());
   const Parameters p = parameters(kind, terms);
   const BakedViews views = {int(viewmats.size() / 16), width, height, viewmats.data(),
@@ -49,7 +50,12 @@ void frame(Floats means, Floats quats, Floats log_scales, Floats opacity_logits,
                 opacity_logits.data(),
                 data(beta_raw, n, "beta_raw")};
   s.kind = p.kind, s.terms = terms;
-  s.a = data(a, p.a * n, "a"), s.b = data(b, p.b * n, "b"), s.c = data_or_null(c, p.c * n, "c");
+  if (base && span && lean) {
+    s.lean = {p.kind, data_or_null(base, 3 * n, "base"), lean->data(), data_or_null(span, 2 * n, "span")};
+  } else {
+    if (!a || !b) throw std::invalid_argument("a view colour is missing");
+    s.a = data_or_null(a, p.a * n, "a"), s.b = data_or_null(b, p.b * n, "b"), s.c = data_or_null(c, p.c * n, "c");
+  }
   s.tiles = data(tiles, 5 * n, "tiles");
   s.extent = data_or_null(extent, n, "extent");
   s.mean_residual = data_or_null(mean_residual, 3 * n, "mean_residual");
@@ -91,8 +97,9 @@ void bind_baked(nb::module_& m) {
       },
       "surfels"_a, "views"_a, "width"_a, "height"_a, "capacity"_a, "normals"_a, "Bytes of working memory of a frame.");
   m.def("baked_frame", &frame, "means"_a.noconvert(), "quats"_a.noconvert(), "log_scales"_a.noconvert(),
-        "opacity_logits"_a.noconvert(), "beta_raw"_a.noconvert(), "kind"_a, "terms"_a, "a"_a.noconvert(),
-        "b"_a.noconvert(), "c"_a.noconvert().none(), "tiles"_a.noconvert(), "extent"_a.noconvert().none(),
+        "opacity_logits"_a.noconvert(), "beta_raw"_a.noconvert(), "kind"_a, "terms"_a, "a"_a.noconvert().none(),
+        "b"_a.noconvert().none(), "c"_a.noconvert().none(), "base"_a.noconvert().none(), "span"_a.noconvert().none(),
+        "lean"_a.noconvert().none(), "tiles"_a.noconvert(), "extent"_a.noconvert().none(),
         "mean_residual"_a.noconvert().none(), "pages"_a.noconvert().none(), "offset"_a, "scale"_a, "weight_bound"_a,
         "near"_a, "prefilter"_a, "transmittance_min"_a, "viewmats"_a.noconvert(), "Ks"_a.noconvert(), "width"_a,
         "height"_a, "background"_a.noconvert().none(), "rgb"_a.noconvert().none(), "alpha"_a.noconvert().none(),

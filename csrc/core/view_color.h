@@ -35,6 +35,23 @@ BT_HD Vec3<S> sv_color(int K, const S* sites, const S* log_tau, const S* rgb, Ve
   }
   return (S(1) / total) * c;
 }
+// The same relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
+// c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)). Without terms this is one colour.
+template <class S>
+BT_HD Vec3<S> sv_relative_color(int K, const S* base, const S* terms, Vec3<S> d) {
+  Vec3<S> c = load3(base);
+  if (K == 0) return c;
+  S top = S(0);
+  for (int k = 0; k < K; ++k) top = max_(top, dot(load3(terms + 6 * k), d));
+  S total = exp_(-top);
+  c = total * c;
+  for (int k = 0; k < K; ++k) {
+    const S w = exp_(dot(load3(terms + 6 * k), d) - top);
+    total += w;
+    c = c + w * load3(terms + 6 * k + 3);
+  }
+  return (S(1) / total) * c;
+}
 // Adds to dd; writes the rest. dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the
 // heaviest site: where one site takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not
 // the difference of two equal colours, whose rounding a temperature of 1e4 would multiply.
@@ -254,6 +271,23 @@ BT_HD Vec3<S> view_color(int kind, int K, const ViewColorArrays<const S>& p, int
   if (kind == kSv) return sv_color(K, a, b, p.c + w.c * i, d);
   if (kind == kSh) return sh_color(K, a, b, d);
   return kind == kSb ? sb_color(K, a, b, d) : sg_color(K, a, b, d);
+}
+// View colours of which only what a surfel needs is left: a base colour, and as many terms as its span says. Terms are
+// b, rgb (sv_relative_color), coefficients from the first degree on (sh), or lobes (sb, sg).
+template <class S>
+struct LeanColors {
+  int kind;
+  const S *base, *terms;  // [n, 3], [all terms, lean_width(kind)]
+  const int32_t* span;    // [n, 2]: first term, how many
+};
+BT_HD int lean_width(int kind) { return kind == kSh ? 3 : kind == kSg ? 7 : 6; }
+template <class S>
+BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, Vec3<S> d) {
+  const int K = p.span[2 * i + 1];
+  const S *base = p.base + 3 * i, *terms = p.terms + int64_t(p.span[2 * i]) * lean_width(p.kind);
+  if (p.kind == kSv) return sv_relative_color(K, base, terms, d);
+  if (p.kind == kSh) return sh_color(K + 1, base, terms, d);
+  return p.kind == kSb ? sb_color(K, base, terms, d) : sg_color(K, base, terms, d);
 }
 // Writes the gradients of the parameters of surfel i and returns that of d.
 template <class S>

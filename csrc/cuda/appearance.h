@@ -10,6 +10,9 @@ template <class S>
 void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                         const uint8_t* active, S* out, Stream stream);
 template <class S>
+void lean_color(int64_t n, const LeanColors<S>& p, const S* means, const double* center, const uint8_t* active, S* out,
+                Stream stream);
+template <class S>
 void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                          const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans, Stream stream);
 

@@ -16,6 +16,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "core/view_color.h"
 #include "cuda/kernels.h"
 
 namespace bt::cuda {
@@ -24,6 +25,7 @@ struct BakedSurfels {
   Surfels<float> geometry;
   int kind, terms;  // as ViewColorArrays in cpu/kernels.h: 0 sv, 1 sh, 2 sb, 3 sg
   const float *a, *b, *c;
+  LeanColors<float> lean;      // in place of a, b and c where lean.base is not null
   const int32_t* tiles;        // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
   const float* extent;         // [n], null: kSupport everywhere
   const float* mean_residual;  // [n, 3], null: 0

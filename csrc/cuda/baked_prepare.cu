@@ -1,7 +1,8 @@
 // First stage of the baked renderer: the surfels that a view sees, each as the row that the later stages read.
 //
 // A thread a surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters a surfel with
-// seven sites) are computed for the visible ones alone, by threads that stand next to each other: a block packs them.
+// seven sites, 20 + 24 a term of lean ones) are computed for the visible ones alone, by threads that stand next to each
+// other: a block packs them.
 #include "core/view_color.h"
 #include "cuda/baked_stages.h"
 
@@ -30,6 +31,7 @@ __device__ uint32_t depth_key(float z) {
 
 // The paper's numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
 __device__ Vec3<float> view_color(const BakedSurfels& s, int64_t i, Vec3<float> d) {
+  if (s.lean.base) return bt::view_color(s.lean, i, d);
   const int K = s.terms;
   switch (s.kind) {
     case 0:

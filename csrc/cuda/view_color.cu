@@ -21,6 +21,18 @@ __global__ void __launch_bounds__(kThreads)
   store3(out + 3 * i, c);
 }
 
+// A surfel of one colour reads 20 bytes; a term more is 24 (sv).
+template <class S>
+__global__ void __launch_bounds__(kThreads)
+    lean_kernel(int64_t n, LeanColors<S> p, const S* __restrict__ means, const double* __restrict__ center,
+                const uint8_t* __restrict__ active, S* __restrict__ out) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= n) return;
+  Vec3<S> c = {S(0), S(0), S(0)};
+  if (active[i]) c = view_color(p, i, view_direction(means + 3 * i, center).n);
+  store3(out + 3 * i, c);
+}
+
 template <class S, int kKind, int kTerms>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(int64_t n, ViewColorArrays<const S> p, const S* __restrict__ means,
@@ -72,6 +84,14 @@ void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* m
 }
 
 template <class S>
+void lean_color(int64_t n, const LeanColors<S>& p, const S* means, const double* center, const uint8_t* active, S* out,
+                Stream stream) {
+  if (!n) return;
+  const auto kernel = lean_kernel<S>;
+  BT_LAUNCH(kernel, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, p, means, center, active, out);
+}
+
+template <class S>
 void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
                          const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans, Stream stream) {
   if (!n) return;
@@ -82,10 +102,11 @@ void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* 
   });
 }
 
-#define BT_INSTANTIATE(S)                                                                                 \
-  template void view_color_forward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*,  \
-                                      const uint8_t*, S*, Stream);                                        \
-  template void view_color_backward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*, \
+#define BT_INSTANTIATE(S)                                                                                          \
+  template void view_color_forward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*,           \
+                                      const uint8_t*, S*, Stream);                                                 \
+  template void lean_color<S>(int64_t, const LeanColors<S>&, const S*, const double*, const uint8_t*, S*, Stream); \
+  template void view_color_backward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*,          \
                                        const uint8_t*, const S*, const ViewColorArrays<S>&, S*, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

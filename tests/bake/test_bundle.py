@@ -15,6 +15,9 @@ from bitymi_ns.bake import ktx2, ply
 from bitymi_ns.bake.bundle import BundleError, World, check_target, read_bundle, verify_bundle, write_bundle
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.ops.reference import view_color as reference
+from bitymi_ns.ops.view_color import VIEW_COLORS
+from tests.ops.test_kernels import lean_parameters
 
 
 def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
@@ -26,6 +29,14 @@ def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
     tiles = packing.tiles if atlas else np.zeros_like(packing.tiles)
     write_bundle(folder, params, tiles, atlas, **kwargs)
     return params, tiles, texels, atlas
+
+
+def make_lean(surfels, folder, kind="sv", count=6):
+    """A bundle with lean view colours and without texture; returns its surfels."""
+    params = {k: v for k, v in surfels(count, kind).items() if k not in VIEW_COLORS[kind]}
+    params |= lean_parameters(kind, count, torch.float32)
+    write_bundle(folder, params, np.zeros((count, 5), dtype=np.int32), None, view_color=kind)
+    return params
 
 
 def amend(folder, change):
@@ -72,6 +83,56 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         assert error < (1e-6 if format == "fp16" else (2.0 / 255) ** 2 / 11)
     assert error == pytest.approx(atlas.mse, rel=0.2)
     assert loaded.info["atlas"]["psnr"] == pytest.approx(atlas.psnr)
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
+    params = make_lean(surfels, tmp_path / "b", kind)
+    loaded = read_bundle(tmp_path / "b")
+    assert loaded.view_color == kind and loaded.info["version"] == "2.0"
+    assert set(loaded.surfels) == set(params)
+    d = torch.nn.functional.normalize(params["means"], dim=1)
+    want = reference.lean(kind, params["view_base"], params["view_span"], params["view_terms"], d)
+    got = reference.lean(kind, *(loaded.surfels[name] for name in ("view_base", "view_span", "view_terms")), d)
+    assert torch.equal(got, want)  # the terms are in the order of the surfels now
+
+
+def test_lean_view_colours_that_do_not_fit_are_refused(surfels, tmp_path):
+    target = tmp_path / "b"
+    params = make_lean(surfels, target)
+    with pytest.raises(BundleError, match="surfel 2"):
+        bad = {**params, "view_span": params["view_span"].clone()}
+        bad["view_span"][2, 1] = 99
+        write_bundle(tmp_path / "bad", bad, np.zeros((6, 5), dtype=np.int32), None, view_color="sv")
+    elements = ply.parse_ply((target / "surfels.ply").read_bytes())
+
+    def rewrite(columns=None, terms=None):
+        more = {"view_term": terms or elements["view_term"]} if terms != {} else {}
+        ply.write_ply(target / "surfels.ply", columns or elements["vertex"], more=more)
+        data = (target / "surfels.ply").read_bytes()
+        entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        amend(target, lambda info: info["files"].update({"surfels.ply": entry}))
+        return read_bundle(target)
+
+    rewrite()
+    counts = elements["vertex"]["view_terms"]
+    for change in ([1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [2**31 - 1, 0, 0, 0, 0, 0], [30, -30, 0, 0, 0, 0]):
+        with pytest.raises(BundleError, match="does not count"):
+            rewrite({**elements["vertex"], "view_terms": (counts + np.int32(change)).astype(np.int32)})
+    with pytest.raises(BundleError, match="view_terms is missing"):
+        rewrite({k: v for k, v in elements["vertex"].items() if k != "view_terms"})
+    with pytest.raises(BundleError, match="needs the properties"):
+        rewrite(terms={k: v for k, v in elements["view_term"].items() if k != "term_5"})
+    with pytest.raises(BundleError, match="another number"):
+        rewrite(terms={k: v[:-1] for k, v in elements["view_term"].items()})
+    with pytest.raises(BundleError, match="another number"):
+        rewrite(terms={})
+    with pytest.raises(BundleError, match="not finite"):
+        rewrite(terms={k: v * np.float32("nan") for k, v in elements["view_term"].items()})
+    rewrite()
+    amend(target, lambda info: info["surfels"].update(terms=None))
+    with pytest.raises(BundleError, match="surfels.terms"):
+        read_bundle(target)
 
 
 def test_the_manifest_states_files_world_and_statistics(surfels, tmp_path):
@@ -213,7 +274,7 @@ def test_versions(surfels, tmp_path):
     make(surfels, target)
     amend(target, lambda info: info.update(version="1.7", holograms={"yes": True}))
     assert read_bundle(target).info["holograms"] == {"yes": True}
-    amend(target, lambda info: info.update(version="2.0"))
+    amend(target, lambda info: info.update(version="3.0"))
     with pytest.raises(BundleError, match="update bitymi-ns"):
         read_bundle(target)
     amend(target, lambda info: info.update(version="one"))

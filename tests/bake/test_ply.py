@@ -35,15 +35,29 @@ def test_the_file_is_plain_ply(tmp_path):
 
 
 def test_what_is_written_is_read(tmp_path):
-    columns = parse_ply(written(tmp_path))
+    columns = parse_ply(written(tmp_path))["vertex"]
     assert list(columns) == list(COLUMNS)
     for name, column in COLUMNS.items():
         assert columns[name].dtype == column.dtype
         np.testing.assert_array_equal(columns[name], column)
 
 
+def test_further_elements_follow(tmp_path):
+    more = {"term": {"a": np.arange(5, dtype=np.float32)}, "none": {"b": np.zeros(0, dtype=np.int32)}}
+    found = parse_ply(written(tmp_path, more=more))
+    assert list(found) == ["vertex", "term", "none"] and found["term"]["a"].tolist() == [0, 1, 2, 3, 4]
+    assert len(found["none"]["b"]) == 0 and len(found["vertex"]["x"]) == 3
+    data = written(tmp_path, more=more)
+    with pytest.raises(PlyError, match="not understood"):
+        parse_ply(data.replace(b"element none", b"element term"))
+    with pytest.raises(PlyError, match="without properties"):
+        parse_ply(data.replace(b"property int b\n", b""))
+    with pytest.raises(PlyError, match="no vertices"):
+        parse_ply(data.replace(b"element vertex", b"element face"))
+
+
 def test_no_vertices_are_fine(tmp_path):
-    assert parse_ply(written(tmp_path, {"x": np.zeros(0, dtype=np.float32)}))["x"].shape == (0,)
+    assert parse_ply(written(tmp_path, {"x": np.zeros(0, dtype=np.float32)}))["vertex"]["x"].shape == (0,)
 
 
 def test_columns_of_different_lengths_are_refused(tmp_path):

@@ -36,9 +36,10 @@ def restate(folder: Path, change=None) -> None:
 
 def change_columns(folder: Path, change) -> None:
     """Rewrites surfels.ply after change(columns), and its hash."""
-    columns = ply.parse_ply((folder / "surfels.ply").read_bytes())
+    elements = ply.parse_ply((folder / "surfels.ply").read_bytes())
+    columns = elements.pop("vertex")
     change(columns)
-    ply.write_ply(folder / "surfels.ply", columns)
+    ply.write_ply(folder / "surfels.ply", columns, more=elements)
     restate(folder)
 
 

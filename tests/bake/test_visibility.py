@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bitymi_ns.bake.visibility import largest_transmittance
+from bitymi_ns.bake.visibility import visibility
 
 
 def test_what_stands_in_front_is_counted(surfels, camera):
@@ -13,12 +13,14 @@ def test_what_stands_in_front_is_counted(surfels, camera):
     params["opacity_logits"] = torch.tensor([0.0, 1.0, 3.0, 3.0])
     params["beta_raw"] = torch.full((4,), -9.0)  # hard discs: the opacity everywhere
     first, second = torch.sigmoid(torch.tensor([0.0, 1.0])).tolist()
-    found = largest_transmittance(params, [camera(6.0)], 0.2)
+    found = visibility(params, [camera(6.0)], 0.2).transmittance
     expected = [1.0, 1 - first, (1 - first) * (1 - second), 0.0]
     assert found.tolist() == pytest.approx(expected, abs=2e-3)
     behind = camera(6.0)
     behind.viewmat[:] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     behind.viewmat[2, 3] = 6.0
-    both = largest_transmittance(params, [camera(6.0), behind], 0.2)
+    seen = visibility(params, [camera(6.0), behind], 0.2).seen
+    assert seen.tolist() == [[True, True, True, False]] * 2
+    both = visibility(params, [camera(6.0), behind], 0.2).transmittance
     assert both.tolist() == pytest.approx([1 - second, 1.0, 1.0, 0.0], abs=2e-3) or both[2] == pytest.approx(1.0)
-    assert largest_transmittance(params, [], 0.2).tolist() == [0.0] * 4
+    assert visibility(params, [], 0.2).transmittance.tolist() == [0.0] * 4

@@ -9,7 +9,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
-from tests.ops.test_kernels import relative
+from tests.ops.test_kernels import lean_parameters, relative
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 TERMS = {"sv": (7, 3), "sh": (16, 4), "sb": (2, 5), "sg": (2, 3)}
@@ -50,6 +50,21 @@ def test_view_colors_and_gradients_against_the_cpu(
     for a, b in zip(got, want, strict=True):
         assert relative(a, b) < (1e-12 if dtype == torch.float64 else 2e-5)
         assert not a[~active].any()
+
+
+@DTYPES
+@pytest.mark.parametrize("kind", list(TERMS))
+def test_lean_view_colors_against_the_cpu(kind: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
+    n = 150
+    g = torch.Generator().manual_seed(1)
+    means, center = torch.randn(n, 3, generator=g, dtype=dtype), torch.randn(3, generator=g)
+    active, lean = torch.rand(n, generator=g) > 0.3, lean_parameters(kind, n, dtype)
+    there = {name: value.to(device) for name, value in lean.items()}
+    got = ops.view_color(kind, there, means.to(device), center.to(device), active.to(device)).cpu()
+    with cpu():
+        want = ops.view_color(kind, lean, means, center, active)
+    assert relative(got.double(), want.double()) < (1e-12 if dtype == torch.float64 else 2e-5)
+    assert not got[~active].any()
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])

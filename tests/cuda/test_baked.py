@@ -16,12 +16,14 @@ from bitymi_ns.bake import bake, export, read_bundle
 from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import Stage
+from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
 from tests.ops.golden import SceneCase, extreme_scenes, load_golden, random_scene
+from tests.ops.test_kernels import lean_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 STEP = 1 / 255
@@ -129,6 +131,17 @@ def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: tor
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
 def test_view_colours(kind: str, device: torch.device, cpu) -> None:
     check(textured(40, 1, kind=kind), front(), device, cpu)
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+def test_lean_view_colours(kind: str, device: torch.device, cpu) -> None:
+    scene = textured(40, 1, kind=kind)
+    geometry = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind]}
+    scene.surfels = geometry | lean_parameters(kind, 40, torch.float32)
+    check(scene, front(), device, cpu)
+    scene.surfels["view_span"][7, 1] = 33
+    with pytest.raises(ValueError, match="surfel 7"):
+        scene.to(device).render(front(8, 8))
 
 
 @pytest.mark.parametrize(

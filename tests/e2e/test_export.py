@@ -141,7 +141,9 @@ def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(
     assert exact["texels"]["kept"] == exact["texels"]["nyquist"] == default["texels"]["nyquist"]
     assert 0 < default["texels"]["kept"] < 0.8 * exact["texels"]["kept"]
     assert exact["surfels"]["left_out"].get("unseen", 0) == 0 and exact["options"]["tolerance"] == 0
-    assert "Atlas bytes" in printed and "no tolerance" in printed
+    assert "Atlas bytes" in printed and "no tolerance" in printed and "all of it is kept" in printed
+    assert "view_color" not in exact and default["view_color"]["tolerance"] == TOLERANCE
+    assert default["view_color"]["sites"]["after"] < default["view_color"]["sites"]["before"]
     assert default["error"]["tolerance"] == TOLERANCE and 0 < default["error"]["rms"]["p90"] < 1
 
 
@@ -154,7 +156,8 @@ def test_verify_compares_a_bundle_with_its_run(
     bundle, _ = check_files(copied)
     assert bundle is not None
     final = check_run(bundle, run, views=1)
-    assert [check.ok for check in final] == [True, True]
+    assert [check.ok for check in final] == [True, True, True]
+    assert "stated" in final[0].detail and final[0].name == "error of the view colours"
     first = min((run / "nerfstudio_models").glob("*.ckpt"))
     earlier = check_run(bundle, first, views=1)
     assert not any(check.ok for check in earlier)  # what the bundle holds was not there yet

@@ -17,13 +17,15 @@ from bitymi_ns.bake import BundleError, read_bundle, write_bundle
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.ply import parse_ply, write_ply
 from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import random_scene
+from tests.ops.test_kernels import lean_parameters
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 60 * MORE
-FORMATS = ("bc7", "uint8", "fp16")
+FORMATS = ("bc7", "uint8", "fp16", "lean")
 N, SIDE = 12, 16
 
 
@@ -33,9 +35,13 @@ def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     params = {key: value.float() for key, value in random_scene(N, 0).params.items()}
     packing = pack([[8, 4]] * N)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
-    atlas = encode(texels, packing, request.param, Range(-0.5, 2.0, "test"))
+    lean = request.param == "lean"
+    if lean:
+        params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"]}
+        params |= lean_parameters("sv", N, torch.float32)
+    atlas = encode(texels, packing, "uint8" if lean else request.param, Range(-0.5, 2.0, "test"))
     folder = tmp_path_factory.mktemp("bundles") / request.param
-    write_bundle(folder, params, packing.tiles, atlas)
+    write_bundle(folder, params, packing.tiles, atlas, view_color="sv")
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -139,18 +145,19 @@ def test_values_of_the_manifest(bundle: dict[str, bytes], tmp_path: Path) -> Non
 
 def test_columns_of_extreme_values(bundle: dict[str, bytes], tmp_path: Path) -> None:
     """Numbers of surfels.ply that are NaN, infinite or huge: drawn without these surfels, or refused."""
-    columns = dict(parse_ply(bundle["surfels.ply"]))
+    elements = parse_ply(bundle["surfels.ply"])
     rng = random.Random("columns")
-    for name in columns:
+    for element, name in [(element, name) for element, columns in elements.items() for name in columns]:
         for value in rng.sample((math.nan, math.inf, 3e38, -1.0, 0.0, 2.0**31 - 1), min(6, MORE)):
-            spoiled = {key: column.copy() for key, column in columns.items()}
-            row = rng.randrange(N)
+            spoiled = {key: column.copy() for key, column in elements[element].items()}
+            row = rng.randrange(len(spoiled[name]))
             if spoiled[name].dtype == np.int32:
                 spoiled[name][row] = int(np.clip(np.nan_to_num(value), -(2**31), 2**31 - 1))
             else:
                 spoiled[name][row] = value
             folder = put(tmp_path / "b", bundle)
-            write_ply(folder / "surfels.ply", spoiled)
+            every = {**elements, element: spoiled}
+            write_ply(folder / "surfels.ply", every.pop("vertex"), more=every)
             files = {**bundle, "surfels.ply": (folder / "surfels.ply").read_bytes()}
             (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], files))
             load_and_draw(folder, verify=True)

@@ -104,3 +104,32 @@ def sg(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
     cosine = (unit(lobes[..., :3]) * dirs[:, None]).sum(-1)  # [N, K]
     falloff = torch.exp(lobes[..., 3].exp() * (cosine - 1))
     return base + (lobes[..., 4:] * falloff[..., None]).sum(1)
+
+
+def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> Tensor:
+    """View colours of which every surfel has as many terms as it needs; without any, its base colour.
+
+    sv: (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)), a term is b, rgb: Spherical Voronoi relative to
+    its first site. sh: base is dc, terms are the coefficients from degree 1 on. sb, sg: base plus lobes.
+
+    Args:
+        kind: sv, sh, sb or sg.
+        base: [N, 3].
+        span: [N, 2] first term and number of terms.
+        terms: [T, 6] (sv, sb), [T, 3] (sh) or [T, 7] (sg).
+        dirs: [N, 3] unit view directions, world frame, from the camera to the surfel.
+
+    Returns:
+        [N, 3].
+    """
+    out = []
+    for color, (first, count), d in zip(base, span.tolist(), dirs, strict=True):
+        own = terms[first : first + count]
+        if kind == "sv":
+            weights = torch.softmax(torch.cat([own.new_zeros(1), own[:, :3] @ d]), dim=0)
+            out.append(weights @ torch.cat([color[None], own[:, 3:]]))
+        elif kind == "sh":
+            out.append(sh(color[None], own[None], d[None], round((count + 1) ** 0.5) - 1)[0])
+        else:
+            out.append({"sb": sb, "sg": sg}[kind](color[None], own[None], d[None])[0])
+    return torch.stack(out) if out else base

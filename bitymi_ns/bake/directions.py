@@ -1,0 +1,81 @@
+"""The directions at which a surfel's view colour counts: those of the training views that see it, and others nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+BETWEEN = 32
+"""Directions between and around those of the views."""
+SPHERE = 64
+"""Directions over the whole sphere for a surfel that no view sees."""
+_REACH = 1.25  # a quarter farther out than the triangle of three views
+_CHUNK = 1 << 19  # directions at once
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Directions of some surfels.
+
+    Attributes:
+        rows: [n] int64 rows of the surfels.
+        unit: [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first.
+        valid: [n, D] bool; the rest of a row is filling.
+        views: how many of the D places are for views.
+    """
+
+    rows: Tensor
+    unit: Tensor
+    valid: Tensor
+    views: int
+
+
+def sphere(count: int) -> Tensor:
+    """Directions spread evenly over the sphere along a Fibonacci spiral: [count, 3] float32."""
+    i = torch.arange(count, dtype=torch.float64)
+    z = 1.0 - (2.0 * i + 1.0) / count
+    angle = i * torch.pi * (3.0 - 5.0**0.5)
+    radius = (1.0 - z * z).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1).float()
+
+
+def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
+    """The directions of all surfels, in chunks of surfels that about equally many views see.
+
+    Beside those of the views that see a surfel there are BETWEEN others: of three such views drawn by lot, the same lot
+    for every surfel, a point of their triangle, a quarter larger. A surfel that no view sees has SPHERE directions.
+
+    Args:
+        means: [N, 3] world positions.
+        seen: [V, N] bool, the views that see each surfel.
+        centers: [V, 3] float64 camera centres, world.
+    """
+    count = seen.sum(0)  # [N]
+    order = torch.argsort(count, stable=True)
+    unseen = int((count == 0).sum())
+    for rows in order[:unseen].split(_CHUNK // SPHERE):
+        unit = sphere(SPHERE).to(means).expand(len(rows), -1, -1)
+        yield Directions(rows, unit, torch.ones(unit.shape[:2], dtype=torch.bool, device=means.device), 0)
+    g = torch.Generator().manual_seed(0)
+    lot = torch.rand(BETWEEN, 3, generator=g).to(means)
+    share = -torch.rand(BETWEEN, 3, generator=g).clamp(min=1e-6).log()  # normalised: even over the triangle
+    share = (1 / 3 + _REACH * (share / share.sum(1, keepdim=True) - 1 / 3)).to(means)
+    rest = order[unseen:]
+    while len(rest):
+        # the last of a chunk is seen by the most views
+        size = max(1, _CHUNK // (int(count[rest[min(len(rest), 4096) - 1]]) + BETWEEN))
+        rows, rest = rest[: min(size, 4096)], rest[min(size, 4096) :]
+        most = int(count[rows[-1]])
+        by_view = seen[:, rows].T  # [n, V]
+        index = torch.argsort(by_view.to(torch.uint8), dim=1, descending=True, stable=True)[:, :most]
+        unit = F.normalize(means[rows].double()[:, None] - centers[index].to(means.device), dim=2).to(means)
+        drawn = (lot * count[rows, None, None]).long().flatten(1)[..., None].expand(-1, -1, 3)
+        corners = unit.gather(1, drawn).unflatten(1, (BETWEEN, 3))
+        between = F.normalize((corners * share[..., None]).sum(2), dim=2)
+        there = torch.ones(len(rows), BETWEEN, dtype=torch.bool, device=means.device)
+        valid = torch.cat([by_view.gather(1, index), there], dim=1)
+        yield Directions(rows, torch.cat([unit, between], dim=1), valid, most)

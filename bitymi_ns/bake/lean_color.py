@@ -1,0 +1,202 @@
+"""View colours without what a scene does not need: a surfel keeps as few sites as hold its colour, or one colour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from bitymi_ns.bake.directions import Directions, sphere, view_directions
+from bitymi_ns.bake.plan import STEPS
+from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.surfel_table import SH_C0
+from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_vectors, site_weights
+from bitymi_ns.ops import view_color
+from bitymi_ns.ops.view_color import LEAN_WIDTH, VIEW_COLORS
+
+COLOR_BIAS = 0.5
+FIT_STEPS = 6
+FIT_VIEWS = 16
+"""The fit looks at so many of a surfel's views; the error is measured in all of them."""
+OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
+"""So many directions over the whole sphere count a little in the fit: where no view looks from, the colour follows the
+trained one loosely instead of running away."""
+
+
+@dataclass
+class LeanColor:
+    """View colours of N surfels, of which only what is needed is left (`ops.view_color.LEAN`).
+
+    Attributes:
+        base: [N, 3] float32.
+        span: [N, 2] int32 first term and number of terms.
+        terms: [T, LEAN_WIDTH[kind]] float32, those of one surfel after those of the one before.
+    """
+
+    base: Tensor
+    span: Tensor
+    terms: Tensor
+
+    def parameters(self) -> dict[str, Tensor]:
+        """By the names that the renderers use."""
+        return {"view_base": self.base, "view_span": self.span, "view_terms": self.terms}
+
+
+def centers_of(cameras: Sequence[Any], like: Tensor) -> Tensor:
+    """[V, 3] float64 centres of the cameras on the device of `like`."""
+    centers = [camera.exact_center.double().cpu() for camera in cameras]
+    return torch.stack(centers).to(like.device) if centers else torch.zeros(0, 3, dtype=torch.float64)
+
+
+def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
+    """max(f_view + 0.5, 0), the colour that is blended, by the renderers' own kernels: [n, D, 3].
+
+    Args:
+        kind: sv, sh, sb or sg.
+        params: parameters of n surfels, all or lean.
+        directions: [n, D, 3] unit vectors.
+    """
+    origin = directions.new_zeros(3)
+    columns = [view_color(kind, params, d.contiguous(), origin) for d in directions.unbind(1)]
+    return (torch.stack(columns, dim=1) + COLOR_BIAS).relu()
+
+
+def largest_error(a: Tensor, b: Tensor, valid: Tensor) -> Tensor:
+    """Largest |a - b| of colours [n, D, 3] over the valid directions and the channels, in 8-bit steps: [n]."""
+    return STEPS * ((a - b).abs().amax(2) * valid).amax(1)
+
+
+@torch.no_grad()
+def reduce_view_color(
+    surfels: Mapping[str, Tensor],
+    kind: str,
+    seen: Tensor,
+    centers: Tensor,
+    opacity: Tensor,
+    tolerance: float,
+    progress: Progress = no_progress,
+) -> LeanColor:
+    """The fewest sites, down to one constant colour, that keep every surfel's colour within a tolerance.
+
+    The error is the largest one over all directions of `view_directions` and the channels, of max(f_view + 0.5, 0),
+    times the largest blending weight that the surfel can have. One colour is tried first, the middle between the
+    extremes; then 2, 3, ... sites: those that are hardest to do without, fitted together by least squares. A surfel for
+    which none is good enough keeps all sites. Surfels of other view colours (sh, sb, sg) keep one colour, or all.
+
+    Args:
+        surfels: the per-surfel parameters, N rows.
+        kind: sv, sh, sb or sg.
+        seen: [V, N] bool, the training views that see each surfel; V may be 0.
+        centers: [V, 3] float64 camera centres.
+        opacity: [N] largest blending weight.
+        tolerance: 8-bit steps.
+        progress: called with the number of surfels done.
+    """
+    means = surfels["means"]
+    full = {name: surfels[name] for name in VIEW_COLORS[kind]}
+    count, base = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means), 3)
+    parts: list[tuple[Tensor, Tensor]] = []  # rows [n], terms [n, number, width]
+    done = 0
+    for at in view_directions(means, seen, centers):
+        own = {name: value[at.rows] for name, value in full.items()}
+        target = shown_at(kind, own, at.unit)
+        allowed = tolerance / opacity[at.rows]
+        low = target.masked_fill(~at.valid[..., None], torch.inf).amin(1)
+        high = target.masked_fill(~at.valid[..., None], -torch.inf).amax(1)
+        middle = 0.5 * (low + high) - COLOR_BIAS
+        base[at.rows] = middle / SH_C0 if kind == "sh" else middle  # there the constant is a coefficient
+        rest = torch.nonzero(STEPS * 0.5 * (high - low).amax(1) > allowed).squeeze(1)
+        if kind == "sv":
+            fitted = _fewer_sites(at, rest, own, target, allowed)
+        else:
+            names = VIEW_COLORS[kind]
+            fitted = [(rest, own[names[0]][rest], own[names[1]][rest])]
+        for rows, color, terms in fitted:
+            where = at.rows[rows]
+            base[where], count[where] = color, terms.shape[1]
+            parts.append((where, terms))
+        done += len(at.rows)
+        progress("reducing the view colours", done, len(means))
+    first = count.cumsum(0) - count
+    terms = means.new_zeros(int(count.sum()), LEAN_WIDTH[kind])
+    for rows, values in parts:
+        terms[first[rows, None] + torch.arange(values.shape[1], device=means.device)] = values
+    return LeanColor(base, torch.stack([first, count], dim=1).int(), terms)
+
+
+def _fewer_sites(
+    at: Directions, rest: Tensor, own: Mapping[str, Tensor], target: Tensor, allowed: Tensor
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Sites for the surfels `rest` of a chunk: (rows [m], base [m, 3], terms [m, number, 6]) for every number."""
+    vectors, rgb = site_vectors(own["sv_sites"], own["sv_log_tau"]), own["sv_rgb"]
+    sites = vectors.shape[1]
+    outside = sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
+    stride = -(-at.views // FIT_VIEWS) if at.views else 1  # views that see a surfel come first: an even choice of them
+    looked = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
+    weight = torch.cat([at.valid[:, : at.views : stride], at.valid[:, at.views :: 2]], dim=1).float()
+    weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
+    colors = site_weights(vectors, looked) @ rgb
+    left = least_needed(vectors, rgb, looked, weight)
+    result = []
+    for number in range(2, sites):
+        if len(rest) == 0:
+            break
+        kept = left[number - 1][rest, :, None].expand(-1, -1, 3)
+        v, r = vectors[rest].gather(1, kept), rgb[rest].gather(1, kept)
+        b, r = fit_sites(v[:, 1:] - v[:, :1], r, looked[rest], colors[rest], weight[rest], FIT_STEPS)
+        shown = (site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r + COLOR_BIAS).relu()
+        good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
+        result.append((rest[good], r[good, 0], torch.cat([b, r[:, 1:]], dim=2)[good]))
+        rest = rest[~good]
+    v = vectors[rest].double()
+    relative = (v[:, 1:] - v[:, :1]).to(rgb)
+    return [*result, (rest, rgb[rest, 0], torch.cat([relative, rgb[rest, 1:]], dim=2))]
+
+
+@torch.no_grad()
+def view_color_errors(
+    kind: str,
+    full: Mapping[str, Tensor],
+    lean: Mapping[str, Tensor],
+    means: Tensor,
+    seen: Tensor,
+    centers: Tensor,
+    opacity: Tensor,
+) -> Tensor:
+    """Largest error of every surfel's view colour over the directions of `view_directions`, times its largest blending
+    weight, in 8-bit steps: [N].
+
+    Args:
+        kind: sv, sh, sb or sg.
+        full: parameters of N surfels as they were trained.
+        lean: the same surfels' lean parameters.
+        means, seen, centers, opacity: as in `reduce_view_color`.
+    """
+    error = means.new_zeros(len(means))
+    for at in view_directions(means, seen, centers):
+        exact = shown_at(kind, {name: full[name][at.rows] for name in VIEW_COLORS[kind]}, at.unit)
+        rows = {name: lean[name][at.rows] for name in ("view_base", "view_span")}
+        found = shown_at(kind, {**rows, "view_terms": lean["view_terms"]}, at.unit)
+        error[at.rows] = largest_error(exact, found, at.valid) * opacity[at.rows]
+    return error
+
+
+def describe(kind: str, surfels: Mapping[str, Tensor], lean: LeanColor, error: Tensor, tolerance: float) -> dict:
+    """What was left out and what it costs, for bundle.json."""
+    before = sum(surfels[name][0].numel() for name in VIEW_COLORS[kind]) if len(lean.base) else 0
+    terms = surfels[VIEW_COLORS[kind][1]].shape[1]
+    sites = terms if kind == "sv" else terms + 1
+    after = 4 * (4 * len(lean.base) + lean.terms.numel())
+    ordered = error.double().sort().values
+    return {
+        "tolerance": tolerance,
+        "unit": "8-bit steps, largest over the directions and channels, weighted by the blending weight",
+        "sites": {"before": sites * len(lean.base), "after": len(lean.base) + len(lean.terms)},
+        "one_color": int((lean.span[:, 1] == 0).sum()),
+        "bytes": {"before": 4 * before * len(lean.base), "after": after},
+        "error": {f"p{p}": round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)},
+    }

@@ -17,6 +17,7 @@ from bitymi_ns.bake.bundle import World, write_bundle
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
 from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
+from bitymi_ns.bake.lean_field import lean_field
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
@@ -27,6 +28,7 @@ from bitymi_ns.bake.surfel_table import view_color_kind
 from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import HashField
 
 OPACITY_FLOOR = 1.0 / 255.0  # below it a surfel is skipped at every pixel
 
@@ -136,16 +138,19 @@ def bake(
     mean_residual = torch.zeros(len(kept), 3)
     texels = atlas = None
     if scene.field is not None:
-        plan = make_plan(surfels, scene.field, options, cameras, transmittance, near, weight_bound)
+        field = scene.field
+        if options.tolerance > 0 and isinstance(field, HashField):
+            field, statistics["field"] = lean_field(field, surfels, transmittance, weight_bound, options.tolerance)
+        plan = make_plan(surfels, field, options, cameras, transmittance, near, weight_bound)
         if options.tolerance > 0:
-            reduced = reduce_tiles(scene.field, plan, options.tolerance, options.r_min, options.chunk, progress)
+            reduced = reduce_tiles(field, plan, options.tolerance, options.r_min, options.chunk, progress)
             packing, nonfinite = pack(reduced.sizes, options.page_width, options.page_rows), reduced.nonfinite
             texels, mean_residual = reduced.pages(packing), reduced.constant
             extent = torch.where(plan.extent > 0, plan.extent, extent.to(plan.extent)).cpu()
         else:
             packing = pack(plan.limit.cpu(), options.page_width, options.page_rows)
             geometry = (surfels["means"], surfels["quats"], surfels["log_scales"].exp())
-            texels, nonfinite = evaluate_tiles(scene.field, *geometry, packing, options.extent, options.chunk, progress)
+            texels, nonfinite = evaluate_tiles(field, *geometry, packing, options.extent, options.chunk, progress)
         tiled = torch.from_numpy(packing.tiles[:, 3] > 0)
         statistics["surfels"]["without_tile"] = int((~tiled).sum())
         statistics["texels"] = {**plan.texels, "kept": packing.texels, "not_finite": nonfinite}
@@ -156,7 +161,7 @@ def bake(
         else:
             texels = None
         stored = None if atlas is None else atlas.decoded()
-        errors = tile_errors(scene.field, plan, packing.tiles, mean_residual, stored, options.chunk, progress)
+        errors = tile_errors(field, plan, packing.tiles, mean_residual, stored, options.chunk, progress)
         statistics["error"] = {"tolerance": options.tolerance, **errors.summary()}
     kind = view_color_kind(surfels)
     if options.tolerance > 0:

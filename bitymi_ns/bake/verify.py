@@ -18,6 +18,7 @@ from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
 from bitymi_ns.bake.visibility import visibility
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import HashField
 
 _SLACK = 1.02  # sums in another order, rotations that were written with length 1
 _SLACK_STEPS = 0.02
@@ -68,6 +69,9 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     stated = bundle.info["statistics"].get("error")
     if stated is None:
         return Check("error against the field", True, "not stated: the texels were changed after the bake")
+    levels = bundle.info["statistics"].get("field")
+    if levels is not None and isinstance(field, HashField):
+        field = field.only(*levels["kept"])
     options = bake_options(bundle)
     render = bundle.info["render"]
     near, weight_bound = float(render["near"]), float(render["weight_bound"])

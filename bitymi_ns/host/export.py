@@ -243,6 +243,11 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
     if texels is not None:
         print_savings(table, info)
+    if "field" in statistics:
+        levels = statistics["field"]
+        alone = ", ".join(f"{change:.2f}" for change in levels["change_of_each"])
+        table.add_row("Levels of the field", f"{levels['levels']} -> {levels['kept'][1]}")
+        table.add_row("", f"(each alone changes a surfel by up to {alone} steps; tolerance {levels['tolerance']:g})")
     print_view_color(table, info)
     atlas = statistics.get("atlas")
     if atlas is None:

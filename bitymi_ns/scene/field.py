@@ -54,6 +54,27 @@ class HashField(nn.Module):
         self._geometry = FieldGeometry(self.min_resolution, contract, tuple(mid), half)
         self._read_from = self._state_of_domain()
 
+    @torch.no_grad()
+    def only(self, first: int, count: int) -> HashField:
+        """A copy with the levels first ... first + count - 1 alone: the same residual, but that the features of the
+        other levels are 0, and the loads of these levels alone. Its voxels are those of its finest level.
+
+        Raises:
+            ValueError: there are no such levels.
+        """
+        if not (0 <= first and 1 <= count and first + count <= self.levels):
+            raise ValueError(f"a field of {self.levels} levels has none from {first} to {first + count - 1}")
+        config = SceneConfig(levels=count, min_resolution=self.min_resolution << first)
+        *mid, half, contract = self.domain.tolist()
+        size = self.field_table.shape[1].bit_length() - 1
+        part = HashField(config, tuple(mid), half, bool(contract), size).to(self.field_table)
+        rows = slice(first * FEATURES, (first + count) * FEATURES)
+        own = (self.field_table[first : first + count], self.field_w1[rows], self.field_w2, self.field_w3)
+        for to, value in zip(part.weights, own, strict=True):
+            to.copy_(value)
+        part.domain = self.domain.clone()
+        return part
+
     @property
     def geometry(self) -> FieldGeometry:
         """Where the grid lies. Read back once: a step must not wait for the device to tell."""

@@ -7,13 +7,6 @@
 namespace bt::cuda {
 namespace {
 
-int kind_number(const std::string& kind) {
-  const char* names[] = {"sv", "sh", "sb", "sg"};
-  for (int i = 0; i < 4; ++i)
-    if (kind == names[i]) return i;
-  throw std::invalid_argument("unknown view colour '" + kind + "'");
-}
-
 template <class S>
 ViewColorArrays<S> view_color_arrays(int64_t n, const std::string& kind, int terms, const Array<S>& a,
                                      const Array<S>& b, const Maybe<S>& c) {

@@ -37,18 +37,13 @@ void frame(Floats means, Floats quats, Floats log_scales, Floats opacity_logits,
            MaybeFloats background, Maybe<float> rgb, Maybe<float> alpha, Maybe<int32_t> packed, Maybe<float> beta,
            Maybe<float> depth, Maybe<float> normal, Maybe<int32_t> overdraw, int stages, Array<uint8_t> memory,
            int64_t capacity, uintptr_t stream) {
-  const int64_t n = int64_t(opacity_logits.size());
+  BakedSurfels s = {};
+  s.geometry = surfels(means, quats, log_scales, opacity_logits, beta_raw);
+  const int64_t n = s.geometry.n;
   const Parameters p = parameters(kind, terms);
   const BakedViews views = {int(viewmats.size() / 16), width, height, viewmats.data(),
                             data(Ks, int64_t(viewmats.size() / 16) * 9, "Ks")};
   const int64_t pixels = int64_t(views.count) * width * height;
-  BakedSurfels s = {};
-  s.geometry = {n,
-                data(means, 3 * n, "means"),
-                data(quats, 4 * n, "quats"),
-                data(log_scales, 2 * n, "log_scales"),
-                opacity_logits.data(),
-                data(beta_raw, n, "beta_raw")};
   s.kind = p.kind, s.terms = terms;
   if (base && span && lean) {
     s.lean = {p.kind, data_or_null(base, 3 * n, "base"), lean->data(), data_or_null(span, 2 * n, "span")};

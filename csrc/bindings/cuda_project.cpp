@@ -11,13 +11,8 @@ void bind(nb::module_& m, const char* forward, const char* backward) {
       forward,
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, int width, int height,
          double near, bool prefilter, Out geom, Out frames, Out radii, Array<int32_t> broken, uintptr_t stream) {
-        const int64_t n = int64_t(opacity_logits.size());
-        const Surfels<S> in = {n,
-                               data(means, 3 * n, "means"),
-                               data(quats, 4 * n, "quats"),
-                               data(log_scales, 2 * n, "log_scales"),
-                               opacity_logits.data(),
-                               data(beta_raw, n, "beta_raw")};
+        const Surfels<S> in = surfels(means, quats, log_scales, opacity_logits, beta_raw);
+        const int64_t n = in.n;
         project_forward(data(viewmat, 16, "viewmat"), data(K, 9, "K"), width, height, S(near), prefilter, in,
                         data(geom, n * kGeom, "geom"), data(frames, n * kFrame, "frames"), data(radii, 2 * n, "radii"),
                         data(broken, 1, "broken"), stream_of(stream));
@@ -31,16 +26,9 @@ void bind(nb::module_& m, const char* forward, const char* backward) {
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, In geom, In dgeom,
          Maybe<const S> dframes, Out dmeans, Out dquats, Out dlog_scales, Out dopacity_logits, Out dbeta_raw,
          uintptr_t stream) {
-        const int64_t n = int64_t(opacity_logits.size());
-        const Surfels<S> in = {n,
-                               data(means, 3 * n, "means"),
-                               data(quats, 4 * n, "quats"),
-                               data(log_scales, 2 * n, "log_scales"),
-                               opacity_logits.data(),
-                               data(beta_raw, n, "beta_raw")};
-        const SurfelGradients<S> out = {data(dmeans, 3 * n, "dmeans"), data(dquats, 4 * n, "dquats"),
-                                        data(dlog_scales, 2 * n, "dlog_scales"),
-                                        data(dopacity_logits, n, "dopacity_logits"), data(dbeta_raw, n, "dbeta_raw")};
+        const Surfels<S> in = surfels(means, quats, log_scales, opacity_logits, beta_raw);
+        const int64_t n = in.n;
+        const SurfelGradients<S> out = surfel_gradients(n, dmeans, dquats, dlog_scales, dopacity_logits, dbeta_raw);
         project_backward(data(viewmat, 16, "viewmat"), data(K, 9, "K"), in, data(geom, n * kGeom, "geom"),
                          data(dgeom, n * kGeom, "dgeom"), data_or_null(dframes, n * kFrame, "dframes"), out,
                          stream_of(stream));

@@ -128,6 +128,17 @@ struct Pinhole {
   S R[9], t[3];  // row major
   S fx, fy, cx, cy;
 };
+// viewmat [4, 4] and K [3, 3], row major
+template <class S>
+BT_HD Pinhole<S> pinhole(const S* viewmat, const S* K) {
+  Pinhole<S> c;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];
+    c.t[i] = viewmat[4 * i + 3];
+  }
+  c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
+  return c;
+}
 template <class S>
 BT_HD Vec3<S> rotate(const S* R, Vec3<S> a) {
   return {R[0] * a.x + R[1] * a.y + R[2] * a.z, R[3] * a.x + R[4] * a.y + R[5] * a.z,

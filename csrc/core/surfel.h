@@ -27,6 +27,17 @@ enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBe
 // Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
+// The geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
+template <class S>
+struct Surfels {
+  int64_t n;
+  const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+};
+template <class S>
+struct SurfelGradients {
+  S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+};
+
 // Rotation matrix columns of a quaternion wxyz of any length.
 template <class S>
 struct Rotation {

@@ -8,22 +8,13 @@
 
 #include "core/bounds.h"
 #include "core/field.h"
+#include "core/surfel.h"
 #include "core/view_color.h"
 
 namespace bt {
 
 int num_threads();
 void set_num_threads(int n);
-
-template <class S>
-struct Surfels {
-  int64_t n;
-  const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
-};
-template <class S>
-struct SurfelGradients {
-  S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
-};
 
 // geom [n, kGeom], frames [n, kFrame], radii [n, 2] (half extents of the level-set box in pixels, 0 where not visible),
 // rows of surfels that are not visible are zero. Returns how many rows are not finite.

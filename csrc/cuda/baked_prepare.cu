@@ -12,16 +12,6 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
 
-__device__ Pinhole<float> pinhole(const float* viewmat, const float* K) {
-  Pinhole<float> c;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];
-    c.t[i] = viewmat[4 * i + 3];
-  }
-  c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
-  return c;
-}
-
 // Order of floats as order of unsigned integers.
 __device__ uint32_t depth_key(float z) {
   uint32_t bits;

@@ -9,16 +9,6 @@
 
 namespace bt::cuda {
 
-template <class S>
-struct Surfels {
-  int64_t n;
-  const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
-};
-template <class S>
-struct SurfelGradients {
-  S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
-};
-
 // viewmat [16] and K [9] lie on the device. geom, frames, radii are written; broken [1] int32 is raised by the number
 // of rows that are not finite.
 template <class S>

@@ -8,17 +8,6 @@ namespace {
 constexpr int kThreads = 128;
 
 template <class S>
-__device__ Pinhole<S> pinhole(const S* viewmat, const S* K) {
-  Pinhole<S> c;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];
-    c.t[i] = viewmat[4 * i + 3];
-  }
-  c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
-  return c;
-}
-
-template <class S>
 __global__ void __launch_bounds__(kThreads)
     forward_kernel(const S* viewmat, const S* K, int width, int height, S near, bool prefilter, Surfels<S> in, S* geom,
                    S* frames, S* radii, int32_t* broken) {

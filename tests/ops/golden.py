@@ -1,7 +1,8 @@
-"""The golden renders; the scenes that they and other tests share are in bitymi_ns.stability."""
+"""The golden renders and how a case is drawn; the scenes that they and other tests share are in bitymi_ns.stability."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,6 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bitymi_ns import ops
+from bitymi_ns.ops.reference import project as reference_project
+from bitymi_ns.ops.reference import trace as reference_trace
+from bitymi_ns.scene import Camera
 from bitymi_ns.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, random_scene
 
 __all__ = [
@@ -17,9 +22,13 @@ __all__ = [
     "SV_KEYS",
     "Golden",
     "SceneCase",
+    "camera_of",
+    "dense",
     "extreme_scenes",
     "load_golden",
     "random_scene",
+    "reference",
+    "traced",
 ]
 
 GOLDEN = Path(__file__).resolve().parent.parent / "golden"
@@ -66,3 +75,26 @@ def load_golden(name: str) -> Golden:
         grads=grads,
         tile_grads=tile_grads,
     )
+
+
+def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
+    """The camera of a case."""
+    return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+
+
+def traced(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False) -> tuple[ops.Fragments, ops.Projection]:
+    """The kernels' fragments of a case; values: those of SURFEL_KEYS."""
+    projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=prefilter)
+    return ops.trace(projection, 0.0), projection
+
+
+def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False) -> reference_trace.Trace:
+    """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
+    projected = reference_project.project(*values, case.viewmat, case.K)
+    return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
+
+
+def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
+    """[P, N] of one number a fragment."""
+    out = values.new_zeros(fragments.width * fragments.height, n)
+    return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)

@@ -7,38 +7,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.bake import read_bundle, write_bundle
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
-from bitymi_ns.scene import Camera, Scene, SceneConfig
+from bitymi_ns.scene import Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
 from bitymi_ns.stability.sweeps import SWEEPS
-
-
-def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
-    return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
-
-
-def traced(case: SceneCase, values: list[Tensor], rim: float = 0.0) -> tuple[ops.Fragments, ops.Projection]:
-    projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=True)
-    return ops.trace(projection, rim), projection
-
-
-def reference(case: SceneCase, values: list[Tensor]) -> reference_trace.Trace:
-    projected = reference_project.project(*values, case.viewmat, case.K)
-    return reference_trace.trace(projected, case.width, case.height, prefilter=True)
-
-
-def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
-    """[P, N] of one number a fragment."""
-    out = values.new_zeros(fragments.width * fragments.height, n)
-    return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)
+from tests.ops.golden import camera_of, dense, reference, traced
 
 
 @pytest.mark.parametrize("scale", [2.0, 0.25, 0.03, 0.002])
@@ -46,9 +25,9 @@ def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
 def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: torch.dtype) -> None:
     case = random_scene(40, 3, scale=scale)
     values = [case.params[name].to(dtype).requires_grad_() for name in SURFEL_KEYS]
-    fragments, _ = traced(case, values)
+    fragments, _ = traced(case, values, prefilter=True)
     exact = [value.detach().double().requires_grad_() for value in values]
-    want = reference(case, exact)
+    want = reference(case, exact, prefilter=True)
     generator = torch.Generator().manual_seed(1)
     loss, wanted = 0.0, 0.0
     kept = want.blended & (dense(fragments, torch.ones(len(fragments)), 40) > 0)
@@ -71,31 +50,6 @@ def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: t
         scale_of = reference_value.grad.abs().max()
         error = (value.grad.double() - reference_value.grad).abs().max() / scale_of
         assert error < (1e-9 if dtype == torch.float64 else 5e-3), (name, error)
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 10_000),
-    scale=st.floats(-8.0, 2.0),
-    ratio=st.floats(0.0, 12.0),
-    opacity=st.floats(-3.0, 8.0),
-    beta=st.floats(-8.0, 6.0),
-    closer=st.floats(0.15, 1.0),
-)
-def test_bounds_lose_no_fragment(
-    seed: int, scale: float, ratio: float, opacity: float, beta: float, closer: float
-) -> None:
-    case = random_scene(1, seed, width=70, height=50)
-    p = case.params
-    position = -case.viewmat[:3, :3].T @ case.viewmat[:3, 3]
-    p["means"] = position + closer * (p["means"] - position)
-    p["log_scales"] = torch.tensor([[scale, scale - ratio]], dtype=torch.float64)
-    p["opacity_logits"] = torch.tensor([opacity], dtype=torch.float64)
-    p["beta_raw"] = torch.tensor([beta], dtype=torch.float64)
-    values = [p[name] for name in SURFEL_KEYS]
-    fragments, _ = traced(case, values)
-    want = reference(case, values)
-    torch.testing.assert_close(dense(fragments, fragments.weight, 1), want.weight, rtol=1e-8, atol=1e-10)
 
 
 def disc(
@@ -135,7 +89,7 @@ def test_small_discs_cover_their_area_wherever_they_lie(size: float, beta: float
 def test_large_discs_are_as_without_the_filter() -> None:
     case, values = disc((0.8, 0.5), 0.7, 2.0, (16.2, 15.7))
     plain = ops.trace(ops.project(*values, camera_of(case)))
-    fragments, _ = traced(case, values)
+    fragments, _ = traced(case, values, prefilter=True)
     a, b = dense(plain, plain.weight, 1), dense(fragments, fragments.weight, 1)
     assert (a - b).abs().max() < 0.02
     inside = (a > 0.05) & (b > 0.05)
@@ -150,7 +104,7 @@ def test_discs_that_turn_edge_on_fade_with_the_cosine() -> None:
     covered, blob = [], []
     for degrees in angles:
         case, values = disc((0.5, 0.5), math.radians(degrees), 2.0, (16.0, 16.0))
-        covered.append(float(traced(case, values)[0].weight.sum()) / math.cos(math.radians(degrees)))
+        covered.append(float(traced(case, values, prefilter=True)[0].weight.sum()) / math.cos(math.radians(degrees)))
         blob.append(float(ops.trace(ops.project(*values, camera_of(case))).weight.sum()))
     assert covered[0] == pytest.approx(9 * math.pi * 25 / 3, rel=0.03)
     assert max(covered[:4]) < 1.1 * covered[0] and min(covered[:4]) > 0.8 * covered[0]
@@ -164,8 +118,8 @@ def test_thin_needles_stay_well_conditioned() -> None:
         sweep = next(sweep for sweep in SWEEPS if sweep.name == name)
         case = sweep.make(value)
         single = [case.params[key].float() for key in SURFEL_KEYS]
-        fragments, _ = traced(case, single)
-        want = reference(case, [value.double() for value in single])
+        fragments, _ = traced(case, single, prefilter=True)
+        want = reference(case, [value.double() for value in single], prefilter=True)
         n = len(single[0])
         error = (dense(fragments, fragments.weight.double(), n) - want.weight).abs()
         assert error.max() < 2e-5 + 1.01 / 255 * (~want.blended).any(), (name, error.max())

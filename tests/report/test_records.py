@@ -43,8 +43,8 @@ def test_baked_or_neural(method: str, checkpoint: str, atlas_bytes: int, baked: 
     assert row.method == "bitymi"
 
 
-def test_export_without_texture_is_known_by_its_stand_in_for_a_checkpoint():
-    checkpoint = "/tmp/bitymi-bundle-x7/room/nerfstudio_models/step-000000000.ckpt"
+def test_export_without_texture_is_known_by_its_stand_in_for_a_checkpoint(tmp_path):
+    checkpoint = str(tmp_path / "bitymi-bundle-x7/room/nerfstudio_models/step-000000000.ckpt")
     assert make(method="bitymi-notexture", checkpoint=checkpoint, atlas_bytes=0).baked
     assert not make(checkpoint="nul\0/a/b").baked
 

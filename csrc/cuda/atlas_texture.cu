@@ -41,6 +41,8 @@ AtlasTexture::AtlasTexture(TexelFormat format, int layers, int height, int width
       check(cudaCreateTextureObject(&texture, &resource, &sampling, nullptr), "texture of the atlas");
       handles_.push_back(texture);
     }
+    // a copy from pageable memory may still be under way, and streams other than the default one do not wait for it
+    check(cudaStreamSynchronize(nullptr), "copy of the atlas");
   } catch (...) {
     release();
     throw;
@@ -51,6 +53,7 @@ void AtlasTexture::release() {
   int current = device_;
   cudaGetDevice(&current);
   cudaSetDevice(device_);
+  cudaDeviceSynchronize();  // frames under way still read the pages
   for (uint64_t texture : handles_) cudaDestroyTextureObject(texture);
   for (void* page : pages_) cudaFreeArray(static_cast<cudaArray_t>(page));
   cudaSetDevice(current);

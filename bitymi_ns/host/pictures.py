@@ -19,7 +19,7 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.metrics import image_metrics
-from bitymi_ns.ops import composite_image
+from bitymi_ns.ops import composite_image, whole_list
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.train.views import as_float, over_background
 
@@ -56,7 +56,7 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
     of the two is the render wherever no colour had to be cut off at 0.
     """
-    fragments, projection = output.fragments, output.projection
+    fragments, projection = whole_list(output.fragments, "a picture of the residual"), output.projection
     rho = fragments.weight.new_zeros(len(fragments), 3)
     if scene.field is not None:
         textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)

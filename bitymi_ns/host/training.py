@@ -220,7 +220,7 @@ class TrainingRun:
             target = over_background(as_float(batch["image"].to(rgb.device)), background)
             mask = batch.get("mask")
             values.append(
-                (psnr(rgb, target, None if mask is None else mask.to(rgb.device)), float(len(output.fragments.weight)))
+                (psnr(rgb, target, None if mask is None else mask.to(rgb.device)), float(len(output.fragments)))
             )
         first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
         return first, second

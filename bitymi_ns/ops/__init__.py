@@ -3,7 +3,9 @@
 Every function takes float32 or float64 tensors and dispatches on their device and dtype.
 """
 
+from .bands import Bands, band, split, whole_list
 from .composite import composite, composite_image
+from .errors import TooManyFragments
 from .field import FieldGeometry, field
 from .project import Projection, project
 from .shade import shade
@@ -14,20 +16,25 @@ from .view_color import VIEW_COLORS, view_color
 
 __all__ = [
     "VIEW_COLORS",
+    "Bands",
     "FieldGeometry",
     "Fragments",
     "Projection",
     "TexelFragments",
     "TexelTiles",
+    "TooManyFragments",
     "add_texel_gradient",
+    "band",
     "composite",
     "composite_image",
     "field",
     "masked_counts",
     "project",
     "shade",
+    "split",
     "ssim",
     "texel_image",
     "trace",
     "view_color",
+    "whole_list",
 ]

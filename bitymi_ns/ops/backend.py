@@ -116,7 +116,7 @@ def on_same_device(like: Tensor, **tensors: Tensor) -> None:
     """
     for name, tensor in tensors.items():
         if tensor.device != like.device:
-            raise ValueError(f"{name} is on device '{tensor.device}', the view's fragments are on '{like.device}'")
+            raise ValueError(f"{name} is on device '{tensor.device}', what goes with it is on '{like.device}'")
 
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:

@@ -62,5 +62,6 @@ def composite(fragments: Fragments, values: Tensor) -> Tensor:
     """Sums of w times any values [F, C] a pixel: [H * W, C]."""
     if values.dim() != 2 or len(values) != len(fragments):
         raise ValueError(f"values must have a row for each of the {len(fragments)} fragments, not {list(values.shape)}")
+    on_same_device(fragments.weight, values=values)
     out = values.new_zeros(fragments.width * fragments.height, values.shape[1])
     return out.index_add(0, fragments.pixel, fragments.weight[:, None] * values)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, kernel_class, module
+from .backend import cuda_backend, dense, kernel, kernel_class, module, on_same_device
 from .project import FRAME
 
 FEATURES = 4
@@ -112,4 +112,5 @@ def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Ten
     Returns:
         [M, 3] residual, unbounded.
     """
+    on_same_device(x, field_table=table, field_w1=w1, field_w2=w2, field_w3=w3)
     return _Field.apply(x, geometry, table, w1, w2, w3)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import dense, kernel, on_same_device
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.camera import Camera
@@ -34,6 +34,7 @@ class Projection:
         broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
         mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken a fragment before the sum.
+        whole: the view that this is a band of (ops/bands.py).
     """
 
     geom: Tensor
@@ -44,6 +45,17 @@ class Projection:
     broken: Tensor
     mean2d_grad: Tensor | None = None
     mean2d_absgrad: Tensor | None = None
+    whole: Projection | None = None
+
+    def take_mean2d(self, grad: Tensor, absgrad: Tensor) -> None:
+        """Notes the gradients of the projected centres; those of bands are added up in the whole view."""
+        if self.whole is None:
+            self.mean2d_grad, self.mean2d_absgrad = grad, absgrad
+        elif self.whole.mean2d_grad is None:
+            self.whole.mean2d_grad, self.whole.mean2d_absgrad = grad.clone(), absgrad
+        else:
+            self.whole.mean2d_grad += grad
+            self.whole.mean2d_absgrad += absgrad
 
     @property
     def not_finite(self) -> int:
@@ -103,7 +115,7 @@ def project(
             column 15 of geom then holds n = fx fy s_u s_v / z^2 and tells all later operations.
 
     Raises:
-        ValueError: shapes do not agree, or the camera has skew.
+        ValueError: shapes or devices do not agree, or the camera has skew.
     """
     n = means.shape[0]
     shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
@@ -111,6 +123,7 @@ def project(
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
     view = (camera.viewmat, camera.K, camera.width, camera.height)

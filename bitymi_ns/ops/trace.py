@@ -10,8 +10,13 @@ from torch import Tensor
 
 from . import trace_cpu, trace_cuda
 from .backend import cuda_backend, dense, function, on_same_device
+from .errors import TooManyFragments
 from .project import GEOM, Projection
 
+__all__ = ["TILE", "TRANSMITTANCE_MIN", "Fragments", "TooManyFragments", "masked_counts", "trace"]
+
+TILE = trace_cuda.TILE
+"""Pixels a side of a tile, also in the CPU kernels (csrc/core/bounds.h)."""
 TRANSMITTANCE_MIN = 1e-4
 """Transmittance below which a pixel takes no more light (csrc/core/surfel.h)."""
 
@@ -59,12 +64,16 @@ class Fragments:
         count = torch.bincount(self.pixel, minlength=self.width * self.height)
         return count.to(torch.int32).view(self.height, self.width, 1)
 
+    def masked_counts(self, mask: Tensor, n: int) -> Tensor:
+        """As the function `masked_counts`."""
+        return masked_counts(self, mask, n)
+
 
 class _Trace(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, geom, projection, rim):
+    def forward(ctx, geom, projection, rim, most):
         find = trace_cuda.find if cuda_backend(geom.device) else trace_cpu.find
-        layout, tile_start, *arrays = find(geom.detach(), projection)
+        layout, tile_start, *arrays = find(geom.detach(), projection, most)
         surfel, pixel, weight, uv, depth, sigma = arrays
         ctx.save_for_backward(geom, *arrays)
         ctx.projection, ctx.rim, ctx.layout = projection, rim, layout
@@ -80,11 +89,11 @@ class _Trace(torch.autograd.Function):
         dgeom, absgrad = torch.empty_like(geom), geom.new_empty(geom.shape[0], 2)
         back = trace_cuda.backward if cuda_backend(geom.device) else trace_cpu.backward
         back(geom.detach(), projection, ctx.rim, ctx.layout, arrays, grads, dgeom, absgrad)
-        projection.mean2d_grad, projection.mean2d_absgrad = dgeom[:, :2], absgrad
-        return dgeom, None, None
+        projection.take_mean2d(dgeom[:, :2], absgrad)
+        return dgeom, None, None, None
 
 
-def trace(projection: Projection, rim: float = 1e-3) -> Fragments:
+def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) -> Fragments:
     """Finds the fragments of a view: for each pixel, front to back by centre depth, the surfels with
     sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255, until the
     transmittance would fall below 1e-4.
@@ -94,10 +103,15 @@ def trace(projection: Projection, rim: float = 1e-3) -> Fragments:
     Args:
         projection: of `project`; geom [N, 16].
         rim: lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1.
+        most: fragments that there may be; 0 = on a CUDA device as many as its free memory holds together with what
+            shading, blending and their backward pass need; None = as many as there are.
+
+    Raises:
+        TooManyFragments: there are more, or their list does not fit the memory of the CUDA device.
     """
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
-    weight, uv, depth, surfel, pixel, sigma, tile_start, layout = _Trace.apply(projection.geom, projection, rim)
+    weight, uv, depth, surfel, pixel, sigma, tile_start, layout = _Trace.apply(projection.geom, projection, rim, most)
     camera, n = projection.camera, len(projection.geom)
     return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height, layout, n)
 

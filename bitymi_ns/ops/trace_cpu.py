@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, kernel_class
+from .errors import TooManyFragments
 from .project import Projection
 
 
@@ -33,19 +34,26 @@ class _Tracers:
 tracers = _Tracers()
 
 
-def find(geom: Tensor, projection: Projection) -> tuple[Tensor, ...]:
+def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Tensor, ...]:
     """The fragments of a view.
 
     Args:
         geom: [N, 16] without graph.
         projection: the view's.
+        most: fragments that there may be; 0 or None = any number.
 
     Returns:
         layout (tile_start), tile_start, surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
+
+    Raises:
+        TooManyFragments: there are more than `most`.
     """
     camera = projection.camera
     tracer = tracers.take(geom)
     n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near)
+    if most and n > most:
+        tracers.give(tracer)
+        raise TooManyFragments(n, most, camera.width, camera.height, 8 + 5 * geom.element_size())
     surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
     weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
     uv = geom.new_empty(2, n)

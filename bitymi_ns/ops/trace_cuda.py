@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, module, workspace
+from .errors import TooManyFragments
 from .project import Projection
 
 TILE = 16
@@ -22,6 +23,10 @@ WARPS = 8
 """Of a tile's block."""
 COLUMNS = 16
 """Sums a pair in the backward pass."""
+NUMBERS = 24
+"""That a fragment takes in a training step: 7 in the list, 3 of its colour, 8 of their gradients; the rest is slack."""
+FEW = 1 << 23
+"""Fragments for which there is always room, so that nobody asks the device for its free memory."""
 
 
 @dataclass(frozen=True)
@@ -93,42 +98,55 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tens
     return layout, tile_start
 
 
-def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[Tensor, ...]:
-    """surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
+def room(geom: Tensor) -> int:
+    """Fragments that the free memory of a CUDA device holds with all that a training step makes of them."""
+    free = torch.cuda.mem_get_info(geom.device)[0]
+    kept = torch.cuda.memory_reserved(geom.device) - torch.cuda.memory_allocated(geom.device)  # by torch, unused
+    return (free + kept) // (NUMBERS * geom.element_size())
 
-    Raises:
-        torch.cuda.OutOfMemoryError: the list does not fit the device; the message has its length.
-    """
-    count, camera = layout.fragments, projection.camera
+
+def _too_many(geom: Tensor, projection: Projection, count: int, most: int) -> TooManyFragments:
+    return TooManyFragments(count, most, projection.camera.width, projection.camera.height, 8 + 5 * geom.element_size())
+
+
+def check_room(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
+    """Raises TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for."""
+    if most == 0 and geom.device.type == "cuda" and count > FEW:
+        most = room(geom)
+    if most and count > most:
+        raise _too_many(geom, projection, count, most)
+
+
+def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[Tensor, ...]:
+    """surfel, pixel, weight, uv, depth, sigma as in `Fragments`; raises TooManyFragments where they find no room."""
+    count = layout.fragments
     try:
         surfel, pixel = _ints(geom, count), _ints(geom, count)
         weight, depth, sigma = (geom.new_empty(count) for _ in range(3))
         uv = geom.new_empty(2, count)
     except torch.cuda.OutOfMemoryError as error:
-        raise torch.cuda.OutOfMemoryError(
-            f"the view has {count:,} fragments, {count / (camera.width * camera.height):.0f} a pixel; their list needs "
-            f"{count * (8 + 5 * geom.element_size()) / 2**30:.1f} GiB, which the device does not have: render a "
-            f"smaller image or use fewer surfels ({error})"
-        ) from error
+        raise _too_many(geom, projection, count, room(geom)) from error
     kernel("trace_fill", geom)(geom, projection.near, layout, surfel, pixel, weight, uv, depth, sigma)
     return surfel, pixel, weight, uv, depth, sigma
 
 
-def find(geom: Tensor, projection: Projection) -> tuple[Any, ...]:
+def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Any, ...]:
     """The fragments of a view.
 
     Args:
         geom: [N, 16] without graph.
         projection: the view's.
+        most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
 
     Returns:
         layout, tile_start, surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more.
-        torch.cuda.OutOfMemoryError: the list does not fit the device; the message has its length.
+        TooManyFragments: there are more than that, or the device has no memory for their list.
     """
     layout, tile_start = blended(geom, projection, tile_lists(geom, projection))
+    check_room(geom, projection, layout.fragments, most)
     return layout, tile_start, *fill(geom, projection, layout)
 
 

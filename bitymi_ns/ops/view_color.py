@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import dense, kernel, on_same_device
 
 MAX_TERMS = 32
 VIEW_COLORS: dict[str, tuple[str, ...]] = {
@@ -114,7 +114,7 @@ def view_color(
         [N, 3].
 
     Raises:
-        ValueError: unknown kind, or a parameter has the wrong shape.
+        ValueError: unknown kind, or a parameter has the wrong shape or lies on another device.
     """
     n = means.shape[0]
     flags = means.new_ones(n, dtype=torch.uint8) if active is None else active.to(means.device, torch.uint8)
@@ -128,4 +128,5 @@ def view_color(
         return out
     terms = check_view_color(kind, params, n)
     given = [params[name] for name in VIEW_COLORS[kind]]
+    on_same_device(means, **dict(zip(VIEW_COLORS[kind], given, strict=True)))
     return _ViewColor.apply(kind, terms, flags, center, means, *given)

@@ -62,6 +62,12 @@ class Camera:
             viewmat=self.viewmat.to(device, non_blocking=not wait), K=self.K.to(device, non_blocking=not wait)
         )
 
+    def rows(self, top: int, bottom: int) -> Camera:
+        """The camera of the image's rows from `top` to `bottom` (exclusive)."""
+        shift = torch.zeros_like(self.K)
+        shift[1, 2] = top
+        return self._with(K=self.K - shift, height=bottom - top)
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the same view with its image resized by `factor` (size rounded to whole pixels)."""
         width = max(1, round(self.width * factor))

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from bitymi_ns.ops import (
     VIEW_COLORS,
+    Bands,
     Fragments,
     Projection,
+    TooManyFragments,
+    band,
     composite_image,
     project,
     shade,
+    split,
     trace,
     view_color,
 )
@@ -37,7 +43,7 @@ class RenderOutput:
         beta: [H, W, 1] sum of w beta, the paper's alpha-blended Beta value.
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
-        fragments: the view's fragments.
+        fragments: the view's fragments; where they were too many, what is known of them without the list.
         projection: the view's surfels.
     """
 
@@ -46,7 +52,7 @@ class RenderOutput:
     beta: Tensor
     depth: Tensor | None
     normal: Tensor | None
-    fragments: Fragments
+    fragments: Fragments | Bands
     projection: Projection
 
     @property
@@ -104,33 +110,47 @@ class Scene(nn.Module):
     ) -> RenderOutput:
         """Renders a view: visibility, then shading, then compositing.
 
+        A view with more fragments than `config.max_fragments`, or than memory holds, is drawn in bands of tiles.
+
         Args:
             camera: the view.
             background: [3] colour behind the scene; None = black.
             field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
             maps: also depth and normals.
             weight_bound: fragments of smaller weight keep the surfel's colour, without residual; None = as configured.
+
+        Raises:
+            TooManyFragments: a single row of tiles has too many.
         """
         p = self.surfels
         projection = project(
             *(p[name] for name in GEOMETRY), camera, self.config.near, self.config.prefilter == "pixel"
         )
-        fragments = trace(projection, self.config.rim)
         geometry, weights = None, ()
         if self.field is not None and field_mode != "off":
             geometry, weights = self.field.geometry, self.field.weights
             if field_mode == "frozen":
                 weights = tuple(w.detach() for w in weights)
-        colors = shade(
-            fragments,
-            self.base_color(projection),
-            projection.frames,
-            geometry,
-            weights,
-            self.config.weight_bound if weight_bound is None else weight_bound,
-            move_surfels=self.config.texture_moves_surfels and field_mode == "train",
-        )
-        image = composite_image(fragments, projection, colors, maps).view(camera.height, camera.width, -1)
+        base = self.base_color(projection)
+
+        def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
+            fragments = trace(part, self.config.rim, most)
+            colors = shade(
+                fragments,
+                base,
+                part.frames,
+                geometry,
+                weights,
+                self.config.weight_bound if weight_bound is None else weight_bound,
+                move_surfels=self.config.texture_moves_surfels and field_mode == "train",
+            )
+            return composite_image(fragments, part, colors, maps), fragments
+
+        try:
+            image, fragments = draw(projection, self.config.max_fragments)
+        except TooManyFragments as error:
+            image, fragments = self._draw_in_bands(projection, draw, error)
+        image = image.view(camera.height, camera.width, -1)
         rgb, alpha = image[..., :3], image[..., 3:4]
         if background is not None:
             rgb = rgb + (1 - alpha) * background
@@ -143,3 +163,36 @@ class Scene(nn.Module):
             fragments=fragments,
             projection=projection,
         )
+
+    def _draw_in_bands(
+        self,
+        projection: Projection,
+        draw: Callable[[Projection, int | None], tuple[Tensor, Fragments]],
+        error: TooManyFragments,
+    ) -> tuple[Tensor, Bands]:
+        """The image [H * W, C] of a view that was refused with `error`, and its fragments; see ops/bands.py."""
+        most, height = self.config.max_fragments, projection.camera.height
+        waiting = split(0, height, max(2, -(-error.count // max(1, error.most))))
+        images, rows, count = [], [], 0
+        while waiting:
+            top, bottom = waiting.pop(0)
+            part, found = band(projection, top, bottom), []
+
+            def draw_once(geom: Tensor, part: Projection = part, found: list[int] = found) -> Tensor:
+                # what fitted once has to fit in the backward pass
+                image, fragments = draw(replace(part, geom=geom), None if found else most)
+                found.append(len(fragments))
+                return image
+
+            try:
+                images.append(checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False))
+            except TooManyFragments:
+                halves = split(top, bottom, 2)
+                if len(halves) == 1:
+                    raise
+                waiting = halves + waiting
+                continue
+            rows.append((top, bottom))
+            count += found[0]
+        seen = replace(projection, geom=projection.geom.detach(), frames=projection.frames.detach())
+        return torch.cat(images), Bands(seen, tuple(rows), self.config.rim, count)

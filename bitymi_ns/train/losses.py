@@ -127,9 +127,10 @@ def beta_only_map(output: RenderOutput, beta_raw: Tensor) -> Tensor:
     Returns:
         [H, W, 1], equal in value to `output.beta`.
     """
-    fragments = replace(output.fragments, weight=output.fragments.weight.detach())
+    fragments = ops.whole_list(output.fragments, "falloff_gradient: beta_only")
+    fragments = replace(fragments, weight=fragments.weight.detach())
     beta = 4.0 * torch.sigmoid(beta_raw)
-    values = beta[output.fragments.surfel.long()].unsqueeze(-1)  # [F, 1]
+    values = beta[fragments.surfel.long()].unsqueeze(-1)  # [F, 1]
     return ops.composite(fragments, values).reshape(output.beta.shape)
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns import ops
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View, as_float, background_color, over_background
@@ -82,7 +81,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
         mask = None if mask is None else mask.to(device)
         output = scene.render(camera.to(device), background=background, field_mode="frozen")
         bad = bad_pixels(output.rgb, target, config.densify.error_threshold, mask)
-        counts = ops.masked_counts(output.fragments, bad.flatten(), n)  # [N]
+        counts = output.fragments.masked_counts(bad.flatten(), n)  # [N]
         loss = photometric(output.rgb, target, config.loss.ssim_weight, mask)
         total += counts
         weighted += loss.double() * counts

@@ -290,7 +290,7 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> tuple[
         output = scene.render(camera.to(device), background=background, field_mode="frozen")
         target = over_background(as_float(image.to(device)), background)
         quality.append(psnr(output.rgb.clamp(0.0, 1.0), target, None if mask is None else mask.to(device)))
-        fragments.append(len(output.fragments.weight))
+        fragments.append(len(output.fragments))
     return (sum(quality) / len(quality), sum(fragments) / len(fragments)) if quality else (math.nan, math.nan)
 
 

@@ -278,6 +278,17 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
         ops.composite_image(fragments, projection, elsewhere)
     with pytest.raises(ValueError, match="mask is on device 'meta'"):
         ops.masked_counts(fragments, torch.ones(400, dtype=torch.bool, device="meta"), 10)
+    with pytest.raises(ValueError, match="log_scales is on device 'meta', what goes with it is on"):
+        ops.project(*(leaf.to("meta") if i == 2 else leaf for i, leaf in enumerate(leaves)), projection.camera)
+    with pytest.raises(ValueError, match="frames is on device 'meta'"):
+        ops.shade(fragments, projection.frames[:, :3], projection.frames.to("meta"))
+    sites = {key: case.params[key].to("meta" if key == "sv_rgb" else device) for key in SV_KEYS}
+    with pytest.raises(ValueError, match="sv_rgb is on device 'meta'"):
+        ops.view_color("sv", sites, leaves[0], projection.camera.exact_center)
+    with pytest.raises(ValueError, match="values is on device 'meta'"):
+        ops.composite(fragments, elsewhere)
+    with pytest.raises(TypeError, match="float32 or float64 tensors, not torch.float16"):
+        ops.project(*(leaf.half() for leaf in leaves), projection.camera)
     shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
     with pytest.raises(ValueError, match="16 bytes"):
         ops.trace(replace(projection, geom=shifted))

@@ -1,0 +1,94 @@
+"""Views with more fragments than memory, drawn a few rows of tiles at a time.
+
+A band is the same projection with the image's rows above it cut off. Its fragments are made when it is drawn, and once
+more in its backward pass; nothing of it is kept in between but its part of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from .project import Projection
+from .trace import TILE, Fragments, masked_counts, trace
+
+
+@dataclass(frozen=True)
+class Bands:
+    """The fragments of a view that was drawn in bands: found again for every question.
+
+    Attributes:
+        projection: of the whole view.
+        rows: first and last pixel row (exclusive) of every band, from top to bottom.
+        rim: as in `trace`.
+        count: number of fragments F.
+    """
+
+    projection: Projection
+    rows: tuple[tuple[int, int], ...]
+    rim: float
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    @torch.no_grad()
+    def lists(self) -> Iterator[Fragments]:
+        """The fragments of one band after the other, without gradient."""
+        for top, bottom in self.rows:
+            yield trace(band(self.projection, top, bottom), self.rim)
+
+    def overdraw(self) -> Tensor:
+        """[H, W, 1] int32: blended surfels a pixel."""
+        return torch.cat([fragments.overdraw() for fragments in self.lists()])
+
+    def masked_counts(self, mask: Tensor, n: int) -> Tensor:
+        """As `masked_counts` of a list."""
+        camera = self.projection.camera
+        if mask.numel() != camera.width * camera.height:
+            raise ValueError(f"the mask has {mask.numel()} pixels, the view {camera.width * camera.height}")
+        rows = mask.reshape(camera.height, camera.width)
+        counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
+        for (top, bottom), fragments in zip(self.rows, self.lists(), strict=True):
+            counts += masked_counts(fragments, rows[top:bottom].reshape(-1), n)
+        return counts
+
+
+def band(projection: Projection, top: int, bottom: int) -> Projection:
+    """The pixel rows from `top`, a multiple of 16, to `bottom` (exclusive) of a view, as a view of their own.
+
+    Its backward pass adds to `mean2d_grad` and `mean2d_absgrad` of `projection`.
+    """
+    shift = projection.geom.new_zeros(projection.geom.shape[1])
+    shift[1] = top
+    camera = projection.camera.rows(top, bottom)
+    return replace(projection, geom=projection.geom - shift, camera=camera, whole=projection)
+
+
+def split(top: int, bottom: int, parts: int) -> list[tuple[int, int]]:
+    """Pixel rows cut into at most `parts` bands of whole tiles; a single row of tiles stays as it is."""
+    tiles = -(-(bottom - top) // TILE)
+    parts = min(parts, tiles)
+    edges = [top + TILE * (tiles * i // parts) for i in range(parts)]
+    return list(zip(edges, [*edges[1:], bottom], strict=True))
+
+
+def whole_list(fragments: Fragments | Bands, what: str) -> Fragments:
+    """The list of a view that was not drawn in bands.
+
+    Args:
+        fragments: of the view.
+        what: what needs the list, for the message.
+
+    Raises:
+        ValueError: it was drawn in bands.
+    """
+    if isinstance(fragments, Bands):
+        raise ValueError(
+            f"{what} needs all fragments of a view at once, and this view has too many ({len(fragments):,}): use "
+            "smaller images, or raise scene.max_fragments"
+        )
+    return fragments

@@ -1,0 +1,39 @@
+"""Views drawn in bands on the CUDA kernels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns import ops
+from bitymi_ns.ops import trace_cuda
+from tests.scene import bands
+
+
+def test_values_and_gradients_do_not_change(device: torch.device) -> None:
+    whole, want = bands.step(device, 0)
+    parts, got = bands.step(device, len(whole) // 3)
+    assert isinstance(parts, ops.Bands) and len(parts) == len(whole)
+    bands.assert_same(got, want)
+
+
+@pytest.mark.parametrize("fit", [1000, 500])
+def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In bands of up to `fit` fragments the view can be drawn; where a row of tiles has more, the error says so."""
+    ints = trace_cuda._ints
+
+    def small_ones(like: torch.Tensor, *shape: int) -> torch.Tensor:
+        if len(shape) == 1 and shape[0] > fit:  # of fragments: there are fewer pairs
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return ints(like, *shape)
+
+    scene, camera = bands.make(device, 0)
+    want = scene.render(camera)
+    assert want.fragments.layout.pairs < 500
+    monkeypatch.setattr(trace_cuda, "_ints", small_ones)
+    monkeypatch.setattr(trace_cuda, "room", lambda geom: 2 * fit)
+    if fit == 500:
+        with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments.*, and there is room for 1,000"):
+            scene.render(camera)
+    else:
+        torch.testing.assert_close(scene.render(camera).rgb, want.rgb, rtol=1e-9, atol=1e-12)

@@ -1,0 +1,75 @@
+"""Views with more fragments than allowed are drawn in bands: same image, same gradients, less at a time."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns import ops
+from bitymi_ns.scene import scene as scene_module
+from bitymi_ns.train.config import DensifyConfig, TrainConfig
+from bitymi_ns.train.losses import beta_only_map
+from bitymi_ns.train.trainer import Trainer
+from bitymi_ns.train.views import View
+from tests.scene import bands
+
+CPU = torch.device("cpu")
+
+
+@pytest.mark.parametrize("share", [0.9, 0.4, 0.16])
+def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, want = bands.step(CPU, 0)
+    assert isinstance(whole, ops.Fragments)
+    lengths, trace = [], ops.trace
+
+    def counted(*args, **kwargs):
+        fragments = trace(*args, **kwargs)
+        lengths.append(len(fragments))
+        return fragments
+
+    monkeypatch.setattr(scene_module, "trace", counted)
+    most = int(share * len(whole))
+    parts, got = bands.step(CPU, most)
+    assert isinstance(parts, ops.Bands) and len(parts) == len(whole)
+    assert parts.rows[0][0] == 0 and parts.rows[-1][1] == bands.HEIGHT
+    assert all(a[1] == b[0] and a[1] % 16 == 0 for a, b in zip(parts.rows, parts.rows[1:], strict=False))
+    # each band once in the forward pass and once in the backward pass
+    assert max(lengths) <= most and len(lengths) == 2 * len(parts.rows)
+    bands.assert_same(got, want)
+
+
+def test_a_row_of_tiles_with_too_many_is_an_error_with_the_number() -> None:
+    scene, camera = bands.make(CPU, 50)
+    with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments, \d+ a pixel.*room for 50"):
+        scene.render(camera)
+
+
+def test_without_gradients() -> None:
+    whole, camera = bands.make(CPU, 0)
+    parts, _ = bands.make(CPU, 1500)
+    with torch.no_grad():
+        want, got = whole.render(camera), parts.render(camera)
+    assert isinstance(got.fragments, ops.Bands)
+    torch.testing.assert_close(got.rgb, want.rgb, rtol=1e-12, atol=1e-12)
+
+
+def test_what_needs_the_list_says_so() -> None:
+    scene, camera = bands.make(CPU, 1500)
+    with pytest.raises(ValueError, match="beta_only needs all fragments of a view at once.*scene.max_fragments"):
+        beta_only_map(scene.render(camera), scene.surfels["beta_raw"])
+
+
+def test_training_goes_on() -> None:
+    scene, camera = bands.make(CPU, 1500)
+    scene = scene.float()
+    camera = type(camera)(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
+    photo = torch.rand(bands.HEIGHT, bands.WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    densify = DensifyConfig(min_surfels=10, min_interval=5)
+    trainer = Trainer(scene, [View(camera, photo)], TrainConfig(densify=densify, resolution_schedule=0), 40)
+    losses, densified, banded = [], 0, 0
+    for _ in range(40):
+        terms, output, report = trainer.advance()
+        losses.append(float(terms["photometric"]))
+        densified += "pruned" in report
+        banded += isinstance(output.fragments, ops.Bands)
+    assert densified and banded > 10 and losses[-1] < losses[0]

@@ -68,24 +68,10 @@ def room_views(width: int, height: int, count: int, points: int, seed: int):
     )
 
 
-def multiplied(rates: LearningRates, factor: float) -> LearningRates:
-    """The rates times a factor; the rules for short runs stay as they are."""
-    keep = {"short_run_power", "short_run_max"}
-    values = {
-        name: value
-        if name in keep
-        else tuple(factor * v for v in value)
-        if isinstance(value, tuple)
-        else factor * value
-        for name, value in vars(rates).items()
-    }
-    return LearningRates(**values)
-
-
 def run(seed: int, options: argparse.Namespace) -> Result:
     """Train once."""
     train, held_out, points, colors = room_views(options.width, options.height, options.views, options.points, seed)
-    config = TrainConfig(seed=seed, lr=multiplied(LearningRates(), options.rates))
+    config = TrainConfig(seed=seed, lr=LearningRates().times(options.rates))
     scene_config = SceneConfig(prefilter=options.prefilter)
     centers = torch.stack([view.camera.center for view in train])
     pixels = len(train) * options.width * options.height

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 REFERENCE_STEPS = 30_000
@@ -105,6 +105,12 @@ class LearningRates:
     """Hash table of the texture field."""
     field_mlp: tuple[float, float] = (1e-2, 1e-3)
     """MLP of the texture field."""
+
+    def times(self, factor: float) -> LearningRates:
+        """The rates times a factor; the rules for short runs stay as they are."""
+        rates = {name: value for name, value in vars(self).items() if not name.startswith("short_run")}
+        scaled = {k: tuple(factor * x for x in v) if isinstance(v, tuple) else factor * v for k, v in rates.items()}
+        return replace(self, **scaled)
 
 
 @dataclass

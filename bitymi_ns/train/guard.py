@@ -3,9 +3,14 @@
 What counts as divergence:
 - a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could mend them);
 - surfels that are not finite, beyond a hundredth of them (fewer are dropped and counted);
-- views drawn worse than blank ones, over a whole window of steps: the mean photometric loss exceeds by a quarter both
-  that of every view in its own mean colour and that of the scene as the run found it. After an opacity reset nothing is
-  judged until half of the time to the next one, by when opacities can be made up for (`Schedule.reset_opacity`).
+- views drawn worse than blank ones, over a window of steps: the mean photometric loss exceeds both that of every view
+  in its own mean colour and that of the scene as the run found it; in the first tenth of the run by a quarter;
+- views drawn worse than before: the mean over a window exceeds that of the best window since the run began or last went
+  back by a quarter, and by a tenth of what blank views cost. Windows are whole epochs, so that all are means over the
+  same views; where the resolution changes, what was measured is converted by the loss of a few views at both.
+
+After an opacity reset nothing is judged until half of the time to the next one, by when opacities can be made up for
+(`Schedule.reset_opacity`). The last window ends with the run.
 
 Going back restores parameters, optimisers and the strategy's statistics as they were a whole window before the last
 good one ended; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power
@@ -17,7 +22,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -28,7 +33,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import ReducedViews, View, as_float, background_color, over_background
+from bitymi_ns.train.views import ReducedViews, as_float, background_color, over_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -36,11 +41,17 @@ if TYPE_CHECKING:
     from bitymi_ns.train.strategy import Strategy
 
 WORSE = 1.25
-"""A window is bad when its mean loss is this many times what it is compared with."""
+"""A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
+RISE = 0.1
+"""And by this share of the loss of blank views: losses near 0 may double."""
+EARLY = 0.1
+"""Share of the run in which views may still be drawn a little worse than blank ones."""
 BROKEN_SHARE = 0.01
 """Surfels that are not finite are dropped up to this share of all; beyond, the run goes back."""
 COMPARED_VIEWS = 4
-"""Views on which the blank picture and the first scene are judged."""
+"""Views on which the blank picture, the first scene and a change of the resolution are judged."""
+SHARE_OF_RUN = 5
+"""A window is at most one part in so many of the run, also where that is less than an epoch."""
 
 
 class Guard:
@@ -72,7 +83,8 @@ class Guard:
         self.window = max(config.guard.min_window, schedule.scaled(config.guard.window))
         self.factor, self.rollbacks = 1.0, 0
         self._streak = 0  # times in a row, without a good window between
-        self._limit = math.nan
+        self._limit, self._best = math.nan, math.inf  # mean losses: of what is blank, of the best window
+        self._views: ReducedViews | None = None
         # on the scene's device, so that no step has to wait for numbers: of the losses, and the most surfels that broke
         self._sum, self._broken, self._count = torch.zeros(()), torch.zeros(1, dtype=torch.int32), 0
         self._states: list[tuple[int, dict[str, Any]]] = []  # the older one is known to be good
@@ -84,6 +96,7 @@ class Guard:
             "rollbacks": self.rollbacks,
             "streak": self._streak,
             "limit": self._limit,
+            "best": self._best,
             "sum": float(self._sum),
             "count": self._count,
         }
@@ -92,7 +105,8 @@ class Guard:
         """The inverse of `state_dict`."""
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
         self._streak = int(state["streak"])
-        self._limit, self._sum, self._count = float(state["limit"]), torch.tensor(state["sum"]), int(state["count"])
+        self._limit, self._best = float(state["limit"]), float(state.get("best", math.inf))
+        self._sum, self._count = torch.tensor(state["sum"]), int(state["count"])
         self._states = []
 
     @property
@@ -110,26 +124,40 @@ class Guard:
         """
         if not self.on or self._states:
             return
+        self._views = views
+        epochs = -(-self.window // len(views)) * len(views)
+        self.window = max(self.window, min(epochs, self.schedule.max_steps // SHARE_OF_RUN))
         if math.isnan(self._limit):
-            compared = [views.at(i, 1.0) for i in range(min(len(views), COMPARED_VIEWS))]
-            self._limit = WORSE * self._untrained(compared)
+            self._limit = max(self._loss_of(views, 1.0), self._loss_of(views, 1.0, blank=True))
         self._states = [(step, self._capture())]
 
     @torch.no_grad()
-    def _untrained(self, views: Sequence[View]) -> float:
-        """Loss of blank pictures or of the scene as it is, whichever is larger."""
-        weight, blank, first = self.config.loss.ssim_weight, [0.0], [0.0]
+    def _loss_of(self, views: ReducedViews, factor: float, blank: bool = False) -> float:
+        """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
+        losses, count = [], min(len(views), COMPARED_VIEWS)
         kind = "white" if self.config.background == "white" else "black"
-        for camera, image, mask in views:
-            device = self.scene.surfels["means"].device
-            background = background_color(kind, self.config.seed, 0, device)
+        device = self.scene.surfels["means"].device
+        background = background_color(kind, self.config.seed, 0, device)
+        for camera, image, mask in (views.at(i * len(views) // count, factor) for i in range(count)):
             target = over_background(as_float(image.to(device)), background)
-            plain = target.mean((0, 1)).expand_as(target).contiguous()
-            drawn = self.scene.render(camera.to(device), background=background, field_mode="frozen").rgb
-            for losses, picture in ((blank, plain), (first, drawn)):
-                losses.append(photometric(picture, target, weight, mask).item())
-        number = max(1, len(blank) - 1)
-        return max(sum(blank), sum(first)) / number
+            if blank:
+                drawn = target.mean((0, 1)).expand_as(target).contiguous()
+            else:
+                drawn = self.scene.render(camera.to(device), background=background, field_mode="frozen").rgb
+            losses.append(photometric(drawn, target, self.config.loss.ssim_weight, mask))
+        return float(torch.stack(losses).mean())
+
+    def _convert(self, step: int) -> None:
+        """Express what was measured so far as losses at the resolution of the next step."""
+        before, now = (self.schedule.resolution_factor(s) for s in (step, step + 1))
+        if before == now or self._views is None:
+            return
+        if self.schedule.recovering(step + 1):  # a faded scene tells nothing
+            self._best = math.inf
+            return
+        old, new = self._loss_of(self._views, before), self._loss_of(self._views, now)
+        if math.isfinite(old) and math.isfinite(new) and old > 0.0:
+            self._best, self._sum = self._best * new / old, self._sum * (new / old)
 
     def failed(self, step: int, error: TrainingDiverged) -> None:
         """Call when a step could not be done because its loss is not finite; then do it again.
@@ -168,25 +196,33 @@ class Guard:
             self._sum, self._count = self._sum.to(loss) + loss, self._count + 1
         self._broken = torch.maximum(self._broken.to(broken), broken)
         last = step + 1 >= self.schedule.max_steps
-        ends = self._count >= self.window or last
+        ends = (self.schedule.max_steps - 1 - step) % self.window == 0
         if ends or broken.device.type == "cpu":
             most = int(self._broken)
             self._broken = torch.zeros_like(broken)
             if most > BROKEN_SHARE * len(self.scene):
                 return self._go_back(step, describe_broken(self.scene) or f"{most} surfels are not finite")
         if not ends:
+            self._convert(step)
             return {}
         mean = float(self._sum) / self._count if self._count else 0.0
-        enough = self._count >= min(self.window, self.config.guard.min_window)
+        enough, whole = self._count >= self.config.guard.min_window, self._count >= self.window
         self._sum, self._count = torch.zeros_like(loss), 0
-        if enough and mean > self._limit:
+        if enough and mean > self._limit * (WORSE if step < EARLY * self.schedule.max_steps else 1.0):
             return self._go_back(step, f"the views are drawn worse than blank ones (loss {mean:.3f})")
+        if whole and mean - self._best > max((WORSE - 1.0) * self._best, RISE * self._limit):
+            return self._go_back(
+                step, f"the views are drawn worse than before (loss {mean:.3f} after {self._best:.3f})"
+            )
         cause = describe_broken(self.scene)
         if cause and (self.strategy.broken_share(self.scene) > BROKEN_SHARE or not self._field_is_finite()):
             return self._go_back(step, cause)
         if cause:
             return self._drop(step)
         self._streak = 0
+        if whole:
+            self._best = min(self._best, mean)
+        self._convert(step)
         if not last:
             self._states = [*self._states[-1:], (step + 1, self._capture())]
         return {}
@@ -212,7 +248,7 @@ class Guard:
         self.factor *= options.rates**self._streak
         self._restore(state)
         self._states = [(origin, state)]
-        self._sum, self._count = torch.zeros_like(self._sum), 0
+        self._sum, self._count, self._best = torch.zeros_like(self._sum), 0, math.inf
         self.announce(
             f"step {step}: training diverged ({cause}); back to the state before step {origin}, "
             f"with learning rates times {self.factor:.2g} from here on"

@@ -17,11 +17,8 @@ def test_a_diverging_run_says_so_and_leaves_a_finite_scene(
     start: Callable[..., BitymiTrainerConfig], factor: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = start()
-    rates = config.pipeline.model.train.lr
-    for name, value in vars(rates).items():
-        if not name.startswith("short_run"):
-            changed = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
-            setattr(rates, name, changed)
+    train = config.pipeline.model.train
+    train.lr = train.lr.times(factor)
     config.max_num_iterations = 100
     message = ""
     try:

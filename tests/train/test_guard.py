@@ -13,22 +13,11 @@ from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.trainer import Trainer, evaluate
 
 
-def multiplied(factor: float) -> LearningRates:
-    keep = {"short_run_power", "short_run_max"}
-    values = {
-        name: value
-        if name in keep
-        else tuple(factor * v for v in value)
-        if isinstance(value, tuple)
-        else factor * value
-        for name, value in vars(LearningRates()).items()
-    }
-    return LearningRates(**values)
-
-
 def config_of(factor: float = 1.0, **guard: float) -> TrainConfig:
     densify = DensifyConfig(max_surfels=300, min_interval=20, min_reset_interval=10_000, max_per_pixel=0)
-    return TrainConfig(densify=densify, lr=multiplied(factor), guard=GuardConfig(**guard), resolution_schedule=0)
+    return TrainConfig(
+        densify=densify, lr=LearningRates().times(factor), guard=GuardConfig(**guard), resolution_schedule=0
+    )
 
 
 def run(trainer: Trainer, steps: int) -> list[dict[str, float]]:
@@ -81,6 +70,45 @@ def test_a_field_that_breaks_on_the_way_is_restored(make_scene, views):
     assert (scene.field.field_table - good).abs().max() < 0.5
     run(trainer, 50)
     assert evaluate(scene, views, trainer.config)[0] > 15
+
+
+def test_views_drawn_worse_than_before_take_the_run_back(make_scene, views):
+    scene = make_scene()
+    trainer = Trainer(scene, views, config_of(), 120)
+    run(trainer, 96)
+    good, _ = evaluate(scene, views, trainer.config)
+    assert trainer.guard.window == 24  # four epochs; the windows end with the run
+    with torch.no_grad():
+        scene.surfels["sv_rgb"] += 0.3
+    damaged, _ = evaluate(scene, views, trainer.config)
+    with pytest.warns(UserWarning, match="step 119: training diverged .the views are drawn worse than before"):
+        for _ in range(24):
+            trainer.advance()
+    assert evaluate(scene, views, trainer.config)[0] > damaged + 3 and damaged < good - 3
+    assert trainer.guard.rollbacks == 1
+
+
+def test_losses_are_compared_across_resolutions(make_scene, views):
+    """Small pictures have smaller losses here: too small for a window of SSIM, they have none."""
+    scene, config = make_scene(), config_of()
+    config.resolution_schedule, config.num_downscales = 12_000, 3
+    trainer = Trainer(scene, views, config, 120)
+    run(trainer, 119)
+    assert trainer.guard.rollbacks == 0 and math.isfinite(trainer.guard._best)
+    at_full_size = trainer.guard._loss_of(trainer.views, 1.0)
+    assert 0.5 * at_full_size < trainer.guard._best < 2 * at_full_size
+
+
+def test_nothing_is_compared_with_before_where_the_resolution_changes_in_a_faded_scene(make_scene, views):
+    scene, config = make_scene(), config_of()
+    config.resolution_schedule, config.num_downscales = 12_500, 1
+    config.densify.min_reset_interval = 1  # resets after steps 12, 24, ...
+    trainer = Trainer(scene, views, config, 120)
+    assert trainer.schedule.is_reset_step(48) and trainer.schedule.recovering(50)
+    trainer.guard.before(0, trainer.views)
+    trainer.guard._best = 0.1
+    trainer.guard._convert(49)
+    assert trainer.guard._best == math.inf
 
 
 def test_a_few_broken_surfels_are_dropped_and_counted(make_scene, views):

@@ -38,7 +38,8 @@ class Camera:
     def exact_center(self) -> Tensor:
         """[3] float64, camera centre in the world frame: far from the origin float32 would not place it."""
         viewmat = self.viewmat.double()
-        return -viewmat[:3, :3].T @ viewmat[:3, 3]
+        # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+        return -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
 
     @property
     def center(self) -> Tensor:

@@ -4,7 +4,8 @@ What counts as divergence:
 - a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could mend them);
 - surfels that are not finite, beyond a hundredth of them (fewer are dropped and counted);
 - views drawn worse than blank ones, over a window of steps: the mean photometric loss exceeds both that of every view
-  in its own mean colour and that of the scene as the run found it; in the first tenth of the run by a quarter;
+  in its own mean colour and that of the scene as the run found it; by a quarter in the first tenth of the run, and
+  in its first 100 steps;
 - views drawn worse than before: the mean over a window exceeds that of the best window since the run began or last went
   back by a quarter, and by a tenth of what blank views cost. Windows are whole epochs, so that all are means over the
   same views; where the resolution changes, what was measured is converted by the loss of a few views at both.
@@ -46,6 +47,8 @@ RISE = 0.1
 """And by this share of the loss of blank views: losses near 0 may double."""
 EARLY = 0.1
 """Share of the run in which views may still be drawn a little worse than blank ones."""
+EARLY_STEPS = 100
+"""Least length of that time: surfels have to settle, however short the run."""
 BROKEN_SHARE = 0.01
 """Surfels that are not finite are dropped up to this share of all; beyond, the run goes back."""
 COMPARED_VIEWS = 4
@@ -208,7 +211,8 @@ class Guard:
         mean = float(self._sum) / self._count if self._count else 0.0
         enough, whole = self._count >= self.config.guard.min_window, self._count >= self.window
         self._sum, self._count = torch.zeros_like(loss), 0
-        if enough and mean > self._limit * (WORSE if step < EARLY * self.schedule.max_steps else 1.0):
+        early = max(EARLY * self.schedule.max_steps, EARLY_STEPS)
+        if enough and mean > self._limit * (WORSE if step < early else 1.0):
             return self._go_back(step, f"the views are drawn worse than blank ones (loss {mean:.3f})")
         if whole and mean - self._best > max((WORSE - 1.0) * self._best, RISE * self._limit):
             return self._go_back(
@@ -223,7 +227,7 @@ class Guard:
         if whole:
             self._best = min(self._best, mean)
         self._convert(step)
-        if not last:
+        if not last and not (enough and mean > self._limit):  # a state that will be good enough later as well
             self._states = [*self._states[-1:], (step + 1, self._capture())]
         return {}
 

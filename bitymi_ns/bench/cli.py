@@ -35,7 +35,8 @@ class BenchRun:
     methods: tuple[str, ...] = ("bitymi",)
     """Methods of ns-train."""
     plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, paper, resolution, or a YAML file of that form."""
+    """Rows to train instead of --methods: ablation, atlas, overdraw, paper, resolution, or
+    a YAML file of that form."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()

@@ -70,6 +70,7 @@ def _install() -> None:
 _install()
 bitymi = _specification("bitymi")
 bitymi_quality = _specification("bitymi-quality")
+bitymi_fast = _specification("bitymi-fast")
 bitymi_sh = _specification("bitymi-sh")
 bitymi_sb = _specification("bitymi-sb")
 bitymi_sg = _specification("bitymi-sg")

@@ -11,18 +11,22 @@ REFERENCE_STEPS = 30_000
 
 @dataclass
 class LossConfig:
-    """The objective: photometric loss and falloff reduction."""
+    """The objective: photometric loss, falloff and overdraw reduction."""
 
     ssim_weight: float = 0.2
     """Photometric loss = (1 - w) L1 + w (1 - SSIM)."""
     falloff_weight: float = 0.005
     """Weight lambda of the falloff loss; 0 turns it off (the paper's quality setting)."""
     falloff_gamma: float = 25.0
-    """How sharply the falloff loss fades with the photometric error: omega = exp(-gamma e)."""
+    """How sharply the falloff and overdraw losses fade with the photometric error: omega = exp(-gamma e)."""
     falloff_error: Literal["l1_sum", "mse"] = "l1_sum"
     """The error e in omega: L1 summed over rgb, or the mean squared error."""
     falloff_gradient: Literal["full", "beta_only"] = "full"
     """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
+    overdraw_weight: float = 0.0
+    """Weight of the loss on the number of fragments a pixel, which fades with the error as the falloff loss does."""
+    overdraw_half: float = 0.005
+    """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""The training objective, L = L_photo + lambda L_beta: photometric loss and falloff reduction."""
+"""The training objective, L = L_photo + lambda L_beta + mu L_over: photometric loss, falloff and overdraw."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
+    from bitymi_ns.ops import Fragments
     from bitymi_ns.scene.scene import RenderOutput
 
 SSIM_WINDOW = 11
@@ -32,13 +33,16 @@ def objective(
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
 
     Returns:
-        `photometric`, and `falloff` unless its weight is 0.
+        `photometric`, and `falloff` and `overdraw` unless their weights are 0.
     """
     terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
+    if config.falloff_weight > 0.0 or config.overdraw_weight > 0.0:
+        omega = error_weight(output.rgb, target, config.falloff_gamma, config.falloff_error, mask)
     if config.falloff_weight > 0.0:
         beta = beta_only_map(output, beta_raw) if config.falloff_gradient == "beta_only" else output.beta
-        loss = falloff(output.rgb, target, beta, config.falloff_gamma, config.falloff_error, mask)
-        terms["falloff"] = config.falloff_weight * loss
+        terms["falloff"] = config.falloff_weight * falloff(omega, beta, mask)
+    if config.overdraw_weight > 0.0:
+        terms["overdraw"] = config.overdraw_weight * overdraw(omega, output.fragments, config.overdraw_half, mask)
     return terms
 
 
@@ -68,7 +72,13 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
     return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ops.ssim(rgb, target))
 
 
-def error_weight(rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_sum", "mse"] = "l1_sum") -> Tensor:
+def error_weight(
+    rgb: Tensor,
+    target: Tensor,
+    gamma: float,
+    error: Literal["l1_sum", "mse"] = "l1_sum",
+    mask: Tensor | None = None,
+) -> Tensor:
     """omega = exp(-gamma e) of the falloff loss: 1 where the picture is right already, near 0 where it is wrong.
 
     Without gradient: else the loss could be lowered by making the error larger.
@@ -77,6 +87,7 @@ def error_weight(rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_s
         rgb, target: [H, W, 3].
         gamma: how fast omega fades with the error.
         error: e = L1 summed over rgb (the formula of the paper), or the mean squared error over rgb.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; omega is 0 elsewhere.
 
     Returns:
         [H, W, 1].
@@ -88,21 +99,21 @@ def error_weight(rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_s
         e = difference.square().mean(-1, keepdim=True)
     else:
         raise ValueError(f"falloff_error must be l1_sum or mse, not {error!r}")
-    return torch.exp(-gamma * e)
+    omega = torch.exp(-gamma * e)
+    # where() also keeps a NaN in an excluded pixel of the photograph out
+    return omega if mask is None else torch.where(mask.reshape(omega.shape), omega, 0.0)
 
 
-def falloff(
-    rgb: Tensor,
-    target: Tensor,
-    beta_map: Tensor,
-    gamma: float,
-    error: Literal["l1_sum", "mse"] = "l1_sum",
-    mask: Tensor | None = None,
-) -> Tensor:
-    """L_beta = mean over the pixels of omega * beta_map, with omega from `error_weight`.
+def _pixels(omega: Tensor, mask: Tensor | None) -> Tensor | int:
+    """Number of pixels that count, at least 1."""
+    return omega.numel() if mask is None else mask.sum().clamp(min=1)
+
+
+def falloff(omega: Tensor, beta_map: Tensor, mask: Tensor | None = None) -> Tensor:
+    """L_beta = mean over the pixels of omega * beta_map.
 
     Args:
-        rgb, target: [H, W, 3]; only their difference counts and it gets no gradient.
+        omega: [H, W, 1] from `error_weight`, with the same mask.
         beta_map: [H, W, 1] alpha-blended beta, sum_i w_i beta_i. `RenderOutput.beta` carries gradient to the blending
             weights and to beta (the literal formula); for gradient to beta alone pass `beta_only_map(...)`.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
@@ -110,11 +121,29 @@ def falloff(
     Returns:
         Scalar.
     """
-    if mask is None:
-        return (error_weight(rgb, target, gamma, error) * beta_map).mean()
-    mask = mask.reshape(*rgb.shape[:2], 1)
-    omega = error_weight(rgb, torch.where(mask, target, rgb), gamma, error)
-    return (omega * beta_map * mask).sum() / mask.sum().clamp(min=1)
+    return (omega * beta_map).sum() / _pixels(omega, mask)
+
+
+def overdraw(omega: Tensor, fragments: Fragments, half: float, mask: Tensor | None = None) -> Tensor:
+    """L_over = mean over the pixels of omega * sum_i w_i / (w_i + half): the fragments of pixels that are right.
+
+    The number of fragments has no gradient. This soft count has: it is concave in w, so that of two ways to share the
+    same coverage the one with fewer, heavier fragments costs less; a fragment far heavier than `half` counts 1 and
+    feels nothing, one far lighter feels 1 / half. Derivation and measured trade-off: docs/architecture.md.
+
+    Args:
+        omega: [H, W, 1] from `error_weight`, with the same mask.
+        fragments: of the view, with their weights w differentiable.
+        half: the weight that counts one half, above 0.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
+
+    Returns:
+        Scalar.
+    """
+    if not half > 0.0:
+        raise ValueError(f"overdraw_half must be above 0, not {half}")
+    w = fragments.weight
+    return torch.dot(omega.flatten()[fragments.pixel], w / (w + half)) / _pixels(omega, mask)
 
 
 def beta_only_map(output: RenderOutput, beta_raw: Tensor) -> Tensor:

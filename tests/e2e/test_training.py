@@ -241,7 +241,9 @@ def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTra
     assert eval_setup(folder / "config.yml")[3] == 59
 
 
-@pytest.mark.parametrize("method", ["bitymi-quality", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"])
+@pytest.mark.parametrize(
+    "method", ["bitymi-quality", "bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"]
+)
 def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
     config = start(method=method)
     config.max_num_iterations = 3

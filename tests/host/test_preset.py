@@ -12,7 +12,7 @@ from bitymi_ns.presets import preset_names, preset_path
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import AdamConfig, TrainConfig
 
-METHODS = ["bitymi", "bitymi-quality", "bitymi-sb", "bitymi-sg", "bitymi-sh", "bitymi-notexture"]
+METHODS = ["bitymi", "bitymi-quality", "bitymi-fast", "bitymi-sb", "bitymi-sg", "bitymi-sh", "bitymi-notexture"]
 
 
 def missing_keys(cls: type, values: dict, prefix: str = "") -> list[str]:
@@ -61,6 +61,9 @@ def test_the_variants_differ_where_they_should() -> None:
     quality = load_preset("bitymi-quality")
     assert quality.train.loss.falloff_weight == 0.0 and base.train.loss.falloff_weight == 0.005
     assert quality.scene == base.scene
+    fast = load_preset("bitymi-fast")
+    assert fast.train.loss.overdraw_weight > 0.0 == base.train.loss.overdraw_weight
+    assert fast.scene == base.scene and fast.train.densify == base.train.densify
     assert [load_preset(f"bitymi-{c}").scene.view_color for c in ("sh", "sb", "sg")] == ["sh", "sb", "sg"]
     assert load_preset("bitymi-notexture").scene.texture == "none"
 

@@ -4,7 +4,7 @@ Every function takes float32 or float64 tensors and dispatches on their device a
 """
 
 from .bands import Bands, band, split, whole_list
-from .composite import composite, composite_image
+from .composite import composite, composite_image, soft_overdraw
 from .errors import TooManyFragments
 from .field import FieldGeometry, field
 from .project import Projection, project
@@ -31,6 +31,7 @@ __all__ = [
     "masked_counts",
     "project",
     "shade",
+    "soft_overdraw",
     "split",
     "ssim",
     "texel_image",

@@ -58,6 +58,22 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
     return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)
 
 
+def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
+    """A count of a pixel's fragments with a gradient: sum of w / (w + half), [H * W].
+
+    Args:
+        fragments: of an H x W view.
+        half: the weight that counts one half, above 0. A fragment far heavier counts 1, one far lighter w / half.
+
+    Raises:
+        ValueError: half is not above 0.
+    """
+    if not half > 0.0:
+        raise ValueError(f"the weight that counts one half must be above 0, not {half}")
+    count = fragments.weight / (fragments.weight + half)
+    return count.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, count)
+
+
 def composite(fragments: Fragments, values: Tensor) -> Tensor:
     """Sums of w times any values [F, C] a pixel: [H * W, C]."""
     if values.dim() != 2 or len(values) != len(fragments):

@@ -20,6 +20,7 @@ from bitymi_ns.ops import (
     composite_image,
     project,
     shade,
+    soft_overdraw,
     split,
     trace,
     view_color,
@@ -43,6 +44,7 @@ class RenderOutput:
         beta: [H, W, 1] sum of w beta, the paper's alpha-blended Beta value.
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
+        soft_overdraw: [H, W, 1] fragments a pixel, those of small weight in part; None without `overdraw_half`.
         fragments: the view's fragments; where they were too many, what is known of them without the list.
         projection: the view's surfels.
     """
@@ -52,6 +54,7 @@ class RenderOutput:
     beta: Tensor
     depth: Tensor | None
     normal: Tensor | None
+    soft_overdraw: Tensor | None
     fragments: Fragments | Bands
     projection: Projection
 
@@ -107,6 +110,7 @@ class Scene(nn.Module):
         field_mode: Literal["train", "frozen", "off"] = "train",
         maps: bool = False,
         weight_bound: float | None = None,
+        overdraw_half: float | None = None,
     ) -> RenderOutput:
         """Renders a view: visibility, then shading, then compositing.
 
@@ -118,6 +122,7 @@ class Scene(nn.Module):
             field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
             maps: also depth and normals.
             weight_bound: fragments of smaller weight keep the surfel's colour, without residual; None = as configured.
+            overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
 
         Raises:
             TooManyFragments: a single row of tiles has too many.
@@ -144,7 +149,10 @@ class Scene(nn.Module):
                 self.config.weight_bound if weight_bound is None else weight_bound,
                 move_surfels=self.config.texture_moves_surfels and field_mode == "train",
             )
-            return composite_image(fragments, part, colors, maps), fragments
+            image = composite_image(fragments, part, colors, maps)
+            if overdraw_half is not None:
+                image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
+            return image, fragments
 
         try:
             image, fragments = draw(projection, self.config.max_fragments)
@@ -160,6 +168,7 @@ class Scene(nn.Module):
             beta=image[..., 4:5],
             depth=image[..., 5:6] if maps else None,
             normal=image[..., 6:9] if maps else None,
+            soft_overdraw=image[..., -1:] if overdraw_half is not None else None,
             fragments=fragments,
             projection=projection,
         )

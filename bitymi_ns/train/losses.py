@@ -13,7 +13,6 @@ from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
-    from bitymi_ns.ops import Fragments
     from bitymi_ns.scene.scene import RenderOutput
 
 SSIM_WINDOW = 11
@@ -26,7 +25,7 @@ def objective(
     """The terms of the objective, weighted: their sum is what training minimises.
 
     Args:
-        output: the rendered view, [H, W].
+        output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on.
         target: [H, W, 3] the photograph at the same size, over the same background.
         beta_raw: [N] the surfels' parameter.
         config: weights and variants.
@@ -40,9 +39,9 @@ def objective(
         omega = error_weight(output.rgb, target, config.falloff_gamma, config.falloff_error, mask)
     if config.falloff_weight > 0.0:
         beta = beta_only_map(output, beta_raw) if config.falloff_gradient == "beta_only" else output.beta
-        terms["falloff"] = config.falloff_weight * falloff(omega, beta, mask)
+        terms["falloff"] = config.falloff_weight * mean_where_right(omega, beta, mask)
     if config.overdraw_weight > 0.0:
-        terms["overdraw"] = config.overdraw_weight * overdraw(omega, output.fragments, config.overdraw_half, mask)
+        terms["overdraw"] = config.overdraw_weight * mean_where_right(omega, output.soft_overdraw, mask)
     return terms
 
 
@@ -104,46 +103,20 @@ def error_weight(
     return omega if mask is None else torch.where(mask.reshape(omega.shape), omega, 0.0)
 
 
-def _pixels(omega: Tensor, mask: Tensor | None) -> Tensor | int:
-    """Number of pixels that count, at least 1."""
-    return omega.numel() if mask is None else mask.sum().clamp(min=1)
-
-
-def falloff(omega: Tensor, beta_map: Tensor, mask: Tensor | None = None) -> Tensor:
-    """L_beta = mean over the pixels of omega * beta_map.
+def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean over the pixels of omega * values: the falloff loss of a beta map, the overdraw loss of a soft count.
 
     Args:
         omega: [H, W, 1] from `error_weight`, with the same mask.
-        beta_map: [H, W, 1] alpha-blended beta, sum_i w_i beta_i. `RenderOutput.beta` carries gradient to the blending
-            weights and to beta (the literal formula); for gradient to beta alone pass `beta_only_map(...)`.
+        values: [H, W, 1]. Falloff: the alpha-blended beta, sum_i w_i beta_i; `RenderOutput.beta` carries gradient to
+            the blending weights and to beta (the literal formula), `beta_only_map(...)` to beta alone. Overdraw:
+            `RenderOutput.soft_overdraw`, sum_i w_i / (w_i + half).
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
 
     Returns:
-        Scalar.
+        Scalar; 0 when no pixel counts.
     """
-    return (omega * beta_map).sum() / _pixels(omega, mask)
-
-
-def overdraw(omega: Tensor, fragments: Fragments, half: float, mask: Tensor | None = None) -> Tensor:
-    """L_over = mean over the pixels of omega * sum_i w_i / (w_i + half): the fragments of pixels that are right.
-
-    The number of fragments has no gradient. This soft count has: it is concave in w, so that of two ways to share the
-    same coverage the one with fewer, heavier fragments costs less; a fragment far heavier than `half` counts 1 and
-    feels nothing, one far lighter feels 1 / half. Derivation and measured trade-off: docs/architecture.md.
-
-    Args:
-        omega: [H, W, 1] from `error_weight`, with the same mask.
-        fragments: of the view, with their weights w differentiable.
-        half: the weight that counts one half, above 0.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
-
-    Returns:
-        Scalar.
-    """
-    if not half > 0.0:
-        raise ValueError(f"overdraw_half must be above 0, not {half}")
-    w = fragments.weight
-    return torch.dot(omega.flatten()[fragments.pixel], w / (w + half)) / _pixels(omega, mask)
+    return (omega * values).sum() / (omega.numel() if mask is None else mask.sum().clamp(min=1))
 
 
 def beta_only_map(output: RenderOutput, beta_raw: Tensor) -> Tensor:

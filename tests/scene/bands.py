@@ -29,9 +29,10 @@ def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Ten
     """The fragments, and all that a training step gives."""
     scene, camera = make(device, most, texture_moves_surfels=True)
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, device=device)
-    output = scene.render(camera, background, maps=True)
-    weight = torch.rand(HEIGHT, WIDTH, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
-    image = torch.cat([output.rgb, output.alpha, output.beta, output.depth, output.normal], -1)
+    output = scene.render(camera, background, maps=True, overdraw_half=0.005)
+    weight = torch.rand(HEIGHT, WIDTH, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
+    maps = (output.alpha, output.beta, output.depth, output.normal, output.soft_overdraw)
+    image = torch.cat([output.rgb, *maps], -1)
     (image * weight).sum().backward()
     mask = weight[..., 0] > 0.7
     result = {

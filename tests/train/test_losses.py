@@ -1,14 +1,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig, TrainConfig
-from bitymi_ns.train.losses import beta_only_map, error_weight, falloff, objective, overdraw, photometric, psnr
+from bitymi_ns.train.losses import beta_only_map, error_weight, mean_where_right, objective, photometric, psnr
 from bitymi_ns.train.trainer import fit
 
 
@@ -55,7 +54,7 @@ def test_nothing_counts():
     rgb = torch.rand(16, 16, 3, requires_grad=True)
     target = torch.zeros(16, 16, 3)
     omega = error_weight(rgb, target, 25.0, mask=mask)
-    loss = photometric(rgb, target, 0.2, mask) + falloff(omega, torch.ones(16, 16, 1), mask)
+    loss = photometric(rgb, target, 0.2, mask) + mean_where_right(omega, torch.ones(16, 16, 1), mask)
     loss.backward()
     assert loss == 0 and (rgb.grad == 0).all()
 
@@ -73,7 +72,7 @@ def test_error_weight_follows_the_paper(pair):
 def test_falloff_gives_no_gradient_to_the_colours(pair):
     rgb, target = pair
     a, beta = rgb.clone().requires_grad_(), torch.rand(20, 24, 1).requires_grad_()
-    falloff(error_weight(a, target, 25.0), beta).backward()
+    mean_where_right(error_weight(a, target, 25.0), beta).backward()
     assert a.grad is None
     torch.testing.assert_close(beta.grad, error_weight(rgb, target, 25.0) / (20 * 24))
 
@@ -83,11 +82,11 @@ def test_beta_only_moves_beta_alone(make_scene, views):
     output = scene.render(views[0].camera)
     beta = beta_only_map(output, scene.surfels["beta_raw"])
     torch.testing.assert_close(beta, output.beta)
-    falloff(error_weight(output.rgb, views[0].image, 25.0), beta).backward()
+    mean_where_right(error_weight(output.rgb, views[0].image, 25.0), beta).backward()
     moved = [name for name, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()]
     assert moved == ["beta_raw"]
     output = scene.render(views[0].camera)
-    falloff(error_weight(output.rgb, views[0].image, 25.0), output.beta).backward()
+    mean_where_right(error_weight(output.rgb, views[0].image, 25.0), output.beta).backward()
     assert (scene.surfels["opacity_logits"].grad != 0).any()
 
 
@@ -98,13 +97,14 @@ def test_objective_has_the_terms_that_are_on(make_scene, views):
     terms = objective(output, target, beta_raw, LossConfig())
     assert set(terms) == {"photometric", "falloff"}
     omega = error_weight(output.rgb, target, 25.0)
-    torch.testing.assert_close(terms["falloff"], 0.005 * falloff(omega, output.beta))
+    torch.testing.assert_close(terms["falloff"], 0.005 * mean_where_right(omega, output.beta))
     same = objective(output, target, beta_raw, LossConfig(falloff_gradient="beta_only"))
     torch.testing.assert_close(same["falloff"], terms["falloff"])
     assert set(objective(output, target, beta_raw, LossConfig(falloff_weight=0.0))) == {"photometric"}
+    output = scene.render(views[0].camera, overdraw_half=0.005)
     both = objective(output, target, beta_raw, LossConfig(falloff_weight=0.0, overdraw_weight=0.002))
     assert set(both) == {"photometric", "overdraw"}
-    torch.testing.assert_close(both["overdraw"], 0.002 * overdraw(omega, output.fragments, 0.005))
+    torch.testing.assert_close(both["overdraw"], 0.002 * mean_where_right(omega, output.soft_overdraw))
 
 
 def test_psnr_of_a_known_error() -> None:
@@ -119,46 +119,12 @@ def test_psnr_of_a_known_error() -> None:
     assert psnr(b, a, ~mask) < 10 and psnr(b, a, torch.zeros_like(mask)) == 100.0
 
 
-def test_overdraw_counts_the_fragments_of_pixels_that_are_right(make_scene, views):
-    scene = make_scene(texture=False, every=1)
-    output, target = scene.render(views[0].camera), views[0].image
-    fragments = output.fragments
-    count = fragments.overdraw().float()
-    everywhere = torch.ones_like(count)
-    # a half of 0 in the limit: the mean overdraw
-    torch.testing.assert_close(overdraw(everywhere, fragments, 1e-9), count.mean(), rtol=1e-3, atol=0)
-    right = (torch.rand(count.shape, generator=torch.Generator().manual_seed(0)) < 0.5).float()
-    torch.testing.assert_close(overdraw(right, fragments, 1e-9), (right * count).mean(), rtol=1e-3, atol=0)
-    mask = right.bool().squeeze(-1)
-    omega = error_weight(output.rgb, target, 25.0, mask=mask)
-    expected = torch.zeros(count.numel(), dtype=torch.float64)
-    w = fragments.weight.detach().double()
-    expected.index_add_(0, fragments.pixel.long(), w / (w + 0.005))
-    expected = (omega.double().flatten() * expected).sum() / mask.sum()
-    torch.testing.assert_close(overdraw(omega, fragments, 0.005, mask).double(), expected, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("half", [1e-9, 0.005, 10.0])
-def test_overdraw_gradient(make_scene, views, half):
-    fragments = make_scene(texture=False).render(views[0].camera).fragments
-    n = 50
-    w = torch.linspace(1e-4, 1, n, dtype=torch.float64, requires_grad=True)
-    part = replace(fragments, weight=w, pixel=torch.arange(n, dtype=torch.int32) % 12)
-    omega = torch.rand(3, 4, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    torch.autograd.gradcheck(lambda w: overdraw(omega, replace(part, weight=w), half), w)
-
-
-def test_overdraw_of_extreme_weights_is_finite(make_scene, views):
-    fragments = make_scene(texture=False).render(views[0].camera).fragments
-    w = torch.tensor([0.0, 1e-45, 1e-38, 1e-30, 1e-8, 1.0], requires_grad=True)
-    part = replace(fragments, weight=w, pixel=torch.zeros(6, dtype=torch.int32))
-    loss = overdraw(torch.ones(1, 1, 1), part, 1e-9)
-    loss.backward()
-    assert torch.isfinite(loss) and torch.isfinite(w.grad).all() and (w.grad >= 0).all()
-    empty = replace(fragments, weight=w[:0], pixel=part.pixel[:0])
-    assert overdraw(torch.ones(1, 1, 1), empty, 0.005) == 0
-    with pytest.raises(ValueError, match="overdraw_half must be above 0"):
-        overdraw(torch.ones(1, 1, 1), part, 0.0)
+def test_mean_where_right_is_a_mean_over_the_pixels_that_count(pair):
+    mask = torch.rand(20, 24, generator=torch.Generator().manual_seed(0)) < 0.5
+    omega = error_weight(*pair, 2.0, mask=mask)
+    values = torch.rand(20, 24, 1)
+    expected = (error_weight(*pair, 2.0) * values)[mask].mean()
+    torch.testing.assert_close(mean_where_right(omega, values, mask), expected)
 
 
 def test_the_overdraw_loss_leaves_fewer_fragments(make_scene, views):

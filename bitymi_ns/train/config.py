@@ -25,6 +25,10 @@ class LossConfig:
     """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
     overdraw_weight: float = 0.0
     """Weight of the loss on the number of fragments a pixel, which fades with the error as the falloff loss does."""
+    overdraw_start: int = 12_000
+    """First step with the overdraw loss: before, it costs quality."""
+    overdraw_stop: int = 27_000
+    """Step from which the overdraw loss is off again, so that the picture settles."""
     overdraw_half: float = 0.005
     """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
 

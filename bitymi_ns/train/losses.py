@@ -32,15 +32,15 @@ def objective(
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
 
     Returns:
-        `photometric`, and `falloff` and `overdraw` unless their weights are 0.
+        `photometric`; `falloff` unless its weight is 0; `overdraw` where the view was rendered with `soft_overdraw`.
     """
     terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
-    if config.falloff_weight > 0.0 or config.overdraw_weight > 0.0:
+    if config.falloff_weight > 0.0 or output.soft_overdraw is not None:
         omega = error_weight(output.rgb, target, config.falloff_gamma, config.falloff_error, mask)
     if config.falloff_weight > 0.0:
         beta = beta_only_map(output, beta_raw) if config.falloff_gradient == "beta_only" else output.beta
         terms["falloff"] = config.falloff_weight * mean_where_right(omega, beta, mask)
-    if config.overdraw_weight > 0.0:
+    if output.soft_overdraw is not None:
         terms["overdraw"] = config.overdraw_weight * mean_where_right(omega, output.soft_overdraw, mask)
     return terms
 

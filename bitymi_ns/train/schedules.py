@@ -101,6 +101,13 @@ class Schedule:
         """Whether the multi-view prune of the finished geometry takes place after this step."""
         return step in self.final_prune_steps
 
+    def overdraw_counts(self, step: int) -> bool:
+        """Whether the overdraw loss is part of this step's objective."""
+        loss = self.config.loss
+        return loss.overdraw_weight > 0.0 and (
+            self.scaled(loss.overdraw_start) <= step < self.scaled(loss.overdraw_stop)
+        )
+
     def after_first_reset(self, step: int) -> bool:
         """Whether the first opacity reset is over: from then on size on screen counts for pruning."""
         return step > self.reset_every

@@ -142,7 +142,7 @@ def training_step(
     view = at_size(View(camera, image, mask), camera.scaled(factor) if factor < 1.0 else camera, device)
     background = background_color(config.background, config.seed, step, device)
     mode = "train" if schedule.field_trains(step) else "frozen"
-    half = config.loss.overdraw_half if config.loss.overdraw_weight > 0.0 else None
+    half = config.loss.overdraw_half if schedule.overdraw_counts(step) else None
     output = scene.render(view.camera, background=background, field_mode=mode, overdraw_half=half)
     target = over_background(view.image, background)
     terms = objective(output, target, scene.surfels["beta_raw"], config.loss, view.mask)

@@ -112,3 +112,12 @@ def test_short_runs_learn_faster() -> None:
         assert short.lr(name, 0) == pytest.approx(10**0.35 * long.lr(name, 0))
         assert tiny.lr(name, 0) == pytest.approx(4 * long.lr(name, 0))
     assert short.lr("field_mlp", 2999) == pytest.approx(long.lr("field_mlp", 59_999))
+
+
+def test_the_overdraw_loss_counts_in_its_share_of_the_run() -> None:
+    config = TrainConfig()
+    assert fired(Schedule(config, 100), "overdraw_counts") == []
+    config.loss.overdraw_weight = 0.003
+    assert fired(Schedule(config, 100), "overdraw_counts") == list(range(40, 90))
+    config.loss.overdraw_start, config.loss.overdraw_stop = 0, 30_000
+    assert fired(Schedule(config, 50), "overdraw_counts") == list(range(50))

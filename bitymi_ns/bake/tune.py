@@ -38,7 +38,7 @@ class TuneOptions:
 
     steps: int = 400
     """Steps; each looks at one training view."""
-    rate: float = 0.1
+    rate: float = 0.05
     """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
     prior: float = 1.0
     """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
@@ -49,7 +49,7 @@ class TuneOptions:
     """Every so-many-th training view is set aside; the texels kept are those that show these best."""
     checks: int = 16
     """How often these views are looked at over the run."""
-    patience: int = 4
+    patience: int = 6
     """Looks without a gain after which the run ends."""
     cache_bytes: int = 4 << 30
     """Memory for the fragments of the views; what does not fit is traced anew at every step."""

@@ -6,23 +6,16 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops import Bands
-from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
+from bitymi_ns.scene import Camera, Scene
 from tests.ops.golden import random_scene
+from tests.scene.small import scene_of
 
 WIDTH, HEIGHT = 24, 150
 """Ten rows of tiles, the last one cut off."""
 
 
 def make(device: torch.device, most: int, **options: object) -> tuple[Scene, Camera]:
-    case = random_scene(60, 5, WIDTH, HEIGHT)
-    config = SceneConfig(min_resolution=8, max_fragments=most, **options)
-    g = torch.Generator().manual_seed(0)
-    field = HashField(config, (0.1, -0.2, 0.3), 3.0, True, 8, g)
-    with torch.no_grad():
-        for parameter in field.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=g) * 0.5)
-    scene = Scene(config, case.params, field).to(device, torch.float64)
-    return scene, Camera(case.viewmat, case.K, WIDTH, HEIGHT).to(device)
+    return scene_of(random_scene(60, 5, WIDTH, HEIGHT), device, max_fragments=most, **options)
 
 
 def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Tensor]]:

@@ -17,7 +17,7 @@ from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import Range, encode
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import VIEW_COLORS
-from tests.ops.test_kernels import lean_parameters
+from tests.ops.test_view_color import lean_parameters
 
 
 def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):

@@ -9,7 +9,8 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
-from tests.ops.test_kernels import lean_parameters, relative
+from tests.ops.test_kernels import relative
+from tests.ops.test_view_color import lean_parameters
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 TERMS = {"sv": (7, 3), "sh": (16, 4), "sb": (2, 5), "sg": (2, 3)}

@@ -22,8 +22,8 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
-from tests.ops.golden import SceneCase, extreme_scenes, load_golden, random_scene
-from tests.ops.test_kernels import lean_parameters
+from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
+from tests.ops.test_view_color import lean_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 STEP = 1 / 255
@@ -82,14 +82,8 @@ def check(scene: BakedScene, camera: Camera, device: torch.device, cpu, backgrou
 
 def test_golden_textured_scene(device: torch.device, cpu) -> None:
     golden = load_golden("textured")
-    atlas, tiles, x = torch.zeros(1, 64, 1024, 4), [], 0
-    for tile in golden.tiles:
-        rows, columns = tile.shape[:2]
-        atlas[0, :rows, x : x + columns, :3] = tile.float()
-        tiles.append((x, 0, 0, columns, rows))
-        x += columns
     params = {name: value.float() for name, value in golden.params.items()}
-    scene = BakedScene(params, "sv", torch.tensor(tiles, dtype=torch.int32), atlas)
+    scene = BakedScene(params, "sv", *atlas_of(golden))
     check(scene, camera_of(golden), device, cpu, golden.background.float())
     got = scene.to(device).render(camera_of(golden), golden.background.float().to(device), maps=True)
     assert (got.rgb.cpu().double() - golden.outputs["rgb"]).abs().max() < STEP

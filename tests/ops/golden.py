@@ -77,6 +77,17 @@ def load_golden(name: str) -> Golden:
     )
 
 
+def atlas_of(golden: Golden) -> tuple[Tensor, Tensor]:
+    """The tiles [N, 5] int32 of a textured scene, side by side on one page [1, 64, 1024, 4] float32."""
+    atlas, tiles, x = torch.zeros(1, 64, 1024, 4), [], 0
+    for tile in golden.tiles:
+        rows, columns = tile.shape[:2]
+        atlas[0, :rows, x : x + columns, :3] = tile.float()
+        tiles.append((x, 0, 0, columns, rows))
+        x += columns
+    return torch.tensor(tiles, dtype=torch.int32), atlas
+
+
 def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
     """The camera of a case."""
     return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)

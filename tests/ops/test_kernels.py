@@ -10,10 +10,9 @@ from bitymi_ns import ops
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
-from bitymi_ns.ops.view_color import LEAN_WIDTH, check_lean
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.golden import GOLDEN_NAMES, SV_KEYS, SceneCase, load_golden, random_scene
+from tests.ops.golden import GOLDEN_NAMES, SV_KEYS, SceneCase, atlas_of, load_golden, random_scene
 
 EXACT_RIM = 1e-12  # the references bound nothing
 OUTPUTS = {"rgb": "rgb", "alpha": "alpha", "depth": "depth", "beta_map": "beta"}
@@ -82,14 +81,8 @@ def test_golden_images_and_gradients(name: str, dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 def test_golden_textured_scene_through_the_baked_renderer(dtype: torch.dtype) -> None:
     golden = load_golden("textured")
-    atlas, tiles, x = torch.zeros(1, 64, 1024, 4), [], 0
-    for tile in golden.tiles:
-        rows, columns = tile.shape[:2]
-        atlas[0, :rows, x : x + columns, :3] = tile.float()
-        tiles.append((x, 0, 0, columns, rows))
-        x += columns
     params = {key: value.to(dtype) for key, value in golden.params.items()}
-    scene = BakedScene(params, "sv", torch.tensor(tiles, dtype=torch.int32), atlas, weight_bound=0.0)
+    scene = BakedScene(params, "sv", *atlas_of(golden), weight_bound=0.0)
     camera = Camera(golden.viewmat.to(dtype), golden.K.to(dtype), golden.width, golden.height)
     output = scene.render(camera, golden.background.to(dtype), maps=True)
     for key, image in images(output).items():
@@ -186,103 +179,6 @@ def test_depth_and_uv_gradients_of_the_trace_by_finite_differences() -> None:
         return sum((part * weight).sum() for part, weight in zip(parts, weights, strict=True))
 
     assert torch.autograd.gradcheck(function, values, eps=1e-7, atol=1e-5, rtol=1e-4)
-
-
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_view_colors_against_the_reference_and_gradcheck(kind: str) -> None:
-    g = torch.Generator().manual_seed(5)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
-    n = 7
-    params = {
-        "sv": {"sv_sites": normal(n, 7, 3), "sv_log_tau": normal(n, 7), "sv_rgb": normal(n, 7, 3)},
-        "sh": {"sh_dc": normal(n, 3), "sh_rest": normal(n, 15, 3)},
-        "sb": {"sb_base": normal(n, 3), "sb_lobes": normal(n, 2, 6)},
-        "sg": {"sg_base": normal(n, 3), "sg_lobes": normal(n, 2, 7)},
-    }[kind]
-    means, center = normal(n, 3), normal(3)
-    directions = torch.nn.functional.normalize(means - center, dim=-1)
-    want = getattr(reference_view_color, kind)(*params.values(), directions)
-    torch.testing.assert_close(ops.view_color(kind, params, means, center), want, rtol=1e-10, atol=1e-12)
-    single = {name: value.float() for name, value in params.items()}
-    got = ops.view_color(kind, single, means.float(), center.float())
-    torch.testing.assert_close(got.double(), want, rtol=2e-5, atol=2e-5)
-
-    leaves = [value.clone().requires_grad_() for value in (means, *params.values())]
-
-    def function(x: Tensor, *values: Tensor) -> Tensor:
-        return ops.view_color(kind, dict(zip(params, values, strict=True)), x, center)
-
-    assert torch.autograd.gradcheck(function, leaves, eps=1e-6, atol=1e-6, rtol=1e-4)
-
-
-def lean_parameters(kind: str, n: int, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
-    """Lean colours with 0, 1, 2, ... terms, or those of whole degrees; the terms of the last surfel come first."""
-    g = torch.Generator().manual_seed(6)
-    counts = torch.tensor([(0, 3, 8, 15)[i % 4] if kind == "sh" else i % 7 for i in range(n)])
-    ends = counts.flip(0).cumsum(0).flip(0)
-    total = int(counts.sum())
-    return {
-        "view_base": torch.randn(n, 3, generator=g, dtype=torch.float64).to(dtype),
-        "view_span": torch.stack([ends - counts, counts], dim=1).int(),
-        "view_terms": torch.randn(total, LEAN_WIDTH[kind], generator=g, dtype=torch.float64).to(dtype),
-    }
-
-
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_lean_view_colors_against_the_reference(kind: str) -> None:
-    n = 15
-    g = torch.Generator().manual_seed(7)
-    means, center = torch.randn(n, 3, generator=g, dtype=torch.float64), torch.randn(3, generator=g).double()
-    directions = torch.nn.functional.normalize(means - center, dim=-1)
-    params = lean_parameters(kind, n)
-    check_lean(kind, params, n)
-    want = reference_view_color.lean(kind, *params.values(), directions)
-    torch.testing.assert_close(ops.view_color(kind, params, means, center), want, rtol=1e-10, atol=1e-12)
-    got = ops.view_color(kind, lean_parameters(kind, n, torch.float32), means.float(), center.float())
-    torch.testing.assert_close(got.double(), want, rtol=2e-5, atol=2e-5)
-
-
-def test_lean_spherical_voronoi_is_the_same_colour_relative_to_its_first_site() -> None:
-    g = torch.Generator().manual_seed(8)
-    n = 9
-    sites, log_tau, rgb = (torch.randn(n, 7, *s, generator=g, dtype=torch.float64) for s in ((3,), (), (3,)))
-    log_tau[0] = 9.0  # one site takes all
-    vectors = torch.nn.functional.normalize(sites, dim=-1) * log_tau.exp()[..., None]
-    terms = torch.cat([vectors[:, 1:] - vectors[:, :1], rgb[:, 1:]], dim=-1)
-    span = torch.stack([6 * torch.arange(n), torch.full((n,), 6)], dim=1).int()
-    lean = {"view_base": rgb[:, 0].contiguous(), "view_span": span, "view_terms": terms.flatten(0, 1)}
-    means, center = torch.randn(n, 3, generator=g, dtype=torch.float64), torch.zeros(3)
-    full = {"sv_sites": sites, "sv_log_tau": log_tau, "sv_rgb": rgb}
-    want = ops.view_color("sv", full, means, center)
-    torch.testing.assert_close(ops.view_color("sv", lean, means, center), want, rtol=1e-9, atol=1e-9)
-    active = torch.arange(n) % 2 == 0
-    assert not ops.view_color("sv", lean, means, center, active)[~active].any()
-
-
-def test_lean_view_colors_whose_terms_are_not_there_are_refused() -> None:
-    good = lean_parameters("sv", 5)
-    for row, value in ((0, -1), (0, 100), (1, -1), (1, 33)):
-        bad = {**good, "view_span": good["view_span"].clone()}
-        bad["view_span"][4, row] = value
-        with pytest.raises(ValueError, match="surfel 4"):
-            check_lean("sv", bad, 5)
-        with pytest.raises(ValueError, match="surfel 4"):
-            ops.view_color("sv", bad, torch.rand(5, 3).double(), torch.zeros(3))
-    with pytest.raises(ValueError, match="view_terms must be"):
-        check_lean("sg", good, 5)
-    with pytest.raises(ValueError, match="surfel 1"):
-        check_lean("sh", lean_parameters("sh", 2) | {"view_span": torch.tensor([[0, 0], [0, 2]]).int()}, 2)
-
-
-def test_view_colors_of_inactive_surfels_are_zero() -> None:
-    params = {"sh_dc": torch.ones(3, 3, requires_grad=True), "sh_rest": torch.ones(3, 15, 3)}
-    active = torch.tensor([True, False, True])
-    color = ops.view_color("sh", params, torch.rand(3, 3), torch.tensor([0.0, 0.0, -2.0]), active)
-    color.sum().backward()
-    assert not color[1].any() and not params["sh_dc"].grad[1].any() and params["sh_dc"].grad[0].all()
 
 
 def make_field(contract: bool, dtype: torch.dtype, seed: int = 0, log2: int = 8) -> HashField:

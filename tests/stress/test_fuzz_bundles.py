@@ -21,7 +21,7 @@ from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import random_scene
-from tests.ops.test_kernels import lean_parameters
+from tests.ops.test_view_color import lean_parameters
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 60 * MORE

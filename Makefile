@@ -64,6 +64,9 @@ $(VENV)/.stamp-deps: $(VENV)/.stamp-torch constraints.txt pyproject.toml scripts
 	@$(PIP) install -qq -c constraints.txt nerfstudio==1.1.5 scikit-build-core nanobind cmake ninja \
 	  $$($(BIN)/python scripts/requirements.py)
 	$(BIN)/python scripts/torchvision_remedy.py
+	@$(BIN)/python -c 'import open3d' || { \
+	  echo "open3d, which nerfstudio reads point clouds with, lacks a library of the system (last line above)." >&2; \
+	  echo "On Debian and Ubuntu: apt install libgl1 libx11-6 libudev1 libgomp1" >&2; exit 1; }
 	@touch $@
 
 # Editable: changes to Python are live, changes to C++ need another make (seconds: build/ is kept).

@@ -99,7 +99,7 @@ def _cases(n: int, width: int, height: int, device: torch.device) -> list[Case]:
     field, q = scene.field, scene.surfels
     assert field is not None
     with torch.no_grad():
-        projection = ops.project(*(q[name] for name in GEOMETRY), camera, scene.config.near)
+        projection = ops.project(*(q[name] for name in GEOMETRY), camera, scene.near)
         fragments = ops.trace(projection, scene.config.rim)
     bound = scene.config.weight_bound
     v, f = int(projection.visible.sum()), len(fragments)

@@ -151,7 +151,8 @@ def trained_like(
         surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
     else:
         surfels |= {"sh_dc": normal(n, 3), "sh_rest": 0.1 * normal(n, 15, 3)}
-    config = SceneConfig(view_color=view_color, sv_sites=SITES, texture="hash" if texture else "none")
+    texture_kind = "hash" if texture else "none"
+    config = SceneConfig(view_color=view_color, sv_sites=SITES, texture=texture_kind, near=0.2)
     field = None
     if texture:
         field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, LOG2_TABLE, g)

@@ -67,7 +67,7 @@ def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tupl
     geometry = tuple(q[name] for name in GEOMETRY)
 
     def project() -> ops.Projection:
-        return ops.project(*geometry, camera, scene.config.near)
+        return ops.project(*geometry, camera, scene.near)
 
     projection = project()
     geom = projection.geom.detach()

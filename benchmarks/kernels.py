@@ -168,7 +168,7 @@ def synthetic(n: int, width: int, height: int) -> tuple[Scene, Camera]:
         "sv_log_tau": torch.zeros(n, SITES),
         "sv_rgb": uniform(n, SITES, 3) - 0.5,
     }
-    config = SceneConfig(view_color="sv", sv_sites=SITES, levels=LEVELS)
+    config = SceneConfig(view_color="sv", sv_sites=SITES, levels=LEVELS, near=0.2)
     field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, LOG2_TABLE, generator)
     with torch.no_grad():
         field.field_w3.copy_(0.1 * normal(*field.field_w3.shape))  # starts at zero
@@ -220,7 +220,7 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
     geometry = (q["means"], q["quats"], q["log_scales"], q["opacity_logits"], q["beta_raw"])
 
     def project() -> ops.Projection:
-        return ops.project(*geometry, camera, scene.config.near)
+        return ops.project(*geometry, camera, scene.near)
 
     projection = project()
     fragments = ops.trace(projection, scene.config.rim)

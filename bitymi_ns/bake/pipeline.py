@@ -38,7 +38,8 @@ class BakeableScene(Protocol):
 
     surfels: Mapping[str, Tensor]
     field: Field | None
-    config: Any  # near, weight_bound, prefilter
+    near: float
+    config: Any  # weight_bound, prefilter
 
 
 @dataclass
@@ -115,7 +116,7 @@ def bake(
     options.check()
     started = time.perf_counter()
     kept, left_out = _drawable(scene.surfels)
-    near = float(getattr(scene.config, "near", 0.2))
+    near = scene.near
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
     prefilter = str(getattr(scene.config, "prefilter", "low_pass"))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}

@@ -154,6 +154,12 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
     """Errors of nerfstudio's loaders as one clear message."""
     try:
         yield
+    except ImportError as error:
+        fail(
+            f"nerfstudio's reader of this capture cannot be loaded: {error}. If that names a library (lib....so), "
+            "install the system's package of it; if a module, install it with pip.",
+            error,
+        )
     except (AssertionError, OSError, LookupError, ValueError, TypeError, ArithmeticError, RuntimeError) as error:
         data = config.data if config.data is not None else config.dataparser.data
         detail = " ".join(str(error).split()) or type(error).__name__

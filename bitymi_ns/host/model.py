@@ -139,6 +139,7 @@ class BitymiModel(SurfelModel):
     def get_extra_state(self) -> dict[str, Any]:
         """Tensors, numbers and text only, so that torch loads it in its safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
+        state["near"] = self.scene.near
         if self._run:
             state["trained_for"] = self._run[0].total
             state["run"] = self._run[0].state()
@@ -149,6 +150,8 @@ class BitymiModel(SurfelModel):
     def set_extra_state(self, state: Any) -> None:
         self.trained_for = state.get("trained_for")
         self.resume_state = state.get("run", {})
+        if self.config.scene.near is None:
+            self.scene.near = state.get("near", 0.2)  # older checkpoints: what all scenes had
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Load a checkpoint (`checkpoints.load` has checked that it belongs to this preset), whatever its number of

@@ -28,8 +28,8 @@ class SceneConfig:
     """Entries a hash level, as a power of two, 1 to 24; not given: as the photographs and the cache ask for."""
     contraction: Literal["auto", "on", "off"] = "auto"
     """Contraction of space beyond the cameras; auto: off for images with alpha, and where a small box is declared."""
-    near: float = 0.2
-    """Nearest depth that is drawn, in scene units (camera z), above 0."""
+    near: float | None = None
+    """Nearest depth that is drawn, in scene units (camera z), above 0; not given: 0.02 of the extent of the cameras."""
     weight_bound: float = 0.02
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
     texture_moves_surfels: bool = False

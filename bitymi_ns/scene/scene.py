@@ -32,6 +32,8 @@ from .field import HashField
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 """Names of the per-surfel parameters that every scene has."""
+NEAR = 0.02
+"""Nearest depth that is drawn, for cameras of extent 1."""
 
 
 @dataclass
@@ -71,12 +73,15 @@ class Scene(nn.Module):
         config: the representation.
         surfels: initial per-surfel parameters by name (docs/architecture.md), first dimension N each.
         field: residual colour field, None = surfels alone.
+        near: nearest drawn depth, camera z, where the configuration does not give it.
 
     Raises:
         ValueError: a parameter is missing or does not belong to the chosen view colour.
     """
 
-    def __init__(self, config: SceneConfig, surfels: Mapping[str, Tensor], field: HashField | None) -> None:
+    def __init__(
+        self, config: SceneConfig, surfels: Mapping[str, Tensor], field: HashField | None, near: float = NEAR
+    ) -> None:
         super().__init__()
         names = (*GEOMETRY, *VIEW_COLORS[config.view_color])
         if set(surfels) != set(names):
@@ -84,6 +89,7 @@ class Scene(nn.Module):
         self.config = config
         self.surfels = nn.ParameterDict({name: nn.Parameter(surfels[name].detach().clone()) for name in names})
         self.field = field
+        self.near = near if config.near is None else config.near
 
     def __len__(self) -> int:
         return self.surfels["means"].shape[0]
@@ -128,9 +134,7 @@ class Scene(nn.Module):
             TooManyFragments: a single row of tiles has too many.
         """
         p = self.surfels
-        projection = project(
-            *(p[name] for name in GEOMETRY), camera, self.config.near, self.config.prefilter == "pixel"
-        )
+        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter == "pixel")
         geometry, weights = None, ()
         if self.field is not None and field_mode != "off":
             geometry, weights = self.field.geometry, self.field.weights

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.scene.scene import Scene
+from bitymi_ns.scene.scene import NEAR, Scene
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import PointReport, scene_extent, surfels_from_points
 
@@ -50,9 +50,10 @@ def build_scene(
     """
     check_representation(scene_config)
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
-    if scene_config.texture == "none":
-        return Scene(scene_config, surfels, None), report
     means = surfels["means"]
+    near = NEAR * scene_extent(camera_centers, means)
+    if scene_config.texture == "none":
+        return Scene(scene_config, surfels, None, near), report
     bounded = bounded or (declared is not None and box_is_small(declared, camera_centers))
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
     mid, half = field_domain(means if declared is None else declared, camera_centers, contract)
@@ -61,7 +62,7 @@ def build_scene(
         log2_size = default_table_size(image_pixels)
     generator = torch.Generator().manual_seed(train_config.seed)
     field = HashField(scene_config, mid, half, contract, log2_size, generator)
-    return Scene(scene_config, surfels, field), report
+    return Scene(scene_config, surfels, field, near), report
 
 
 def check_representation(config: SceneConfig) -> None:
@@ -77,7 +78,7 @@ def check_representation(config: SceneConfig) -> None:
         "levels": (config.levels, 1, 4),
         "min_resolution": (config.min_resolution, 2, 1 << 20),
         "log2_table_size": (config.log2_table_size or 1, 1, 24),
-        "near": (config.near, 1e-6, math.inf),
+        "near": (1.0 if config.near is None else config.near, 1e-6, math.inf),
         "weight_bound": (config.weight_bound, 0.0, 1.0),
         "rim": (config.rim, 1e-8, 1.0),
     }

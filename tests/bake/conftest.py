@@ -70,6 +70,7 @@ def scene():
 
     def make(count: int = 200, field: object = "wave", kind: str = "sv", seed: int = 0) -> SimpleNamespace:
         field = WaveField() if field == "wave" else field
-        return SimpleNamespace(surfels=make_surfels(count, kind, seed), field=field, config=SimpleNamespace(near=0.25))
+        surfels = make_surfels(count, kind, seed)
+        return SimpleNamespace(surfels=surfels, field=field, near=0.25, config=SimpleNamespace())
 
     return make

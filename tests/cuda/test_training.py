@@ -20,7 +20,7 @@ STEPS = 3
 def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[View]]:
     """A few discs with a texture, and photographs of other colours."""
     case = random_scene(20, 5, width=20, height=16, scale=0.5)
-    config = SceneConfig(min_resolution=8)
+    config = SceneConfig(min_resolution=8, near=0.2)
     field = HashField(config, (0.0, 0.0, 0.0), 4.0, True, 6, torch.Generator().manual_seed(0))
     with torch.no_grad():
         field.field_w3.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))

@@ -241,6 +241,19 @@ def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTra
     assert eval_setup(folder / "config.yml")[3] == 59
 
 
+def test_the_near_plane_is_the_one_of_the_training(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    scene = eval_setup(trained.get_base_dir() / "config.yml")[1].model.scene
+    assert 0.02 < scene.near < 0.04  # nerfstudio scales the cameras to 1
+    folder = a_run_of(trained, tmp_path)
+    path = max((folder / "nerfstudio_models").iterdir())
+    state = torch.load(path, weights_only=True)
+    state["pipeline"]["_model._extra_state"]["near"] = 0.5
+    torch.save(state, path)
+    assert eval_setup(folder / "config.yml")[1].model.scene.near == 0.5
+    rewrite(folder, lambda config: setattr(config.pipeline.model.scene, "near", 0.1))
+    assert eval_setup(folder / "config.yml")[1].model.scene.near == 0.1
+
+
 @pytest.mark.parametrize(
     "method", ["bitymi-quality", "bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"]
 )

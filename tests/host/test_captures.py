@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,12 @@ def test_a_frame_without_pose(capture: Path, edit: Any) -> None:
 def test_intrinsics_missing(capture: Path, edit: Any) -> None:
     edit(capture, lambda meta: [meta.pop(key, None) for key in ("fl_x", "fl_y")])
     with expect("cannot be loaded: .*(fx|fl_x)"):
+        load(capture)
+
+
+def test_a_reader_of_nerfstudios_that_lacks_a_library(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with expect("reader of this capture cannot be loaded: .*open3d"):
         load(capture)
 
 

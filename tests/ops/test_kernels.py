@@ -20,7 +20,7 @@ OUTPUTS = {"rgb": "rgb", "alpha": "alpha", "depth": "depth", "beta_map": "beta"}
 
 def scene_of(case: SceneCase, dtype: torch.dtype, rim: float = EXACT_RIM) -> tuple[Scene, Camera]:
     params = {key: value.to(dtype) for key, value in case.params.items()}
-    scene = Scene(SceneConfig(texture="none", rim=rim), params, None)
+    scene = Scene(SceneConfig(texture="none", rim=rim, near=0.2), params, None)
     return scene, Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
 
 

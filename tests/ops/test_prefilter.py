@@ -128,7 +128,7 @@ def test_thin_needles_stay_well_conditioned() -> None:
 def test_a_baked_scene_is_drawn_as_the_trained_one(tmp_path: Path) -> None:
     case = random_scene(30, 6, scale=0.05)
     params = {key: value.float() for key, value in case.params.items()}
-    scene = Scene(SceneConfig(texture="none", prefilter="pixel"), params, None)
+    scene = Scene(SceneConfig(texture="none", prefilter="pixel", near=0.2), params, None)
     tiles = torch.zeros(30, 5, dtype=torch.int32)
     write_bundle(tmp_path / "bundle", params, tiles.numpy(), None, prefilter="pixel")
     baked = BakedScene.from_bundle(read_bundle(tmp_path / "bundle"))

@@ -10,7 +10,7 @@ from tests.ops.golden import SceneCase
 
 def scene_of(case: SceneCase, device: torch.device, texture: bool = True, **options: object) -> tuple[Scene, Camera]:
     """The case in float64, with a random field."""
-    config = SceneConfig(texture="hash" if texture else "none", min_resolution=8, **options)
+    config = SceneConfig(texture="hash" if texture else "none", min_resolution=8, near=0.2, **options)
     field = None
     if texture:
         g = torch.Generator().manual_seed(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene, check_representation, default_table_size, field_domain
@@ -51,6 +52,20 @@ def test_a_declared_box_is_the_domain_if_it_is_small(cloud) -> None:
 @pytest.mark.parametrize(("option", "bounded", "contract"), [("on", True, True), ("off", False, False)])
 def test_the_option_comes_before_what_the_capture_says(cloud, option, bounded, contract) -> None:
     assert build(cloud, bounded, contraction=option)[0].field.geometry.contract is contract
+
+
+def test_the_near_plane_follows_the_cameras_unless_it_is_given(cloud) -> None:
+    assert build(cloud)[0].near == pytest.approx(0.02 * 2.2)
+    assert build(cloud, texture="none")[0].near == pytest.approx(0.02 * 2.2)
+    assert build(cloud, near=0.3)[0].near == 0.3
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_the_unit_of_length_does_not_decide_what_is_seen(cloud, unit) -> None:
+    points = torch.tensor([[0.0, 0.0, 0.06], [0.0, 0.0, 0.03], [0.0, 0.0, 5.0]]) * unit
+    scene, _ = build_scene(points, cloud[1][:3], unit * CENTERS, SceneConfig(texture="none"), TrainConfig(), False, 0)
+    camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 8], [0, 9, 8], [0, 0, 1]]), 16, 16)
+    assert scene.render(camera).projection.visible.tolist() == [True, False, True]
 
 
 def test_a_domain_is_never_empty() -> None:

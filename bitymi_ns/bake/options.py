@@ -29,6 +29,9 @@ class BakeOptions:
     colour: the largest one at the directions of the training views that see it, and at others between and around them;
     it keeps as few Spherical Voronoi sites as that takes, or one colour (of other view colours all or one colour). 0:
     the sizes of the rule, and all of the view colours."""
+    local_voxel: bool = True
+    """Measure a tile against the field's voxels where the surfel is; False: against the smallest voxel of the scene, as
+    the paper's rule has it (which also has an extent of 4)."""
     cap_by_views: bool = True
     """Give no tile more texels than pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = True

@@ -18,6 +18,7 @@ from bitymi_ns.scene.camera import Camera
 SUPPORT = 3.0  # radius of the kernel in scale units
 ALPHA_MAX = 0.99
 STEPS = 255.0  # 8-bit steps in a colour of 1
+PAPER_EXTENT = 4.0  # e of the paper's rule
 MARGIN = 1.5
 """Held-out views may see more of a surfel than the training views do: its transmittance is taken this much larger."""
 
@@ -50,8 +51,8 @@ class Plan:
         probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
         limit: [N, 2] int32, the finest tile of use, at most `probes`.
         weight_bound: fragments of smaller weight get no residual.
-        texels: how many texels the rules before the tolerance give: nyquist (the paper's), after_cap_by_views, and
-            within_visible_part, where tiles cover `extent` only.
+        texels: how many texels the rules before the tolerance give: paper (one voxel size, extent 4), nyquist (the
+            options' own), after_cap_by_views, and within_visible_part, where tiles cover `extent` only.
     """
 
     means: Tensor
@@ -118,7 +119,8 @@ def make_plan(
     if options.tolerance > 0:
         extent = torch.minimum(extent, visible_extent(opacity, beta, weight_bound))
     voxel = torch.cat([field.voxel_size(part) for part in means.split(options.chunk)])
-    delta = voxel_along_axes(voxel, axes, means, _center(field))
+    finest = voxel.amin().expand(len(means), 2)  # the paper's delta
+    delta = voxel_along_axes(voxel, axes, means, _center(field)) if options.local_voxel else finest
     pixels = None
     if cameras and options.cap_by_views:
         pixels = max_projected_extent(means, axes, scales, cameras, options.extent, near)[0]
@@ -131,7 +133,12 @@ def make_plan(
     limit = grids(share, pixels)
     probes = grids(share, None) if options.tolerance > 0 else limit
     whole = torch.ones_like(share)
-    texels = {"nyquist": grids(whole, None), "after_cap_by_views": grids(whole, pixels), "within_visible_part": limit}
+    texels = {
+        "paper": nyquist_resolution(scales, finest, PAPER_EXTENT, options.r_min, options.r_max),
+        "nyquist": grids(whole, None),
+        "after_cap_by_views": grids(whole, pixels),
+        "within_visible_part": limit,
+    }
     counts = {name: int(sizes.long().prod(1).sum()) for name, sizes in texels.items()}
     edges = axes * scales[:, None, :]
     return Plan(means, edges, opacity, beta, extent, probes, limit, weight_bound, counts)

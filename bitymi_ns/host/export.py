@@ -55,7 +55,7 @@ class ExportAtlas(BakeOptions):
     overwrite: bool = False
     """Replace a bundle that is there already."""
     exact: bool = False
-    """Keep everything: the paper's rule for the size of every tile, no cap by views, no surfel dropped as unseen, all
+    """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
     finetune_steps: int = TuneOptions.steps
     """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
@@ -285,11 +285,12 @@ def print_savings(table: Table, info: dict[str, Any]) -> None:
     error = statistics.get("error") or statistics["finetune"]["error_before"]
     kept, count = texels["kept"], info["surfels"]["count"]
     table.add_row("Tiles", f"{statistics['surfels']['trained']:,} -> {count - statistics['surfels']['without_tile']:,}")
-    table.add_row("Texels by the paper's rule", f"{texels['nyquist']:,}")
+    table.add_row("Texels by the paper's rule", f"{texels['paper']:,}")
+    table.add_row("... by the voxels where they are", f"{texels['nyquist']:,}")
     table.add_row("... no finer than a view sees", f"{texels['after_cap_by_views']:,}")
     table.add_row("... only where they are seen", f"{texels['within_visible_part']:,}")
-    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels['nyquist']):.1f} %)")
-    rule = texels["nyquist"] * BYTES_PER_TEXEL[statistics["options"]["format"]]
+    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels['paper']):.1f} %)")
+    rule = texels["paper"] * BYTES_PER_TEXEL[statistics["options"]["format"]]
     stored = info["files"][info["atlas"]["file"]]["bytes"] if info["atlas"] else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     tolerance = f"tolerance {error['tolerance']:g}" if error["tolerance"] else "no tolerance"

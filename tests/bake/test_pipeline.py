@@ -82,6 +82,17 @@ def test_views_cap_the_tiles_and_say_what_that_saved(scene, camera):
     assert bake(made, [], rule).statistics["texels"] == free  # no views, no cap
 
 
+def test_the_papers_rule_has_one_voxel_size_and_wider_tiles(scene):
+    made = scene(200)
+    made.field.voxel_size = lambda x: (0.02 * (1 + x.square().sum(-1, keepdim=True))).expand(-1, 2)
+    rule = BakeOptions(tolerance=0, drop_unseen=False, cap_by_views=False, r_max=1024)
+    local = bake(made, [], rule).statistics["texels"]
+    finest = bake(made, [], replace(rule, local_voxel=False)).statistics["texels"]
+    paper = bake(made, [], replace(rule, local_voxel=False, extent=4.0)).statistics["texels"]
+    assert local["kept"] < finest["kept"] < paper["kept"]
+    assert paper["kept"] == paper["nyquist"] == paper["paper"] == finest["paper"] == local["paper"]
+
+
 def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     made = scene(50)
     made.surfels["means"] *= 0.3

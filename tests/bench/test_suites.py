@@ -86,7 +86,7 @@ def test_plans_name_methods_that_there_are(name: str) -> None:
 
 def test_the_atlas_plan_compares_rules_of_one_run() -> None:
     rows, bundles = read_plan("atlas")
-    assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "view-cap"]
+    assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "local-voxel"]
     assert all("--format bc7" in " ".join(b.options) for b in bundles)
 
 

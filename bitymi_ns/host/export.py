@@ -94,14 +94,15 @@ class ExportAtlas(BakeOptions):
                 baked = bake(model.scene, views, options, progress)
                 if self.finetune_steps and not self.exact and baked.atlas is not None:
                     photos = photographs(views, datamanager.train_view)
-                    held_out = [to_camera(datamanager.eval_view(i)[0]) for i in range(len(datamanager.eval_dataset))]
+                    shown = range(len(datamanager.eval_dataset) if self.compare else 0)
+                    held_out = [to_camera(datamanager.eval_view(i)[0]) for i in shown]
                     baked = tune_atlas(
                         baked,
                         photos,
                         model.background.cpu(),
                         TuneOptions(steps=self.finetune_steps),
                         progress,
-                        photographs(held_out, datamanager.eval_view) if self.compare else (),
+                        photographs(held_out, datamanager.eval_view),
                     )
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)

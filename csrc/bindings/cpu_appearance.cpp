@@ -1,8 +1,8 @@
 // View colours, the residual field at points and at fragments, texels, and SSIM.
 #include <nanobind/stl/string.h>
-#include <nanobind/stl/tuple.h>
 
 #include "bindings/cpu.h"
+#include "bindings/field.h"
 
 namespace bt {
 namespace {
@@ -23,33 +23,7 @@ void check_spans(const int32_t* span, int64_t n, int64_t size, int width) {
 }
 
 template <class S>
-struct Field {
-  FieldArrays<S> arrays;
-  Array<const S> table, w1, w2, w3;  // keeps them alive
-  Field(Array<const S> table_, Array<const S> w1_, Array<const S> w2_, Array<const S> w3_, int levels, int log2_size,
-        int min_resolution, bool contract, std::tuple<double, double, double> mid, double half)
-      : table(table_), w1(w1_), w2(w2_), w3(w3_) {
-    if (levels < 1 || levels > 4 || log2_size < 4 || log2_size > 28)
-      throw std::invalid_argument("a field has 1 to 4 levels and 2^4 to 2^28 entries a level");
-    arrays = {levels,
-              log2_size,
-              min_resolution,
-              contract,
-              {S(std::get<0>(mid)), S(std::get<1>(mid)), S(std::get<2>(mid))},
-              S(half),
-              data(table, (int64_t(levels) << log2_size) * 4, "table"),
-              data(w1, levels * 64, "w1"),
-              data(w2, 256, "w2"),
-              data(w3, 48, "w3")};
-  }
-  int64_t entries() const { return (int64_t(arrays.levels) << arrays.log2_size) * 4; }
-};
-template <class S>
-FieldGradients<S> field_gradients(const Field<S>& field, const Array<S>& table, const Array<S>& w1, const Array<S>& w2,
-                                  const Array<S>& w3) {
-  return {data(table, field.entries(), "dtable"), data(w1, field.arrays.levels * 64, "dw1"), data(w2, 256, "dw2"),
-          data(w3, 48, "dw3")};
-}
+using Field = FieldHandle<S, nb::device::cpu, sizeof(S)>;
 
 template <class S>
 void bind(nb::module_& m, const char* suffix) {
@@ -110,10 +84,7 @@ void bind(nb::module_& m, const char* suffix) {
       "center"_a.noconvert(), "active"_a.noconvert(), "dout"_a.noconvert(), "da"_a.noconvert(), "db"_a.noconvert(),
       "dc"_a.noconvert().none(), "dmeans"_a.noconvert());
 
-  nb::class_<Field<S>>(m, name("Field").c_str())
-      .def(nb::init<In, In, In, In, int, int, int, bool, std::tuple<double, double, double>, double>(),
-           "table"_a.noconvert(), "w1"_a.noconvert(), "w2"_a.noconvert(), "w3"_a.noconvert(), "levels"_a, "log2_size"_a,
-           "min_resolution"_a, "contract"_a, "mid"_a, "half"_a);
+  bind_field_class<Field<S>>(m, name("Field"));
   m.def(
       name("field_forward").c_str(),
       [](const Field<S>& field, In x, Out rho) {
@@ -129,7 +100,7 @@ void bind(nb::module_& m, const char* suffix) {
         const int64_t n = int64_t(x.size()) / 3;
         const S* g = data(drho, 3 * n, "drho");
         S* to = data_or_null(dx, 3 * n, "dx");
-        const FieldGradients<S> out = field_gradients(field, dtable, dw1, dw2, dw3);
+        const FieldGradients<S> out = field.gradients(dtable, dw1, dw2, dw3);
         nb::gil_scoped_release release;
         field_backward(n, field.arrays, x.data(), g, out, to);
       },
@@ -163,7 +134,7 @@ void bind(nb::module_& m, const char* suffix) {
         S* df = data_or_null(dframes, n * kFrame, "dframes");
         FieldGradients<S> out = {};
         const bool learn = field && dtable && dw1 && dw2 && dw3;
-        if (learn) out = field_gradients(*field, *dtable, *dw1, *dw2, *dw3);
+        if (learn) out = field->gradients(*dtable, *dw1, *dw2, *dw3);
         if ((du != nullptr) != (df != nullptr) || (du && !learn))
           throw std::invalid_argument("duv and dframes come together, with the field's gradients");
         nb::gil_scoped_release release;

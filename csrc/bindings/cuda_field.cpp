@@ -1,43 +1,14 @@
 // The residual field: at points, at fragments and at texels.
-#include <nanobind/stl/tuple.h>
 
 #include "bindings/cuda.h"
+#include "bindings/field.h"
 #include "cuda/field.h"
 
 namespace bt::cuda {
 namespace {
 
-// The kernels' view of the field's parameters; keeps them alive.
 template <class S>
-struct Field {
-  FieldArrays<S> arrays;
-  Array<const S> table, w1, w2, w3;
-  Field(Array<const S> table_, Array<const S> w1_, Array<const S> w2_, Array<const S> w3_, int levels, int log2_size,
-        int min_resolution, bool contract, std::tuple<double, double, double> mid, double half)
-      : table(table_), w1(w1_), w2(w2_), w3(w3_) {
-    if (levels < 1 || levels > kMaxLevels || log2_size < 0 || log2_size > 28)
-      throw std::invalid_argument("a field has 1 to 4 levels and at most 2^28 entries a level");
-    const int64_t inputs = levels * kFeatures;
-    arrays = {levels,
-              log2_size,
-              min_resolution,
-              contract,
-              {S(std::get<0>(mid)), S(std::get<1>(mid)), S(std::get<2>(mid))},
-              S(half),
-              rows(table, entries(levels, log2_size), "table"),
-              data(w1, inputs * kWidth, "w1"),
-              data(w2, kWidth * kWidth, "w2"),
-              data(w3, kWidth * 3, "w3")};
-  }
-  static int64_t entries(int levels, int log2_size) { return (int64_t(levels) << log2_size) * kFeatures; }
-  int64_t entries() const { return entries(arrays.levels, arrays.log2_size); }
-  FieldGradients<S> gradients(const Array<S>& table_, const Array<S>& w1_, const Array<S>& w2_,
-                              const Array<S>& w3_) const {
-    rows(Array<const S>(table_), entries(), "dtable");
-    return {table_.data(), data(w1_, arrays.levels * kFeatures * kWidth, "dw1"), data(w2_, kWidth * kWidth, "dw2"),
-            data(w3_, kWidth * 3, "dw3")};
-  }
-};
+using Field = FieldHandle<S, Where, 16>;  // kernels read the table 16 bytes at a time
 
 constexpr int64_t kRange = 8;  // numbers of ExactRange
 
@@ -53,10 +24,7 @@ void bind(nb::module_& m, const char* suffix) {
   using Out = Array<S>;
   using Ints = Array<int32_t>;
 
-  nb::class_<Field<S>>(m, name("Field").c_str())
-      .def(nb::init<In, In, In, In, int, int, int, bool, std::tuple<double, double, double>, double>(),
-           "table"_a.noconvert(), "w1"_a.noconvert(), "w2"_a.noconvert(), "w3"_a.noconvert(), "levels"_a, "log2_size"_a,
-           "min_resolution"_a, "contract"_a, "mid"_a, "half"_a);
+  bind_field_class<Field<S>>(m, name("Field"));
   m.def(
       name("field_forward").c_str(),
       [](const Field<S>& field, In x, Out rho, uintptr_t stream) {

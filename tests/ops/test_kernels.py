@@ -215,6 +215,12 @@ def test_field_against_the_reference(contract: bool, count: int) -> None:
     torch.testing.assert_close(single(x.float()).double(), field_reference(single, x.float()), rtol=1e-3, atol=1e-3)
 
 
+def test_the_smallest_table() -> None:
+    x = torch.randn(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    field = make_field(True, torch.float64, log2=1)
+    torch.testing.assert_close(field(x), field_reference(field, x), rtol=1e-10, atol=1e-11)
+
+
 @pytest.mark.parametrize("contract", [True, False])
 def test_field_gradients_by_finite_differences(contract: bool) -> None:
     field = make_field(contract, torch.float64, log2=5)

@@ -1,8 +1,9 @@
 # make setup   virtual environment, pinned dependencies, compiled extension
 # make demo    train, bake and evaluate the sample scene (or DATA=folder) into demo/
 # make test    the test suite
-# make bench   quality, speed and size on the demo scene and on your captures, with a report (hours; it resumes):
-#              make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"] [METHODS="bitymi bitymi-quality"]
+# make bench   quality, speed, size and stability on the demo scene and on your captures, with a report (hours; training
+#              and baking resume): make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"]
+#              [METHODS="bitymi bitymi-quality"] [PLANS="atlas overdraw"]
 # make sanitize  the kernels' tests under the address and undefined-behaviour sanitizers (minutes)
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
@@ -15,6 +16,7 @@ DATA   ?=
 STEPS  ?=
 SEEDS  ?=
 METHODS ?= bitymi bitymi-quality
+PLANS  ?= atlas overdraw
 WORK   ?= outputs/bench
 TESTS  ?= tests/ops tests/stress tests/scene
 
@@ -89,9 +91,15 @@ sanitize: setup
 $(WORK)/captures/demo/transforms.json: | setup
 	$(BIN)/bitymi sample --output-dir $(@D)
 
+MATRIX = $(BIN)/bitymi bench local --data $(WORK)/captures/demo $(DATA) --work $(WORK) \
+  $(if $(STEPS),--steps $(STEPS)) $(if $(SEEDS),--seeds $(SEEDS))
+
 bench: setup $(WORK)/captures/demo/transforms.json
-	$(BIN)/bitymi bench local --data $(WORK)/captures/demo $(DATA) --methods $(METHODS) --knobs --work $(WORK) \
-	  $(if $(STEPS),--steps $(STEPS)) $(if $(SEEDS),--seeds $(SEEDS)) --output $(WORK)/captures.md
+	$(MATRIX) --methods $(METHODS) --knobs --output $(WORK)/captures.md
+	for plan in $(PLANS); do $(MATRIX) --plan $$plan --output $(WORK)/$$plan.md || exit; done
+	$(BIN)/bitymi stability --output $(WORK)/stability.md
+	$(BIN)/python benchmarks/seeds.py --seeds 20 --output $(WORK)/seeds.md
+	$(BIN)/python benchmarks/seeds.py --seeds 10 --rates 10 --output $(WORK)/seeds-rates-10.md
 	$(BIN)/bitymi report $(WORK) --output-dir $(WORK)/report --title "bitymi bench"
 
 lint: $(VENV)/.stamp-deps

@@ -23,7 +23,7 @@ class BakeOptions:
     extent: float = 3.0
     """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
     4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
-    tolerance: float = 0.5
+    tolerance: float = 0.75
     """Largest error that is left out, in 8-bit steps, weighted by what a fragment can contribute to a pixel. Of a tile:
     root mean square over its visible part; it takes the smallest grid that keeps this, or none. Of a surfel's view
     colour: the largest one at the directions of the training views that see it, and at others between and around them;

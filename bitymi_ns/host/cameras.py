@@ -62,5 +62,7 @@ def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
 def normal_image(normal: Tensor, camera: Camera) -> Tensor:
     """Blended normals of the camera frame, [H, W, 3], as colours of the unit world normal, (n + 1) / 2; 0 for none."""
     length = normal.norm(dim=-1, keepdim=True)
-    world = (normal / length.clamp(min=1e-6)) @ camera.viewmat[:3, :3]  # R^T n for each row
+    unit = normal / length.clamp(min=1e-6)
+    # R^T n; no product of matrices, which cuBLAS would refuse where torch is asked for deterministic algorithms
+    world = (unit[..., None] * camera.viewmat[:3, :3]).sum(-2)
     return torch.where(length > 1e-3, 0.5 * (world + 1.0), 0.0)

@@ -31,7 +31,7 @@ from bitymi_ns.train.views import as_float, over_background
 WEIGHT_BOUNDS = (0.0, 1 / 255, 0.01, 0.02, 0.05, 0.1)
 TRANSMITTANCES = (0.0, TRANSMITTANCE_MIN, 1e-3, 1e-2, 5e-2)
 TILE_SIDES = (8, 16, 32, 64, 128)
-TOLERANCES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
+TOLERANCES = (0.0, 0.25, 0.5, 0.75, 1.0, 2.0, 4.0)
 FORMATS = ("fp16", "uint8", "bc7")
 SIZES = (1.0, 0.75, 0.5, 0.25)
 

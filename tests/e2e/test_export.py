@@ -302,4 +302,4 @@ def test_a_configuration_without_its_bundle(copied: Path, tmp_path: Path) -> Non
 
 def test_the_presets_bake_options_are_those_of_the_command() -> None:
     options = default_export()
-    assert (options.format, options.r_max, options.cap_by_views, options.tolerance) == ("bc7", 64, True, 0.5)
+    assert (options.format, options.r_max, options.cap_by_views, options.tolerance) == ("bc7", 64, True, 0.75)

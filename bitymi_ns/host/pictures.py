@@ -19,7 +19,7 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.metrics import image_metrics
-from bitymi_ns.ops import composite_image, whole_list
+from bitymi_ns.ops import composite
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.train.views import as_float, over_background
 
@@ -56,20 +56,21 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
     of the two is the render wherever no colour had to be cut off at 0.
     """
-    fragments, projection = whole_list(output.fragments, "a picture of the residual"), output.projection
-    rho = fragments.weight.new_zeros(len(fragments), 3)
-    if scene.field is not None:
-        textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
-        surfel = fragments.surfel[textured].long()
-        u, v = fragments.uv[:, textured]
-        p = scene.surfels
-        axes = tangent_vectors(p["quats"][surfel])
-        size = p["log_scales"][surfel].exp()
-        x = p["means"][surfel] + (u * size[:, 0])[:, None] * axes[..., 0] + (v * size[:, 1])[:, None] * axes[..., 1]
-        rho[textured] = scene.field(x)
-    shape = (projection.camera.height, projection.camera.width, -1)
-    parts = (composite_image(fragments, projection, part.clamp(min=0.0)).view(shape)[..., :3] for part in (rho, -rho))
-    positive, negative = parts
+    p = scene.surfels
+    bands = []
+    for fragments in output.fragments.lists():
+        rho = fragments.weight.new_zeros(len(fragments), 3)
+        if scene.field is not None:
+            textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
+            surfel = fragments.surfel[textured].long()
+            u, v = fragments.uv[:, textured]
+            axes = tangent_vectors(p["quats"][surfel])
+            size = p["log_scales"][surfel].exp()
+            x = p["means"][surfel] + (u * size[:, 0])[:, None] * axes[..., 0] + (v * size[:, 1])[:, None] * axes[..., 1]
+            rho[textured] = scene.field(x)
+        parts = composite(fragments, torch.cat([rho, -rho], 1).clamp(min=0.0))
+        bands.append(parts.view(fragments.height, fragments.width, 6))
+    positive, negative = torch.cat(bands).split(3, dim=-1)
     return positive, negative
 
 

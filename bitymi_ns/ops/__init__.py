@@ -3,8 +3,8 @@
 Every function takes float32 or float64 tensors and dispatches on their device and dtype.
 """
 
-from .bands import Bands, band, split, whole_list
-from .composite import composite, composite_image, soft_overdraw
+from .bands import Bands, band, split
+from .composite import beta_map, composite, composite_image, soft_overdraw
 from .errors import TooManyFragments
 from .field import FieldGeometry, field
 from .project import Projection, project
@@ -25,6 +25,7 @@ __all__ = [
     "TooManyFragments",
     "add_texel_gradient",
     "band",
+    "beta_map",
     "composite",
     "composite_image",
     "field",
@@ -37,5 +38,4 @@ __all__ = [
     "texel_image",
     "trace",
     "view_color",
-    "whole_list",
 ]

@@ -74,21 +74,3 @@ def split(top: int, bottom: int, parts: int) -> list[tuple[int, int]]:
     parts = min(parts, tiles)
     edges = [top + TILE * (tiles * i // parts) for i in range(parts)]
     return list(zip(edges, [*edges[1:], bottom], strict=True))
-
-
-def whole_list(fragments: Fragments | Bands, what: str) -> Fragments:
-    """The list of a view that was not drawn in bands.
-
-    Args:
-        fragments: of the view.
-        what: what needs the list, for the message.
-
-    Raises:
-        ValueError: it was drawn in bands.
-    """
-    if isinstance(fragments, Bands):
-        raise ValueError(
-            f"{what} needs all fragments of a view at once, and this view has too many ({len(fragments):,}): use "
-            "smaller images, or raise scene.max_fragments"
-        )
-    return fragments

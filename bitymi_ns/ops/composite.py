@@ -74,6 +74,18 @@ def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
     return count.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, count)
 
 
+def beta_map(fragments: Fragments, beta_raw: Tensor) -> Tensor:
+    """The blended Beta value, sum of w beta, with the weights held fixed: its gradient reaches beta alone. [H * W].
+
+    Args:
+        fragments: of an H x W view.
+        beta_raw: [N] the surfels' parameter, beta = 4 sigmoid(beta_raw).
+    """
+    beta = 4.0 * torch.sigmoid(beta_raw)
+    values = fragments.weight.detach() * beta[fragments.surfel.long()]
+    return values.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, values)
+
+
 def composite(fragments: Fragments, values: Tensor) -> Tensor:
     """Sums of w times any values [F, C] a pixel: [H * W, C]."""
     if values.dim() != 2 or len(values) != len(fragments):

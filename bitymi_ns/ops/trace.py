@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +59,10 @@ class Fragments:
     def arrays(self) -> tuple[Tensor, ...]:
         """What the kernels take: surfel, pixel, weight, uv, depth, sigma, without their graph."""
         return self.surfel, self.pixel, self.weight.detach(), self.uv.detach(), self.depth.detach(), self.sigma
+
+    def lists(self) -> Iterator[Fragments]:
+        """The view's lists one after the other, from top to bottom: this one."""
+        yield self
 
     def overdraw(self) -> Tensor:
         """[H, W, 1] int32: blended surfels a pixel."""

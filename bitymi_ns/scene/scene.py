@@ -17,6 +17,7 @@ from bitymi_ns.ops import (
     Projection,
     TooManyFragments,
     band,
+    beta_map,
     composite_image,
     project,
     shade,
@@ -117,6 +118,7 @@ class Scene(nn.Module):
         maps: bool = False,
         weight_bound: float | None = None,
         overdraw_half: float | None = None,
+        beta_alone: bool = False,
     ) -> RenderOutput:
         """Renders a view: visibility, then shading, then compositing.
 
@@ -129,6 +131,7 @@ class Scene(nn.Module):
             maps: also depth and normals.
             weight_bound: fragments of smaller weight keep the surfel's colour, without residual; None = as configured.
             overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
+            beta_alone: the gradient of the Beta map reaches beta alone, not the blending weights.
 
         Raises:
             TooManyFragments: a single row of tiles has too many.
@@ -154,6 +157,9 @@ class Scene(nn.Module):
                 move_surfels=self.config.texture_moves_surfels and field_mode == "train",
             )
             image = composite_image(fragments, part, colors, maps)
+            if beta_alone:
+                beta = beta_map(fragments, p["beta_raw"]).unsqueeze(1)
+                image = torch.cat([image[:, :4], beta, image[:, 5:]], 1)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments

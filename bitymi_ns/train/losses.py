@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -20,14 +19,14 @@ SSIM_WINDOW = 11
 
 
 def objective(
-    output: RenderOutput, target: Tensor, beta_raw: Tensor, config: LossConfig, mask: Tensor | None = None
+    output: RenderOutput, target: Tensor, config: LossConfig, mask: Tensor | None = None
 ) -> dict[str, Tensor]:
     """The terms of the objective, weighted: their sum is what training minimises.
 
     Args:
-        output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on.
+        output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on, and with `beta_alone`
+            where the falloff loss is to move beta alone.
         target: [H, W, 3] the photograph at the same size, over the same background.
-        beta_raw: [N] the surfels' parameter.
         config: weights and variants.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
 
@@ -38,8 +37,7 @@ def objective(
     if config.falloff_weight > 0.0 or output.soft_overdraw is not None:
         omega = error_weight(output.rgb, target, config.falloff_gamma, config.falloff_error, mask)
     if config.falloff_weight > 0.0:
-        beta = beta_only_map(output, beta_raw) if config.falloff_gradient == "beta_only" else output.beta
-        terms["falloff"] = config.falloff_weight * mean_where_right(omega, beta, mask)
+        terms["falloff"] = config.falloff_weight * mean_where_right(omega, output.beta, mask)
     if output.soft_overdraw is not None:
         terms["overdraw"] = config.overdraw_weight * mean_where_right(omega, output.soft_overdraw, mask)
     return terms
@@ -117,23 +115,6 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
         Scalar; 0 when no pixel counts.
     """
     return (omega * values).sum() / (omega.numel() if mask is None else mask.sum().clamp(min=1))
-
-
-def beta_only_map(output: RenderOutput, beta_raw: Tensor) -> Tensor:
-    """The blended beta map with the blending weights held fixed, so that the falloff loss moves beta alone.
-
-    Args:
-        output: what `Scene.render` returned.
-        beta_raw: [N] the surfels' parameter; beta = 4 sigmoid(beta_raw).
-
-    Returns:
-        [H, W, 1], equal in value to `output.beta`.
-    """
-    fragments = ops.whole_list(output.fragments, "falloff_gradient: beta_only")
-    fragments = replace(fragments, weight=fragments.weight.detach())
-    beta = 4.0 * torch.sigmoid(beta_raw)
-    values = beta[fragments.surfel.long()].unsqueeze(-1)  # [F, 1]
-    return ops.composite(fragments, values).reshape(output.beta.shape)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

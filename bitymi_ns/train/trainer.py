@@ -142,10 +142,15 @@ def training_step(
     view = at_size(View(camera, image, mask), camera.scaled(factor) if factor < 1.0 else camera, device)
     background = background_color(config.background, config.seed, step, device)
     mode = "train" if schedule.field_trains(step) else "frozen"
-    half = config.loss.overdraw_half if schedule.overdraw_counts(step) else None
-    output = scene.render(view.camera, background=background, field_mode=mode, overdraw_half=half)
+    output = scene.render(
+        view.camera,
+        background=background,
+        field_mode=mode,
+        overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
+        beta_alone=config.loss.falloff_gradient == "beta_only",
+    )
     target = over_background(view.image, background)
-    terms = objective(output, target, scene.surfels["beta_raw"], config.loss, view.mask)
+    terms = objective(output, target, config.loss, view.mask)
     own = watch or LossWatch()
     own.note(scene, step, terms)
     if watch is None:

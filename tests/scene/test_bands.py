@@ -8,7 +8,6 @@ import torch
 from bitymi_ns import ops
 from bitymi_ns.scene import scene as scene_module
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.losses import beta_only_map
 from bitymi_ns.train.trainer import Trainer
 from bitymi_ns.train.views import View
 from tests.scene import bands
@@ -53,10 +52,16 @@ def test_without_gradients() -> None:
     torch.testing.assert_close(got.rgb, want.rgb, rtol=1e-12, atol=1e-12)
 
 
-def test_what_needs_the_list_says_so() -> None:
-    scene, camera = bands.make(CPU, 1500)
-    with pytest.raises(ValueError, match="beta_only needs all fragments of a view at once.*scene.max_fragments"):
-        beta_only_map(scene.render(camera), scene.surfels["beta_raw"])
+def test_a_beta_map_that_moves_beta_alone() -> None:
+    found = []
+    for most in (0, 1500):
+        scene, camera = bands.make(CPU, most)
+        output = scene.render(camera, beta_alone=True)
+        output.beta.square().sum().backward()
+        moved = {name: p.grad for name, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()}
+        found.append({"beta": output.beta.detach(), **moved})
+    assert set(found[0]) == {"beta", "beta_raw"}
+    bands.assert_same(found[1], found[0])
 
 
 def test_training_goes_on() -> None:

@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig, TrainConfig
-from bitymi_ns.train.losses import beta_only_map, error_weight, mean_where_right, objective, photometric, psnr
+from bitymi_ns.train.losses import error_weight, mean_where_right, objective, photometric, psnr
 from bitymi_ns.train.trainer import fit
 
 
@@ -79,10 +79,9 @@ def test_falloff_gives_no_gradient_to_the_colours(pair):
 
 def test_beta_only_moves_beta_alone(make_scene, views):
     scene = make_scene(texture=False)
-    output = scene.render(views[0].camera)
-    beta = beta_only_map(output, scene.surfels["beta_raw"])
-    torch.testing.assert_close(beta, output.beta)
-    mean_where_right(error_weight(output.rgb, views[0].image, 25.0), beta).backward()
+    output = scene.render(views[0].camera, beta_alone=True)
+    torch.testing.assert_close(output.beta, scene.render(views[0].camera).beta)
+    mean_where_right(error_weight(output.rgb, views[0].image, 25.0), output.beta).backward()
     moved = [name for name, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()]
     assert moved == ["beta_raw"]
     output = scene.render(views[0].camera)
@@ -93,16 +92,13 @@ def test_beta_only_moves_beta_alone(make_scene, views):
 def test_objective_has_the_terms_that_are_on(make_scene, views):
     scene = make_scene(texture=False)
     output, target = scene.render(views[0].camera), views[0].image
-    beta_raw = scene.surfels["beta_raw"]
-    terms = objective(output, target, beta_raw, LossConfig())
+    terms = objective(output, target, LossConfig())
     assert set(terms) == {"photometric", "falloff"}
     omega = error_weight(output.rgb, target, 25.0)
     torch.testing.assert_close(terms["falloff"], 0.005 * mean_where_right(omega, output.beta))
-    same = objective(output, target, beta_raw, LossConfig(falloff_gradient="beta_only"))
-    torch.testing.assert_close(same["falloff"], terms["falloff"])
-    assert set(objective(output, target, beta_raw, LossConfig(falloff_weight=0.0))) == {"photometric"}
+    assert set(objective(output, target, LossConfig(falloff_weight=0.0))) == {"photometric"}
     output = scene.render(views[0].camera, overdraw_half=0.005)
-    both = objective(output, target, beta_raw, LossConfig(falloff_weight=0.0, overdraw_weight=0.002))
+    both = objective(output, target, LossConfig(falloff_weight=0.0, overdraw_weight=0.002))
     assert set(both) == {"photometric", "overdraw"}
     torch.testing.assert_close(both["overdraw"], 0.002 * mean_where_right(omega, output.soft_overdraw))
 

@@ -40,7 +40,7 @@ class TuneOptions:
     """Steps; each looks at one training view."""
     rate: float = 0.05
     """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
-    prior: float = 1.0
+    prior: float = 0.3
     """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
     of the rate, one never seen not at all."""
     ssim_weight: float = 0.2

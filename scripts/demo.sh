@@ -8,11 +8,12 @@
 # interrupted goes on from its last checkpoint.
 # METHOD (default bitymi) and STEPS (default: the method's own) choose what is trained.
 set -euo pipefail
+[ $# -eq 0 ] || data=$(realpath -- "$1" 2>/dev/null) || data=
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 method=${METHOD:-bitymi}
 if [ $# -ge 1 ]; then
-  data=$(realpath -- "$1" 2>/dev/null) && [ -f "$data/transforms.json" ] || {
+  [ -f "$data/transforms.json" ] || {
     echo "demo: $1 is no nerfstudio capture (a folder with transforms.json and images);" \
       "ns-process-data makes one from photographs or a video" >&2
     exit 1

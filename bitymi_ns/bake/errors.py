@@ -21,16 +21,18 @@ class TileErrors:
     Attributes:
         rms: [N] root mean square over the visible part of each surfel and the colour channels.
         largest: [N] largest absolute value.
+        shown: [N] bool, whether any fragment of the surfel gets a residual; the errors are 0 elsewhere.
     """
 
     rms: Tensor
     largest: Tensor
+    shown: Tensor
 
     def summary(self) -> dict[str, Any]:
         """Percentiles over the surfels that get a residual at all, for bundle.json."""
         result: dict[str, Any] = {"unit": "8-bit steps, weighted by the blending weight; stored atlas against field"}
         for name, values in (("rms", self.rms), ("largest", self.largest)):
-            values = values.double().sort().values if len(values) else torch.zeros(1, dtype=torch.float64)
+            values = values[self.shown].double().sort().values if self.shown.any() else torch.zeros(1)
             for percent in (50, 90, 99, 100):
                 at = round((len(values) - 1) * percent / 100)
                 result.setdefault(name, {})[f"p{percent}"] = round(float(values[at]), 4)
@@ -76,4 +78,4 @@ def tile_errors(
         largest[rows] = weighted.flatten(1).amax(1).cpu()
         done += len(rows)
         progress("measuring the error", done, len(plan))
-    return TileErrors(rms, largest)
+    return TileErrors(rms, largest, plan.extent.cpu() > 0)

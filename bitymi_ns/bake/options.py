@@ -55,6 +55,9 @@ class BakeOptions:
             raise ValueError(f"the extent must be positive, not {self.extent}")
         if not 0 <= self.tolerance < 255:
             raise ValueError(f"the tolerance must be from 0 to below 255 steps, not {self.tolerance}")
+        for name in ("range_samples", "chunk"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.format not in BYTES_PER_TEXEL:
             raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {self.format!r}")
         if self.format == "bc7":

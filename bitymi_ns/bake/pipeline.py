@@ -20,7 +20,7 @@ from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, v
 from bitymi_ns.bake.lean_field import lean_field
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
-from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
+from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, encode
 from bitymi_ns.bake.reduce import reduce_tiles
@@ -116,7 +116,7 @@ def bake(
     options.check()
     started = time.perf_counter()
     kept, left_out = _drawable(scene.surfels)
-    near = scene.near
+    everything, near = kept, scene.near
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
     prefilter = str(getattr(scene.config, "prefilter", "low_pass"))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
@@ -128,7 +128,7 @@ def bake(
             left_out["unseen"] = int((~seen).sum())
             kept, views = kept[seen], views.of(seen)
             surfels = {name: value[seen] for name, value in surfels.items()}
-        transmittance = views.transmittance
+        transmittance = views.in_front
     if len(kept) == 0:
         raise ValueError(f"no surfel is left to bake of {len(scene.surfels['means'])}: left out {left_out}")
     statistics: dict[str, Any] = {"surfels": {"trained": len(scene.surfels["means"]), "kept": len(kept)}}
@@ -140,6 +140,8 @@ def bake(
     texels = atlas = None
     if scene.field is not None:
         field = scene.field
+        drawable = {name: scene.surfels[name].detach()[everything].float() for name in ("means", "log_scales")}
+        paper = paper_texels(drawable, field, options)
         if options.tolerance > 0 and isinstance(field, HashField):
             field, statistics["field"] = lean_field(field, surfels, transmittance, weight_bound, options.tolerance)
         plan = make_plan(surfels, field, options, cameras, transmittance, near, weight_bound)
@@ -154,7 +156,7 @@ def bake(
             texels, nonfinite = evaluate_tiles(field, *geometry, packing, options.extent, options.chunk, progress)
         tiled = torch.from_numpy(packing.tiles[:, 3] > 0)
         statistics["surfels"]["without_tile"] = int((~tiled).sum())
-        statistics["texels"] = {**plan.texels, "kept": packing.texels, "not_finite": nonfinite}
+        statistics["texels"] = {"paper": paper, **plan.texels, "kept": packing.texels, "not_finite": nonfinite}
         if tiled.any():
             mean_residual = torch.where(tiled[:, None], tile_means(texels, packing), mean_residual)
             atlas = _encode(texels.numpy(), packing, options, progress)
@@ -239,7 +241,7 @@ def _lean_surfels(
     """
     kind, means = view_color_kind(surfels), surfels["means"]
     seen = means.new_zeros(0, len(means), dtype=torch.bool) if views is None else views.seen
-    opacity, _ = kernel_parameters(surfels, None if views is None else views.transmittance)
+    opacity, _ = kernel_parameters(surfels, None if views is None else views.in_front)
     at = (seen, centers_of(cameras, means), opacity)
     lean = reduce_view_color(surfels, kind, *at, tolerance, progress)
     error = view_color_errors(kind, surfels, lean.parameters(), means, *at)

@@ -51,8 +51,8 @@ class Plan:
         probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
         limit: [N, 2] int32, the finest tile of use, at most `probes`.
         weight_bound: fragments of smaller weight get no residual.
-        texels: how many texels the rules before the tolerance give: paper (one voxel size, extent 4), nyquist (the
-            options' own), after_cap_by_views, and within_visible_part, where tiles cover `extent` only.
+        texels: how many texels the rules before the tolerance give: nyquist, after_cap_by_views, and
+            within_visible_part, where tiles cover `extent` only.
     """
 
     means: Tensor
@@ -119,8 +119,11 @@ def make_plan(
     if options.tolerance > 0:
         extent = torch.minimum(extent, visible_extent(opacity, beta, weight_bound))
     voxel = torch.cat([field.voxel_size(part) for part in means.split(options.chunk)])
-    finest = voxel.amin().expand(len(means), 2)  # the paper's delta
-    delta = voxel_along_axes(voxel, axes, means, _center(field)) if options.local_voxel else finest
+    delta = (
+        voxel_along_axes(voxel, axes, means, _center(field))
+        if options.local_voxel
+        else voxel.amin().expand(scales.shape)
+    )
     pixels = None
     if cameras and options.cap_by_views:
         pixels = max_projected_extent(means, axes, scales, cameras, options.extent, near)[0]
@@ -134,7 +137,6 @@ def make_plan(
     probes = grids(share, None) if options.tolerance > 0 else limit
     whole = torch.ones_like(share)
     texels = {
-        "paper": nyquist_resolution(scales, finest, PAPER_EXTENT, options.r_min, options.r_max),
         "nyquist": grids(whole, None),
         "after_cap_by_views": grids(whole, pixels),
         "within_visible_part": limit,
@@ -142,6 +144,20 @@ def make_plan(
     counts = {name: int(sizes.long().prod(1).sum()) for name, sizes in texels.items()}
     edges = axes * scales[:, None, :]
     return Plan(means, edges, opacity, beta, extent, probes, limit, weight_bound, counts)
+
+
+def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:
+    """How many texels the paper's rule gives: one voxel size, the smallest, and tiles of extent 4.
+
+    Args:
+        surfels: means [N, 3], log_scales [N, 2] of all surfels that can be drawn.
+        field: the whole residual field.
+        options: smallest and largest tile.
+    """
+    scales = surfels["log_scales"].exp()
+    finest = torch.stack([field.voxel_size(part).amin() for part in surfels["means"].split(options.chunk)]).amin()
+    sides = nyquist_resolution(scales, finest.expand(scales.shape), PAPER_EXTENT, options.r_min, options.r_max)
+    return int(sides.long().prod(1).sum())
 
 
 def _center(field: Field) -> Tensor | None:

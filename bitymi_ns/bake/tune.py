@@ -274,10 +274,11 @@ def _descend(
 @torch.no_grad()
 def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progress) -> Tensor:
     """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
-    weight times the bilinear weight; 0 where no view sees it."""
+    weight times the bilinear weight, in pixels that count; 0 where no view sees it."""
     total = torch.zeros_like(scene.texels)
     for index in range(len(views)):
         view = views[index]
-        scene.add_gradient(view, scene.texels, torch.ones_like(view.rest), total)
+        shown = torch.ones_like(view.rest) if view.mask is None else view.mask.to(view.rest).expand_as(view.rest)
+        scene.add_gradient(view, scene.texels, shown.contiguous(), total)
         progress("tracing the training views", index + 1, len(views))
     return total.amax(dim=1, keepdim=True)  # a channel that the ReLU cuts off counts nothing

@@ -76,9 +76,9 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     render = bundle.info["render"]
     near, weight_bound = float(render["near"]), float(render["weight_bound"])
     transmittance = None
-    if cameras and options.tolerance > 0:
+    if cameras and (options.drop_unseen or options.tolerance > 0):
         seen = visibility(bundle.surfels, cameras, near, render.get("prefilter", "low_pass"))
-        transmittance = seen.transmittance
+        transmittance = seen.in_front
     plan = make_plan(bundle.surfels, field, options, cameras, transmittance, near, weight_bound)
     tiled = bundle.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.extent, plan.extent)
@@ -116,7 +116,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
         views = visibility(trained, cameras, float(render["near"]), render.get("prefilter", "low_pass"))
-        seen, transmittance = views.seen, views.transmittance
+        seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)
     found = float(view_color_errors(bundle.view_color, trained, bundle.surfels, *at).amax())

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.progress import Progress, no_progress
-from bitymi_ns.ops import project, trace
+from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.scene.camera import Camera
 
 
@@ -25,6 +25,11 @@ class Visibility:
 
     transmittance: Tensor
     seen: Tensor
+
+    @property
+    def in_front(self) -> Tensor:
+        """[N] the transmittance to count with: 1 for surfels that no view blends, of which nothing is known."""
+        return torch.where(self.transmittance > 0, self.transmittance, 1.0)
 
     def of(self, rows: Tensor) -> Visibility:
         """The same of some of the surfels."""
@@ -53,10 +58,11 @@ def visibility(
     largest = means.new_zeros(len(means))
     seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        fragments = trace(project(means, *geometry, camera.to(means.device), near, prefilter == "pixel"))
-        in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
-        rows = fragments.surfel.long()
-        largest.scatter_reduce_(0, rows, in_front, "amax")
-        seen[done - 1, rows] = True
+        projection = project(means, *geometry, camera.to(means.device), near, prefilter == "pixel")
+        for fragments in fitting_lists(projection):
+            in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
+            rows = fragments.surfel.long()
+            largest.scatter_reduce_(0, rows, in_front, "amax")
+            seen[done - 1, rows] = True
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, seen)

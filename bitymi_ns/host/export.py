@@ -284,14 +284,15 @@ def print_savings(table: Table, info: dict[str, Any]) -> None:
     statistics = info["statistics"]
     texels = statistics["texels"]
     error = statistics.get("error") or statistics["finetune"]["error_before"]
-    kept, count = texels["kept"], info["surfels"]["count"]
+    kept, count, options = texels["kept"], info["surfels"]["count"], statistics["options"]
     table.add_row("Tiles", f"{statistics['surfels']['trained']:,} -> {count - statistics['surfels']['without_tile']:,}")
     table.add_row("Texels by the paper's rule", f"{texels['paper']:,}")
-    table.add_row("... by the voxels where they are", f"{texels['nyquist']:,}")
+    voxel = "local voxel" if options["local_voxel"] else "smallest voxel"
+    table.add_row(f"... by the {voxel}, extent {options['extent']:g}", f"{texels['nyquist']:,}")
     table.add_row("... no finer than a view sees", f"{texels['after_cap_by_views']:,}")
     table.add_row("... only where they are seen", f"{texels['within_visible_part']:,}")
     table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels['paper']):.1f} %)")
-    rule = texels["paper"] * BYTES_PER_TEXEL[statistics["options"]["format"]]
+    rule = texels["paper"] * BYTES_PER_TEXEL[options["format"]]
     stored = info["files"][info["atlas"]["file"]]["bytes"] if info["atlas"] else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     tolerance = f"tolerance {error['tolerance']:g}" if error["tolerance"] else "no tolerance"

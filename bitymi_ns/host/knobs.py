@@ -187,8 +187,10 @@ class Knobs:
             return bake(self.scene, self.views, replace(self.options, **options), progress)
 
     def _scene(self, baked: Baked, atlas: Tensor | None, offset: float = 0.0, scale: float = 1.0) -> BakedScene:
+        # with the view colours as they were trained: the knobs are the atlas's
+        surfels = {name: value.detach()[baked.rows].float().cpu() for name, value in self.scene.surfels.items()}
         return BakedScene(
-            baked.surfels,
+            surfels,
             self.scene.config.view_color,
             torch.from_numpy(baked.packing.tiles).contiguous(),
             atlas,

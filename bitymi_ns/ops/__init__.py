@@ -3,7 +3,7 @@
 Every function takes float32 or float64 tensors and dispatches on their device and dtype.
 """
 
-from .bands import Bands, band, split
+from .bands import Bands, band, fitting_lists, split
 from .composite import beta_map, composite, composite_image, soft_overdraw
 from .errors import TooManyFragments
 from .field import FieldGeometry, field
@@ -29,6 +29,7 @@ __all__ = [
     "composite",
     "composite_image",
     "field",
+    "fitting_lists",
     "masked_counts",
     "project",
     "shade",

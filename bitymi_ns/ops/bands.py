@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from .errors import TooManyFragments
 from .project import Projection
 from .trace import TILE, Fragments, masked_counts, trace
 
@@ -55,6 +56,30 @@ class Bands:
         for (top, bottom), fragments in zip(self.rows, self.lists(), strict=True):
             counts += masked_counts(fragments, rows[top:bottom].reshape(-1), n)
         return counts
+
+
+@torch.no_grad()
+def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
+    """The fragments of a view, as one list, or as several of some rows of tiles each where one has too many.
+
+    Args:
+        projection: of the view.
+        most: fragments of a list, as in `trace`.
+
+    Raises:
+        TooManyFragments: a single row of tiles has too many.
+    """
+    waiting = [(0, projection.camera.height)]
+    while waiting:
+        top, bottom = waiting.pop(0)
+        whole = bottom - top == projection.camera.height
+        try:
+            yield trace(projection if whole else band(projection, top, bottom), most=most)
+        except TooManyFragments as error:
+            parts = split(top, bottom, max(2, -(-error.count // max(1, error.most))))
+            if len(parts) == 1:
+                raise
+            waiting = parts + waiting
 
 
 def band(projection: Projection, top: int, bottom: int) -> Projection:

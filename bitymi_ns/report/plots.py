@@ -12,7 +12,7 @@ from bitymi_ns.report.knob_plots import knob_sheets
 from bitymi_ns.report.pareto import front
 from bitymi_ns.report.records import Curve, Evaluation, Records, neural_parent
 
-MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p")
+MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Marks of baked evaluations, one a format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
 """Sections of the page."""

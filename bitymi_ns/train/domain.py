@@ -77,15 +77,14 @@ def check_representation(config: SceneConfig) -> None:
         "sh_degree": (config.sh_degree, 0, 3),
         "levels": (config.levels, 1, 4),
         "min_resolution": (config.min_resolution, 2, 1 << 20),
-        "log2_table_size": (config.log2_table_size or 1, 1, 24),
-        "near": (1.0 if config.near is None else config.near, 1e-6, math.inf),
+        "log2_table_size": (1 if config.log2_table_size is None else config.log2_table_size, 1, 24),
+        "near": (1.0 if config.near is None else config.near, 1e-6, 1e6),
         "weight_bound": (config.weight_bound, 0.0, 1.0),
         "rim": (config.rim, 1e-8, 1.0),
     }
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
-            limits = f"at least {low:g}" if high == math.inf else f"between {low:g} and {high:g}"
-            raise ValueError(f"the scene option {name} must be {limits}, not {value}")
+            raise ValueError(f"the scene option {name} must be between {low:g} and {high:g}, not {value}")
 
 
 def box_is_small(box: Tensor, camera_centers: Tensor) -> bool:

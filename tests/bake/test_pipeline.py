@@ -93,13 +93,25 @@ def test_the_papers_rule_has_one_voxel_size_and_wider_tiles(scene):
     assert paper["kept"] == paper["nyquist"] == paper["paper"] == finest["paper"] == local["paper"]
 
 
+def test_the_papers_count_does_not_depend_on_what_is_left_out(scene, camera):
+    made = scene(50)
+    made.surfels["means"][::2, 2] -= 100.0  # behind the camera
+    whole, part = (bake(made, [camera()], BakeOptions(drop_unseen=drop)) for drop in (False, True))
+    assert len(part.rows) < len(whole.rows)
+    assert part.statistics["texels"]["paper"] == whole.statistics["texels"]["paper"]
+
+
 def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     made = scene(50)
     made.surfels["means"] *= 0.3
     made.surfels["means"][::2, 2] -= 100.0  # behind the camera
     kept = bake(made, [camera()], BakeOptions(drop_unseen=False, tolerance=0))
     assert (kept.packing.tiles[::2, 3:] == 4).all() and len(kept.rows) == 50
-    assert not bake(made, [camera()], BakeOptions(drop_unseen=False)).packing.tiles[::2].any()
+    within = bake(
+        made, [camera()], BakeOptions(drop_unseen=False)
+    )  # nothing is known of them: they keep what they have
+    assert within.packing.tiles[::2].any() and within.packing.tiles[::2, 3:].max() == 4
+    assert (within.surfels["view_span"][::2, 1] > 0).any()
     dropped = bake(made, [camera()])
     assert dropped.rows.tolist() == list(range(1, 50, 2))
     assert dropped.statistics["surfels"]["left_out"]["unseen"] == 25
@@ -139,6 +151,7 @@ def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
     "options, reason",
     [
         (BakeOptions(extent=0.0), "extent"),
+        (BakeOptions(range_samples=0), "range_samples"),
         (BakeOptions(tolerance=-1.0), "tolerance"),
         (BakeOptions(format="jpeg"), "format"),
         (BakeOptions(bc7_profile="best"), "profile"),

@@ -107,6 +107,14 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
     assert moved[few].mean() < 0.2 * moved[many].mean()
 
 
+def test_masked_pixels_are_not_seen(wrong: Baked, views: list[View]) -> None:
+    scene = TexelScene(wrong, BACKGROUND)
+    hidden = torch.zeros(40, 48, 1, dtype=torch.bool)
+    masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
+    one, all_but_masked = (coverage(scene, TexelViews(scene, each, 1 << 30)) for each in (views[:1], masked))
+    assert torch.equal(one, all_but_masked) and one.any()
+
+
 def test_it_ends_with_the_best_texels_of_the_held_in_views(wrong: Baked, views: list[View]) -> None:
     wild = replace(OPTIONS, rate=50.0, steps=40, patience=2)
     statistics = tune_atlas(wrong, views, BACKGROUND, wild).statistics["finetune"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, export, ply
+from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, check_view_color, export, ply
 from bitymi_ns.cli import main
 
 
@@ -56,6 +56,30 @@ def test_a_bundle_passes_as_it_was_written(made):
     ]  # fmt: skip
     assert check_field(bundle, trained.field, views).ok
     assert main(["verify", str(folder)]) == 0
+
+
+@pytest.mark.parametrize("drop", [True, False])
+@pytest.mark.parametrize("tolerance", [0.0, 0.5])
+def test_the_error_that_a_bundle_states_is_found_again(scene, camera, tmp_path, tolerance, drop):
+    trained, views = scene(60), [camera(6.0), camera(8.0)]
+    trained.surfels["means"][::3, 2] -= 100.0  # behind the cameras
+    options = BakeOptions(format="fp16", tolerance=tolerance, drop_unseen=drop)
+    baked = bake(trained, views, options)
+    export(baked, tmp_path / "b", statistics={"options": vars(options)})
+    bundle, _ = check_files(tmp_path / "b")
+    assert check_field(bundle, trained.field, views).ok
+    assert check_view_color(bundle, trained.surfels, views).ok
+
+
+def test_percentiles_count_surfels_that_show_a_residual(scene):
+    made, few = scene(60), scene(60)
+    made.config.weight_bound = few.config.weight_bound = 0.02
+    for each in (made, few):
+        each.surfels["opacity_logits"][::2] = -4.5  # never reach the weight bound
+    few.surfels = {name: value[1::2] for name, value in few.surfels.items()}
+    options = BakeOptions(format="fp16", drop_unseen=False)
+    errors = [bake(each, [], options).statistics["error"]["rms"] for each in (made, few)]
+    assert errors[0] == errors[1] and errors[0]["p50"] > 0
 
 
 def test_every_damaged_file_is_named(made, capsys):

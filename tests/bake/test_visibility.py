@@ -23,4 +23,5 @@ def test_what_stands_in_front_is_counted(surfels, camera):
     assert seen.tolist() == [[True, True, True, False]] * 2
     both = visibility(params, [camera(6.0), behind], 0.2).transmittance
     assert both.tolist() == pytest.approx([1 - second, 1.0, 1.0, 0.0], abs=2e-3) or both[2] == pytest.approx(1.0)
+    assert visibility(params, [camera(6.0)], 0.2).in_front[3] == 1.0  # nothing is known of it
     assert visibility(params, [], 0.2).transmittance.tolist() == [0.0] * 4

@@ -261,6 +261,21 @@ def test_the_papers_tables_stand_beside_ours(tmp_path: Path) -> None:
     assert formats["bc7"] == ("bc7", "1", "2.00", "−0.500")
 
 
+def test_variants_of_the_bake_are_none_of_the_papers_rows(tmp_path: Path) -> None:
+    plain = suite_cells()
+    variants = []
+    for c in plain:
+        if "bundle" in c["key"]:
+            key = {**c["key"], "bundle": "paper-rule", "export": ["--format", "bc7", "--exact", "True"]}
+            value = {**c["value"], **results(9.0, 99.0, atlas_bytes=9e7)}
+            variants.append({**c, "key": key, "value": value})
+    pages = []
+    for name, cells in (("plain", plain), ("all", [*variants, *plain])):
+        records = collect([write(tmp_path / f"{name}.jsonl", cells)], tmp_path / "report")
+        pages.append(paper_tables(records, over_seeds(records.evaluations)))
+    assert len(variants) == 4 and pages[0] == pages[1]
+
+
 def test_part_of_a_suite_is_no_mean_of_it(tmp_path: Path) -> None:
     cells = [c for c in suite_cells() if c["key"]["scene"] == "truck"]
     records = collect([write(tmp_path / "cells.jsonl", cells)], tmp_path / "report")

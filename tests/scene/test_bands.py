@@ -52,6 +52,19 @@ def test_without_gradients() -> None:
     torch.testing.assert_close(got.rgb, want.rgb, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("most", [0, 1500, 10**6])
+def test_lists_that_fit_are_the_whole_view(most: int) -> None:
+    scene, camera = bands.make(CPU, 0)
+    whole = scene.render(camera)
+    found = list(ops.fitting_lists(whole.projection, most))
+    assert (len(found) > 1) == (most == 1500) and all(most == 0 or len(f) <= most for f in found)
+    assert sum(len(f) for f in found) == len(whole.fragments)
+    counts = sum(torch.bincount(f.surfel, minlength=len(scene)) for f in found)
+    assert torch.equal(counts, torch.bincount(whole.fragments.surfel, minlength=len(scene)))
+    with pytest.raises(ops.TooManyFragments):
+        list(ops.fitting_lists(whole.projection, 50))
+
+
 def test_a_beta_map_that_moves_beta_alone() -> None:
     found = []
     for most in (0, 1500):

@@ -84,7 +84,14 @@ def test_a_scene_without_texture_has_no_field(cloud) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [("sv_sites", 0), ("sv_sites", 33), ("lobes", 0), ("sh_degree", 4), ("levels", 5), ("min_resolution", 0)]
-    + [("log2_table_size", 40), ("near", 0.0), ("weight_bound", -1.0), ("rim", 0.0)],
+    + [
+        ("log2_table_size", 40),
+        ("log2_table_size", 0),
+        ("near", 0.0),
+        ("near", float("inf")),
+        ("weight_bound", -1.0),
+        ("rim", 0.0),
+    ],
 )
 def test_options_out_of_range_are_named(name, value) -> None:
     with pytest.raises(ValueError, match=f"{name} must be .*, not {value}"):

@@ -107,9 +107,8 @@ def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     made.surfels["means"][::2, 2] -= 100.0  # behind the camera
     kept = bake(made, [camera()], BakeOptions(drop_unseen=False, tolerance=0))
     assert (kept.packing.tiles[::2, 3:] == 4).all() and len(kept.rows) == 50
-    within = bake(
-        made, [camera()], BakeOptions(drop_unseen=False)
-    )  # nothing is known of them: they keep what they have
+    # of what no view sees nothing is known: it is treated as if nothing stood in front
+    within = bake(made, [camera()], BakeOptions(drop_unseen=False))
     assert within.packing.tiles[::2].any() and within.packing.tiles[::2, 3:].max() == 4
     assert (within.surfels["view_span"][::2, 1] > 0).any()
     dropped = bake(made, [camera()])

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from bitymi_ns.report.records import Evaluation, Records, neural_parent
+from bitymi_ns.report.records import Evaluation, Records, psnr_delta
 from bitymi_ns.report.tables import MISSING, Row, Table, count, signed, significant
 
 PUBLISHED = "Published, on other hardware"
@@ -120,11 +120,7 @@ def table_1(data: dict[str, Any], rows: list[Evaluation]) -> Table:
     lines.append(Row((f"{HERE}, mean of {scenes} trained scenes",), section=True))
     for name in [n for n in texel if any(r.atlas_format == n for r in baked)]:
         of_format = [r for r in baked if r.atlas_format == name]
-        deltas = []
-        for row in of_format:
-            parent = neural_parent(row, rows)
-            after, before = row.get("psnr"), parent.get("psnr") if parent else None
-            deltas.append(None if after is None or before is None else after - before)
+        deltas = [psnr_delta(row, rows) for row in of_format]
         size = _mean([r.get("atlas_bytes") for r in of_format])
         delta = _mean(deltas)
         cells = (MISSING if size is None else significant(size / 1e6), MISSING if delta is None else signed(delta))

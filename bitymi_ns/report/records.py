@@ -286,7 +286,11 @@ def add_training_time(records: Records) -> None:
 
 
 def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
-    """Means over runs that differ in their seed alone, with `psnr_seeds`, the standard deviation of their PSNR."""
+    """Means over runs that differ in their seed alone, with `psnr_seeds`, the standard deviation of their PSNR.
+
+    Baked ones have `psnr_delta`, their PSNR minus that of the trained scene: of the same run each, before the mean.
+    """
+    evaluations = [_with_delta(row, evaluations) for row in evaluations]
     groups: dict[tuple, list[Evaluation]] = {}
     for i, row in enumerate(evaluations):
         key = (row.scene, row.baked, row.group, row.series) if row.group else (i,)
@@ -305,6 +309,21 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
         label = f"{first.group} ({len(rows)} seeds)"
         merged.append(replace(first, label=label, results=means, run=first.series, seed=None, seeds=len(rows)))
     return merged
+
+
+def _with_delta(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation:
+    delta = psnr_delta(row, evaluations)
+    return row if delta is None else replace(row, results={**row.results, "psnr_delta": delta})
+
+
+def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
+    """PSNR of a baked evaluation minus that of its neural parent."""
+    known = row.get("psnr_delta")
+    if known is not None:
+        return known
+    parent = neural_parent(row, evaluations)
+    before, after = (parent.get("psnr") if parent else None), row.get("psnr")
+    return None if before is None or after is None else after - before
 
 
 def _suffixes(sources: list[Path]) -> list[str]:

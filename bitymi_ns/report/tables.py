@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Literal
 
-from bitymi_ns.report.records import Curve, Evaluation, Records, neural_parent
+from bitymi_ns.report.records import Curve, Evaluation, Records, neural_parent, psnr_delta
 
 MISSING = "–"
 
@@ -115,13 +115,6 @@ def _numbers(evaluations: list[Evaluation], everyone: list[Evaluation]) -> list[
     """The columns that at least one row fills."""
     delta = Column("ΔPSNR", lambda row: psnr_delta(row, everyone), signed)
     return [c for c in (*COLUMNS, delta) if any(c.value(row) is not None for row in evaluations)]
-
-
-def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
-    """PSNR of a baked evaluation minus that of its neural parent."""
-    parent = neural_parent(row, evaluations)
-    before, after = (parent.get("psnr") if parent else None), row.get("psnr")
-    return None if before is None or after is None else after - before
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:

@@ -14,7 +14,7 @@ from bitymi_ns.report import ReportError, build
 from bitymi_ns.report.collect import collect
 from bitymi_ns.report.paper import paper_tables, published
 from bitymi_ns.report.pareto import front
-from bitymi_ns.report.records import over_seeds
+from bitymi_ns.report.records import over_seeds, psnr_delta
 
 VOID = {"meta", "img", "source", "br"}
 
@@ -115,6 +115,15 @@ def test_means_over_seeds_with_their_spread(work: Path, tmp_path: Path) -> None:
     assert neural.label == "bitymi (2 seeds)" and neural.results["psnr"] == pytest.approx(25.1)
     assert baked.results["psnr_seeds"] == pytest.approx(0.1414, abs=1e-3) and baked.seeds == 2
     assert baked.label == "bitymi, bc7 (2 seeds)"
+
+
+def test_a_bundle_of_one_seed_is_compared_with_that_seed(work: Path, tmp_path: Path) -> None:
+    rows = collect([work], tmp_path / "report").evaluations
+    only = [row for row in rows if not row.baked or row.seed == 0]
+    merged = over_seeds(only)
+    assert len(only) == 3 and [row.baked for row in merged] == [False, True] and merged[0].seeds == 2
+    before, after = (row.results["psnr"] for row in only if row.seed == 0)
+    assert psnr_delta(merged[1], merged) == pytest.approx(after - before)
 
 
 def test_the_page_has_everything_and_is_well_formed(work: Path, tmp_path: Path) -> None:

@@ -49,6 +49,11 @@ class BakeOptions:
     chunk: int = 1 << 18
     """Texels evaluated at once."""
 
+    @property
+    def looks_at_views(self) -> bool:
+        """Whether what the training views see decides what is kept and how much an error counts."""
+        return self.drop_unseen or self.tolerance > 0
+
     def check(self) -> None:
         """Refuses values that the bake would stumble over later."""
         if not self.extent > 0:

@@ -116,12 +116,13 @@ def bake(
     options.check()
     started = time.perf_counter()
     kept, left_out = _drawable(scene.surfels)
-    everything, near = kept, scene.near
+    near = scene.near
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
     prefilter = str(getattr(scene.config, "prefilter", "low_pass"))
     surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
+    drawable = surfels
     transmittance = views = None
-    if cameras and (options.drop_unseen or options.tolerance > 0):
+    if cameras and options.looks_at_views:
         views = visibility(surfels, cameras, near, prefilter, progress)
         if options.drop_unseen:
             seen = views.transmittance > 0
@@ -140,7 +141,6 @@ def bake(
     texels = atlas = None
     if scene.field is not None:
         field = scene.field
-        drawable = {name: scene.surfels[name].detach()[everything].float() for name in ("means", "log_scales")}
         paper = paper_texels(drawable, field, options)
         if options.tolerance > 0 and isinstance(field, HashField):
             field, statistics["field"] = lean_field(field, surfels, transmittance, weight_bound, options.tolerance)

@@ -76,7 +76,7 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     render = bundle.info["render"]
     near, weight_bound = float(render["near"]), float(render["weight_bound"])
     transmittance = None
-    if cameras and (options.drop_unseen or options.tolerance > 0):
+    if cameras and options.looks_at_views:
         seen = visibility(bundle.surfels, cameras, near, render.get("prefilter", "low_pass"))
         transmittance = seen.in_front
     plan = make_plan(bundle.surfels, field, options, cameras, transmittance, near, weight_bound)

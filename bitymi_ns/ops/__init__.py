@@ -3,7 +3,7 @@
 Every function takes float32 or float64 tensors and dispatches on their device and dtype.
 """
 
-from .bands import Bands, band, fitting_lists, split
+from .bands import Bands, band, by_bands, fitting_lists, refused
 from .composite import beta_map, composite, composite_image, soft_overdraw
 from .errors import TooManyFragments
 from .field import FieldGeometry, field
@@ -26,15 +26,16 @@ __all__ = [
     "add_texel_gradient",
     "band",
     "beta_map",
+    "by_bands",
     "composite",
     "composite_image",
     "field",
     "fitting_lists",
     "masked_counts",
     "project",
+    "refused",
     "shade",
     "soft_overdraw",
-    "split",
     "ssim",
     "texel_image",
     "trace",

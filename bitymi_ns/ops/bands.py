@@ -6,8 +6,9 @@ more in its backward pass; nothing of it is kept in between but its part of the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +16,8 @@ from torch import Tensor
 from .errors import TooManyFragments
 from .project import Projection
 from .trace import TILE, Fragments, masked_counts, trace
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -69,17 +72,45 @@ def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
     Raises:
         TooManyFragments: a single row of tiles has too many.
     """
-    waiting = [(0, projection.camera.height)]
+    height = projection.camera.height
+
+    def find(top: int, bottom: int) -> Fragments:
+        return trace(projection if bottom - top == height else band(projection, top, bottom), most=most)
+
+    for _, _, fragments in by_bands([(0, height)], find):
+        yield fragments
+
+
+def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> Iterator[tuple[int, int, T]]:
+    """Draws bands from top to bottom, in smaller ones where that raises `TooManyFragments`.
+
+    Args:
+        waiting: first and last pixel row (exclusive) of every band.
+        draw: what is done with the rows of a band.
+
+    Yields:
+        first and last row of every band as it was drawn, and what `draw` gave.
+
+    Raises:
+        TooManyFragments: a single row of tiles has too many.
+    """
     while waiting:
-        top, bottom = waiting.pop(0)
-        whole = bottom - top == projection.camera.height
+        (top, bottom), *rest = waiting
         try:
-            yield trace(projection if whole else band(projection, top, bottom), most=most)
+            drawn = draw(top, bottom)
         except TooManyFragments as error:
-            parts = split(top, bottom, max(2, -(-error.count // max(1, error.most))))
+            parts = refused(top, bottom, error)
             if len(parts) == 1:
                 raise
-            waiting = parts + waiting
+            waiting = parts + rest
+            continue
+        yield top, bottom, drawn
+        waiting = rest
+
+
+def refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:
+    """Bands of rows that were refused as one: as many as their number of fragments asks for, two at least."""
+    return split(top, bottom, max(2, -(-error.count // max(1, error.most))))
 
 
 def band(projection: Projection, top: int, bottom: int) -> Projection:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -75,15 +77,15 @@ def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
 
 
 def beta_map(fragments: Fragments, beta_raw: Tensor) -> Tensor:
-    """The blended Beta value, sum of w beta, with the weights held fixed: its gradient reaches beta alone. [H * W].
+    """The blended Beta value, sum of w beta, with the weights held fixed: its gradient reaches beta alone.
+    [H * W, 1].
 
     Args:
         fragments: of an H x W view.
         beta_raw: [N] the surfels' parameter, beta = 4 sigmoid(beta_raw).
     """
     beta = 4.0 * torch.sigmoid(beta_raw)
-    values = fragments.weight.detach() * beta[fragments.surfel.long()]
-    return values.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, values)
+    return composite(replace(fragments, weight=fragments.weight.detach()), beta[fragments.surfel.long(), None])
 
 
 def composite(fragments: Fragments, values: Tensor) -> Tensor:

@@ -18,11 +18,12 @@ from bitymi_ns.ops import (
     TooManyFragments,
     band,
     beta_map,
+    by_bands,
     composite_image,
     project,
+    refused,
     shade,
     soft_overdraw,
-    split,
     trace,
     view_color,
 )
@@ -158,8 +159,7 @@ class Scene(nn.Module):
             )
             image = composite_image(fragments, part, colors, maps)
             if beta_alone:
-                beta = beta_map(fragments, p["beta_raw"]).unsqueeze(1)
-                image = torch.cat([image[:, :4], beta, image[:, 5:]], 1)
+                image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments
@@ -191,27 +191,23 @@ class Scene(nn.Module):
     ) -> tuple[Tensor, Bands]:
         """The image [H * W, C] of a view that was refused with `error`, and its fragments; see ops/bands.py."""
         most, height = self.config.max_fragments, projection.camera.height
-        waiting = split(0, height, max(2, -(-error.count // max(1, error.most))))
-        images, rows, count = [], [], 0
-        while waiting:
-            top, bottom = waiting.pop(0)
+
+        def draw_band(top: int, bottom: int) -> tuple[Tensor, int]:
             part, found = band(projection, top, bottom), []
 
-            def draw_once(geom: Tensor, part: Projection = part, found: list[int] = found) -> Tensor:
+            def draw_once(geom: Tensor) -> Tensor:
                 # what fitted once has to fit in the backward pass
                 image, fragments = draw(replace(part, geom=geom), None if found else most)
                 found.append(len(fragments))
                 return image
 
-            try:
-                images.append(checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False))
-            except TooManyFragments:
-                halves = split(top, bottom, 2)
-                if len(halves) == 1:
-                    raise
-                waiting = halves + waiting
-                continue
+            image = checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False)
+            return image, found[0]
+
+        images, rows, count = [], [], 0
+        for top, bottom, (image, length) in by_bands(refused(0, height, error), draw_band):
+            images.append(image)
             rows.append((top, bottom))
-            count += found[0]
+            count += length
         seen = replace(projection, geom=projection.geom.detach(), frames=projection.frames.detach())
         return torch.cat(images), Bands(seen, tuple(rows), self.config.rim, count)

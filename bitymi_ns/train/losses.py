@@ -107,8 +107,8 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
     Args:
         omega: [H, W, 1] from `error_weight`, with the same mask.
         values: [H, W, 1]. Falloff: the alpha-blended beta, sum_i w_i beta_i; `RenderOutput.beta` carries gradient to
-            the blending weights and to beta (the literal formula), or to beta alone where the
-            view was rendered so. Overdraw: `RenderOutput.soft_overdraw`, sum_i w_i / (w_i + half).
+            the blending weights and to beta (the literal formula), or to beta alone where the view was
+            rendered so. Overdraw: `RenderOutput.soft_overdraw`, sum_i w_i / (w_i + half).
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
 
     Returns:

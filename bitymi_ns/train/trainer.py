@@ -147,7 +147,7 @@ def training_step(
         background=background,
         field_mode=mode,
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
-        beta_alone=config.loss.falloff_gradient == "beta_only",
+        beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )
     target = over_background(view.image, background)
     terms = objective(output, target, config.loss, view.mask)

@@ -12,6 +12,7 @@ from torch import Tensor
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train import bounds
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene
 
@@ -51,6 +52,10 @@ def new_scene(
         )
     except ValueError as error:
         fail(str(error), error)
+    for sentence in bounds.start(
+        report, train.densify.max_surfels, metadata.get("train_pixels", 0), config.log2_table_size
+    ):
+        CONSOLE.print(sentence, soft_wrap=True)
     if report.random:
         CONSOLE.print(f"The capture has no points: training starts from {report.random:,} random ones.")
     if report.not_finite:

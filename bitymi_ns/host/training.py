@@ -16,6 +16,7 @@ from torch.nn import Parameter
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
 from bitymi_ns.host.errors import fail
+from bitymi_ns.train import bounds
 from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
@@ -55,8 +56,7 @@ class TrainingRun:
                 self.schedule.lr(name, 0)
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
-        cameras = self.datamanager.train_dataset.cameras
-        pixels = float((cameras.width * cameras.height).double().mean())
+        pixels = model.metadata["train_pixels"]
         self.strategy = Strategy(self.config, self.schedule, extent, self._on_resize, pixels)
         self.watch = LossWatch()
         self.guard = Guard(
@@ -78,6 +78,9 @@ class TrainingRun:
         }
         self._output: Any = None
         self._loss = torch.zeros(())
+        self._held_back = False  # whether it was said that densification meets its bound
+        for sentence in bounds.short_run(self.schedule, len(self.datamanager.train_dataset)):
+            CONSOLE.print(sentence, soft_wrap=True)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
         self.views = ReducedViews(_TrainViews(self.datamanager), model.device)
 
@@ -164,6 +167,9 @@ class TrainingRun:
         except ValueError as error:
             self._diverged(step, error)
         self.clock.stop()
+        if report.get("held_back") and not self._held_back:
+            self._held_back = True
+            self._announce(bounds.held_back(int(report["held_back"]), self.strategy.most, self.config))
         if report:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
         if step in self.curve_steps:

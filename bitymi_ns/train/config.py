@@ -79,8 +79,8 @@ class DensifyConfig:
     """Final prunes remove surfels whose multi-view error score (0 to 1) is above this."""
     min_interval: int = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
-    max_per_pixel: float = 0.15
-    """Densification stops at this many surfels a pixel of a training view; 0 = no such bound."""
+    pixels_per_surfel: float = 300.0
+    """Densification stops at one surfel for so many pixels of all training photographs together; 0 = no such bound."""
     max_surfels: int = 0
     """Hard cap on the number of surfels; 0 = none."""
     min_surfels: int = 100

@@ -108,9 +108,14 @@ def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple
 
 
 def default_table_size(image_pixels: int) -> int:
-    """Entries a hash level, as a power of two: what the photographs can tell apart, and what a cache can hold.
+    """Entries per hash level, as a power of two: what the photographs can tell apart, and what a cache can hold.
 
-    A level gets one entry of 4 features for 32 pixels of all photographs together; four levels of 2^17 entries are 8 MB
-    in float32.
+    Four levels of 2^17 entries are 8 MB in float32.
     """
-    return min(17, max(14, round(math.log2(max(1, image_pixels) / 32))))
+    return min(17, max(14, table_size_of(image_pixels)))
+
+
+def table_size_of(image_pixels: int) -> int:
+    """Entries per hash level, as a power of two, that the photographs can tell apart: one entry of 4 features for 32
+    pixels of all photographs together."""
+    return round(math.log2(max(1, image_pixels) / 32))

@@ -59,7 +59,7 @@ class Strategy:
         schedule: Schedule,
         extent: float,
         on_resize: ResizeHook | None = None,
-        view_pixels: float = 0.0,
+        image_pixels: int = 0,
     ) -> None:
         """
         Args:
@@ -67,14 +67,13 @@ class Strategy:
             schedule: says at which steps what takes place.
             extent: scene extent in world units.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
-            view_pixels: pixels of a training view at full size, for `densify.max_per_pixel`; 0 = that bound is off.
+            image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
         """
         self.config = config
         self.schedule = schedule
         self.extent = extent
         self.on_resize = on_resize
-        bounds = (config.densify.max_surfels, int(config.densify.max_per_pixel * view_pixels))
-        self.most = min((bound for bound in bounds if bound > 0), default=0)  # 0: densification is not bounded
+        self.most = most_surfels(config, image_pixels)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._clear(0, torch.device("cpu"))
 
@@ -173,6 +172,7 @@ class Strategy:
         if self.most > 0:
             room = max(0, self.most - n)
             chosen = _strongest(clone | split, scores.importance, self.abs_grad_sum / seen, room)
+            report["held_back"] = int((clone | split).sum()) - int(chosen.sum())
             clone, split = clone & chosen, split & chosen
         clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()
         stay = (~split).nonzero().flatten()
@@ -299,6 +299,18 @@ class Strategy:
         if len(self.grad_sum) == len(pruned):
             for name in STATISTICS:
                 setattr(self, name, getattr(self, name)[keep.to(self.grad_sum.device)])
+
+
+def most_surfels(config: TrainConfig, image_pixels: int) -> int:
+    """The number of surfels at which densification stops; 0 = never.
+
+    Args:
+        config: training options.
+        image_pixels: of all training images at full size.
+    """
+    densify = config.densify
+    by_pixels = int(image_pixels / densify.pixels_per_surfel) if densify.pixels_per_surfel > 0 else 0
+    return min((bound for bound in (densify.max_surfels, by_pixels) if bound > 0), default=0)
 
 
 def _finite_rows(scene: Scene) -> Tensor:

@@ -206,8 +206,8 @@ class Trainer:
         self.config = config
         self.views = ReducedViews(views, device)
         self.schedule = Schedule(config, max_steps, extent)
-        pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
-        self.strategy = Strategy(config, self.schedule, extent, view_pixels=pixels)
+        pixels = sum(view.camera.width * view.camera.height for view in views)
+        self.strategy = Strategy(config, self.schedule, extent, image_pixels=pixels)
         self.optimizers = make_optimizers(scene)
         self.guard = Guard(scene, self.optimizers, self.strategy, self.schedule, config)
         self.step = 0

@@ -37,7 +37,7 @@ def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi
     scene, train = config.pipeline.model.scene, config.pipeline.model.train
     scene.log2_table_size, scene.min_resolution = 10, 16
     train.densify.importance, train.densify.reset_interval = 1, 100_000  # densifies, and does not fall back
-    train.densify.max_surfels, train.densify.min_interval, train.densify.max_per_pixel = 800, 1, 0.0
+    train.densify.max_surfels, train.densify.min_interval, train.densify.pixels_per_surfel = 800, 1, 0.0
     return config
 
 

@@ -14,7 +14,7 @@ from bitymi_ns.train.trainer import Trainer, evaluate
 
 
 def config_of(factor: float = 1.0, **guard: float) -> TrainConfig:
-    densify = DensifyConfig(max_surfels=300, min_interval=20, min_reset_interval=10_000, max_per_pixel=0)
+    densify = DensifyConfig(max_surfels=300, min_interval=20, min_reset_interval=10_000, pixels_per_surfel=0)
     return TrainConfig(
         densify=densify, lr=LearningRates().times(factor), guard=GuardConfig(**guard), resolution_schedule=0
     )

@@ -16,7 +16,7 @@ from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.init import surfels_from_points
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.score import Scores
-from bitymi_ns.train.strategy import Strategy
+from bitymi_ns.train.strategy import Strategy, most_surfels
 from bitymi_ns.train.trainer import make_optimizers
 
 DENSIFY, RESET, FINAL, LATE_DENSIFY = 1000, 3000, 18_000, 4000
@@ -243,11 +243,44 @@ def test_the_cap_is_met_exactly_and_the_most_important_grow(bench, cap):
     b.importance = torch.arange(40) + 10
     b.set("log_scales", slice(0, 40, 2), LARGE)
     b.see(1.0, 1.0)
-    b.step(DENSIFY)
+    report = b.step(DENSIFY)
     assert len(b.scene) == cap
+    assert report["held_back"] == 80 - cap
     grown = {x for x in b.x if b.x.count(x) == 2}
     assert grown == set(range(40 - (cap - 40), 40))
     check(b)
+
+
+@pytest.mark.parametrize(("views", "surfels"), [(1, 60), (2, 80), (9, 80)])
+def test_the_bound_follows_the_pixels_of_all_photographs(bench, views, surfels):
+    b = bench(40)
+    b.strategy = Strategy(b.config, Schedule(b.config, 30_000), 1.0, image_pixels=views * 60 * 300)
+    b.importance = torch.full((40,), 10)
+    b.set("log_scales", slice(0, 40), LARGE)
+    b.see(1.0, 1.0)
+    report = b.step(DENSIFY)
+    assert len(b.scene) == surfels and report["held_back"] == 80 - surfels
+
+
+@pytest.mark.parametrize(
+    ("cap", "per_surfel", "pixels", "most"),
+    [
+        (0, 300.0, 0, 0),
+        (0, 300.0, 3000, 10),
+        (7, 300.0, 3000, 7),
+        (70, 300.0, 3000, 10),
+        (0, 0.0, 3000, 0),
+        (7, 0.0, 3, 7),
+    ],
+)
+def test_the_tighter_bound_holds(cap, per_surfel, pixels, most):
+    config = TrainConfig(densify=DensifyConfig(max_surfels=cap, pixels_per_surfel=per_surfel))
+    assert most_surfels(config, pixels) == most
+
+
+def test_a_capture_of_the_size_of_tanks_and_temples_densifies_beyond_its_points():
+    # 263 photographs of 979 x 543, 98,705 points; the paper ends at up to 159,000 surfels there
+    assert most_surfels(TrainConfig(), 263 * 979 * 543) > 2 * 159_000
 
 
 def test_a_scene_over_the_cap_loses_its_faintest(bench):

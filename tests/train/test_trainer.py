@@ -20,7 +20,7 @@ from bitymi_ns.train.views import View
 def test_a_short_run_is_a_proper_run(make_scene, views):
     scene, config = (
         make_scene(),
-        TrainConfig(densify=DensifyConfig(max_surfels=400, min_interval=1, min_reset_interval=1, max_per_pixel=0)),
+        TrainConfig(densify=DensifyConfig(max_surfels=400, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)),
     )
     before, _ = evaluate(scene, views[:1], config)
     seen = []
@@ -41,7 +41,7 @@ def test_a_short_run_is_a_proper_run(make_scene, views):
 @pytest.mark.parametrize("options", [{"background": "random"}, {"freeze_every": 1}])
 def test_a_resumed_run_is_the_same_run(make_scene, views, options):
     config = TrainConfig(
-        densify=DensifyConfig(max_surfels=250, min_interval=1, min_reset_interval=1, max_per_pixel=0), **options
+        densify=DensifyConfig(max_surfels=250, min_interval=1, min_reset_interval=1, pixels_per_surfel=0), **options
     )
     straight = Trainer(make_scene(), views, config, 60)
     for _ in range(14):

@@ -1,0 +1,71 @@
+"""What a run's own rules keep it from, in sentences: no bound is met in silence."""
+
+from __future__ import annotations
+
+from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
+from bitymi_ns.train.domain import default_table_size, table_size_of
+from bitymi_ns.train.init import PointReport
+from bitymi_ns.train.schedules import Schedule
+
+
+def short_run(schedule: Schedule, views: int) -> list[str]:
+    """The rules for short runs that are in force, and whether the run sees all of its photographs.
+
+    Args:
+        schedule: of the run.
+        views: number of training views.
+    """
+    found = []
+    if schedule.short_run_gain > 1.0:
+        parts = [f"surfels learn {schedule.short_run_gain:.1f} times as fast"]
+        densify, resets = sorted(schedule.densify_steps), len(schedule.reset_steps)
+        apart = f", {densify[1] - densify[0]} steps apart" if len(densify) > 1 else ""
+        parts.append(f"{_count(len(densify), 'densification')}{apart}, {_count(resets, 'opacity reset')}")
+        if schedule.freeze_every < schedule.config.freeze_every:
+            parts.append(f"the texture field learns on 1 of {schedule.freeze_every} steps once it is frozen")
+        found.append(f"Rules for runs of fewer than {REFERENCE_STEPS:,} steps: {'; '.join(parts)}.")
+    if schedule.max_steps < views:
+        found.append(
+            f"A run of {schedule.max_steps:,} steps sees {schedule.max_steps:,} of the {views:,} training photographs, "
+            "each once. Train for longer with --max-num-iterations."
+        )
+    return found
+
+
+def start(points: PointReport, max_surfels: int, image_pixels: int, log2_table_size: int | None) -> list[str]:
+    """Bounds that the first scene meets.
+
+    Args:
+        points: what became of the sparse points.
+        max_surfels: `densify.max_surfels`.
+        image_pixels: of all training images together.
+        log2_table_size: `scene.log2_table_size`; None = by the photographs.
+    """
+    found = []
+    if points.over_cap:
+        found.append(
+            f"{points.over_cap:,} of {points.given:,} points of the capture are left out: densify.max_surfels is "
+            f"{max_surfels:,}."
+        )
+    size = default_table_size(image_pixels)
+    if log2_table_size is None and table_size_of(image_pixels) > size:
+        found.append(
+            f"The texture field gets 2^{size} entries per level, the most that is chosen by itself; the photographs "
+            f"could fill 2^{table_size_of(image_pixels)} (--pipeline.model.scene.log2-table-size)."
+        )
+    return found
+
+
+def held_back(count: int, most: int, config: TrainConfig) -> str:
+    """Densification wanted `count` more surfels than the `most` there may be."""
+    densify = config.densify
+    option = "max-surfels" if most == densify.max_surfels else "pixels-per-surfel"
+    why = "" if most == densify.max_surfels else f", one for {densify.pixels_per_surfel:g} pixels of all photographs,"
+    return (
+        f"Densification stops at {most:,} surfels{why} and would have made {count:,} more now "
+        f"(--pipeline.model.train.densify.{option})."
+    )
+
+
+def _count(n: int, name: str) -> str:
+    return f"{n or 'no'} {name}{'' if n == 1 else 's'}"

@@ -1,0 +1,46 @@
+"""No bound is met in silence."""
+
+from __future__ import annotations
+
+import pytest
+
+from bitymi_ns.train import bounds
+from bitymi_ns.train.config import DensifyConfig, TrainConfig
+from bitymi_ns.train.init import PointReport
+from bitymi_ns.train.schedules import Schedule
+
+
+def test_a_full_run_meets_no_bound() -> None:
+    assert bounds.short_run(Schedule(TrainConfig(), 30_000), views=300) == []
+    assert bounds.start(PointReport(given=100), 0, 44 * 270 * 480, None) == []
+
+
+def test_a_short_run_says_which_rules_are_in_force() -> None:
+    (sentence,) = bounds.short_run(Schedule(TrainConfig(), 1200), views=43)
+    assert "30,000 steps: surfels learn 3.1 times as fast" in sentence
+    assert "5 densifications, 100 steps apart" in sentence and "no opacity resets" in sentence
+    assert "the texture field learns on 1 of 3 steps once it is frozen" in sentence
+
+
+def test_a_run_that_does_not_see_every_photograph_says_so() -> None:
+    rules, views = bounds.short_run(Schedule(TrainConfig(), 80), views=263)
+    assert "no densifications" in rules
+    assert "80 of the 263" in views and "--max-num-iterations" in views
+
+
+@pytest.mark.parametrize(("table", "said"), [(None, True), (19, False)])
+def test_a_table_smaller_than_the_photographs_could_fill_is_announced(table, said) -> None:
+    sentences = bounds.start(PointReport(given=9), 0, 10**12, table)
+    assert [("log2-table-size" in s and "2^35" in s) for s in sentences] == [True] * said
+
+
+def test_points_that_do_not_fit_are_announced() -> None:
+    (sentence,) = bounds.start(PointReport(given=12_000, over_cap=2_000), 10_000, 0, None)
+    assert sentence.startswith("2,000 of 12,000 points") and "densify.max_surfels is 10,000" in sentence
+
+
+def test_a_bound_that_densification_meets_is_named() -> None:
+    config = TrainConfig(densify=DensifyConfig(max_surfels=800))
+    capped, by_pixels = bounds.held_back(1234, 800, config), bounds.held_back(1234, 700, config)
+    assert "800 surfels and would have made 1,234 more" in capped and "densify.max-surfels" in capped
+    assert "one for 300 pixels of all photographs" in by_pixels and "densify.pixels-per-surfel" in by_pixels

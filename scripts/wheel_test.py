@@ -51,9 +51,8 @@ def build(folder: Path) -> Path:
 
 def expected() -> set[str]:
     """The files a wheel has, beside its metadata: those of the package, the presets, and what is compiled."""
-    listed = subprocess.run(
-        ["git", "ls-files", "bitymi_ns", "method_configs"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "bitymi_ns", "method_configs"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     files = {line.replace("method_configs/", "bitymi_ns/method_configs/") for line in listed.stdout.splitlines()}
     return files | {"bitymi_ns/_cpu" + sysconfig.get_config_var("EXT_SUFFIX"), "bitymi_ns/_cpu_features.py"}
 

@@ -5,6 +5,7 @@
 #              and baking resume): make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"]
 #              [METHODS="bitymi bitymi-quality"] [PLANS="atlas overdraw"]
 # make sanitize  the kernels' tests under the address and undefined-behaviour sanitizers (minutes)
+# make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
@@ -31,7 +32,7 @@ CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test sanitize bench lint format clean
+.PHONY: setup demo test wheel-test sanitize bench lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -72,7 +73,7 @@ $(VENV)/.stamp-deps: $(VENV)/.stamp-torch constraints.txt pyproject.toml scripts
 	@touch $@
 
 # Editable: changes to Python are live, changes to C++ need another make (seconds: build/ is kept).
-$(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt cmake/cuda.cmake $(CXX_FILES)
+$(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(wildcard cmake/*.cmake) $(CXX_FILES)
 	$(PIP) install -qq --no-build-isolation --no-deps $(CMAKE_ARGS) -e .
 	@touch $@
 
@@ -81,6 +82,9 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -q
+
+wheel-test: setup
+	$(BIN)/python scripts/wheel_test.py
 
 sanitize: setup
 	$(BIN)/cmake -S . -B build/sanitize -G Ninja -DBITYMI_SANITIZE=ON -DBITYMI_CUDA=OFF \

@@ -64,7 +64,8 @@ if(CMAKE_CUDA_COMPILER_VERSION VERSION_LESS 12.0)
   message(WARNING "CUDA ${CMAKE_CUDA_COMPILER_VERSION} is too old (12.0 is needed): built for the CPU alone")
   return()
 endif()
-message(STATUS "CUDA kernels for ${CMAKE_CUDA_ARCHITECTURES} by nvcc ${CMAKE_CUDA_COMPILER_VERSION}")
+list(JOIN CMAKE_CUDA_ARCHITECTURES ", " architectures)
+message(STATUS "CUDA kernels for ${architectures} by nvcc ${CMAKE_CUDA_COMPILER_VERSION}")
 
 # The library holds the kernels and a static runtime: the module imports on a machine without a driver.
 add_library(bitymi_cuda STATIC ${cuda_kernels})
@@ -72,7 +73,8 @@ target_include_directories(bitymi_cuda PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
 set_target_properties(bitymi_cuda PROPERTIES
   POSITION_INDEPENDENT_CODE ON CUDA_STANDARD 17 CUDA_STANDARD_REQUIRED ON CUDA_RUNTIME_LIBRARY Static
   CUDA_VISIBILITY_PRESET hidden)
-target_compile_definitions(bitymi_cuda PRIVATE BITYMI_ARCHITECTURES="${CMAKE_CUDA_ARCHITECTURES}")
+# Not the list itself: its semicolons would end the command of the shell.
+target_compile_definitions(bitymi_cuda PRIVATE BITYMI_ARCHITECTURES="${architectures}")
 target_compile_options(bitymi_cuda PRIVATE --expt-relaxed-constexpr -lineinfo -Xcompiler=-Wall)
 find_package(CUDAToolkit REQUIRED)
 nanobind_add_module(_cuda NB_STATIC NOMINSIZE ${cuda_bindings})

@@ -8,7 +8,8 @@ from functools import cache, lru_cache
 
 import torch
 
-from bitymi_ns.host.errors import warn
+from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.ops.backend import why_not_cpu
 
 
 def has_cuda_kernels() -> bool:
@@ -41,14 +42,19 @@ def default_device_type() -> str:
 
 
 def kernel_device(device: torch.device | str) -> torch.device:
-    """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one)."""
+    """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one).
+
+    Raises:
+        InputError: they cannot run on this CPU either.
+    """
     device = torch.device(device)
-    if device.type == "cpu":
-        return device
-    problem = why_not_cuda() if device.type == "cuda" else f"there are no kernels for the device '{device}'"
-    if problem is None:
-        return device
-    _say_once(f"The scene stays on the CPU: {problem}.")
+    if device.type != "cpu":
+        problem = why_not_cuda() if device.type == "cuda" else f"there are no kernels for the device '{device}'"
+        if problem is None:
+            return device
+        _say_once(f"The scene stays on the CPU: {problem}.")
+    if problem := why_not_cpu():
+        fail(problem)
     return torch.device("cpu")
 
 

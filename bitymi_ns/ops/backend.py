@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +14,8 @@ import torch
 from torch import Tensor
 
 SUFFIX = {torch.float32: "_f32", torch.float64: "_f64"}
+
+CPUINFO = Path("/proc/cpuinfo")
 
 _emulated = False
 
@@ -36,7 +40,32 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
         _emulated = before
 
 
+@cache
+def why_not_cpu() -> str | None:
+    """Why the CPU kernels cannot run on this CPU and what can be done about it; None when they can.
+
+    Asked before they are loaded: a CPU ends a process at an instruction that it does not have. Only Linux says what a
+    CPU has; elsewhere they are taken to run.
+    """
+    try:
+        needed = importlib.import_module("bitymi_ns._cpu_features").FEATURES
+        lines = CPUINFO.read_text(encoding="utf8").splitlines()
+    except (ImportError, OSError):
+        return None
+    flags = next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), None)
+    missing = [name for name in needed.split() if flags is not None and name not in flags]
+    if not missing:
+        return None
+    return (
+        f"the CPU kernels were compiled for a CPU with {', '.join(missing)}, which this one lacks: install bitymi-ns "
+        "again on this machine from its source, with `pip install . -Ccmake.define.BITYMI_MARCH=native` (in a "
+        "checkout: `make clean setup`)"
+    )
+
+
 def _load(name: str) -> ModuleType:
+    if name == "_cpu" and (problem := why_not_cpu()):
+        raise RuntimeError(problem)
     try:
         return importlib.import_module(f"bitymi_ns.{name}")
     except ImportError as error:

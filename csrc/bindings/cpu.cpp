@@ -21,6 +21,7 @@ NB_MODULE(_cpu, m) {
   wait_without_spinning();
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
+  m.attr("FEATURES") = BITYMI_CPU_FEATURES;  // of the CPU, as in bitymi_ns._cpu_features
   nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
       .def(
           "__init__",

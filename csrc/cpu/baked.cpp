@@ -12,33 +12,23 @@ namespace bt {
 namespace {
 // Two texels that lie next to each other, as eight reals.
 template <class S>
-struct Wide;
-template <>
-struct Wide<float> {
-  typedef float V __attribute__((vector_size(32)));
-};
-template <>
-struct Wide<double> {
-  typedef double V __attribute__((vector_size(64)));
-};
-template <class S>
-inline typename Wide<S>::V texel_pair(const uint8_t* at) {
+inline Oct<S> texel_pair(const uint8_t* at) {
   typedef uint8_t B __attribute__((vector_size(8)));
   B b;
   std::memcpy(&b, at, sizeof b);
-  return __builtin_convertvector(b, typename Wide<S>::V);
+  return __builtin_convertvector(b, Oct<S>);
 }
 #if defined(__AVX2__)
 template <>
-inline Wide<float>::V texel_pair<float>(const uint8_t* at) {  // the compiler takes the bytes one by one
-  return (Wide<float>::V)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i*)at)));
+inline Oct<float> texel_pair<float>(const uint8_t* at) {  // the compiler takes the bytes one by one
+  return (Oct<float>)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i*)at)));
 }
 #endif
 template <class S>
-inline typename Wide<S>::V texel_pair(const float* at) {
-  Wide<float>::V b;
+inline Oct<S> texel_pair(const float* at) {
+  Oct<float> b;
   std::memcpy(&b, at, sizeof b);
-  return __builtin_convertvector(b, typename Wide<S>::V);
+  return __builtin_convertvector(b, Oct<S>);
 }
 
 // The textured fragments of a pack: to[lane] += weight * relu(colour + scale * texel), bilinear. The position is
@@ -57,10 +47,9 @@ inline void add_textured(const T* patch, int columns, uint32_t lanes, Pack<S> x,
   for (uint32_t r = lanes; r; r &= r - 1) {
     const int i = __builtin_ctz(r);
     const T* p = patch + 4 * int(at[i]);
-    const auto top = texel_pair<S>(p), bottom = texel_pair<S>(p + stride);
-    const auto column = top + fy[i] * (bottom - top);
-    const Quad<S> left = __builtin_shufflevector(column, column, 0, 1, 2, 3);
-    const Quad<S> right = __builtin_shufflevector(column, column, 4, 5, 6, 7);
+    const Oct<S> top = texel_pair<S>(p), bottom = texel_pair<S>(p + stride);
+    const Oct<S> column = top + fy[i] * (bottom - top);
+    const Quad<S> left = half<0, Quad<S>>(column), right = half<1, Quad<S>>(column);
     const Quad<S> c = colour + scale * (left + fx[i] * (right - left));
     to[i] += w[i] * (c < S(0) ? Quad<S>{} : c);
   }

@@ -25,16 +25,20 @@ template <>
 struct LaneTypes<float> {
   typedef float V __attribute__((vector_size(64)));
   typedef int32_t M __attribute__((vector_size(64)));  // lanes of 0 or -1
+  typedef float O __attribute__((vector_size(32)));
   typedef float Q __attribute__((vector_size(16)));
 };
 template <>
 struct LaneTypes<double> {
   typedef double V __attribute__((vector_size(128)));
   typedef int64_t M __attribute__((vector_size(128)));
+  typedef double O __attribute__((vector_size(64)));
   typedef double Q __attribute__((vector_size(32)));
 };
 template <class S>
 using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry, or rgba
+template <class S>
+using Oct = typename LaneTypes<S>::O;  // eight: two texels that lie next to each other
 
 template <>
 struct IndexOf<Pack<float>> {
@@ -231,11 +235,26 @@ template <class S>
 BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
   return (typename IndexOf<Pack<S>>::type) __builtin_convertvector(a.v, typename Pack<S>::M);
 }
+// Half of a vector: the lower one (0) or the upper one (1). GCC has the shuffle from version 12 on.
+template <int which, class Half, class V>
+BT_HD Half half(V v) {
+  static_assert(sizeof(V) == 2 * sizeof(Half));
+#if __has_builtin(__builtin_shufflevector)
+  constexpr int n = sizeof(Half) / sizeof(v[0]), i = which * n;
+  if constexpr (n == 4)
+    return __builtin_shufflevector(v, v, i, i + 1, i + 2, i + 3);
+  else
+    return __builtin_shufflevector(v, v, i, i + 1, i + 2, i + 3, i + 4, i + 5, i + 6, i + 7);
+#else
+  Half r;
+  std::memcpy(&r, reinterpret_cast<const char*>(&v) + which * sizeof r, sizeof r);
+  return r;
+#endif
+}
 template <class S>
 BT_HD S sum(Pack<S> a) {
-  const auto h = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 4, 5, 6, 7) +
-                 __builtin_shufflevector(a.v, a.v, 8, 9, 10, 11, 12, 13, 14, 15);
-  const auto q = __builtin_shufflevector(h, h, 0, 1, 2, 3) + __builtin_shufflevector(h, h, 4, 5, 6, 7);
+  const Oct<S> h = half<0, Oct<S>>(a.v) + half<1, Oct<S>>(a.v);
+  const Quad<S> q = half<0, Quad<S>>(h) + half<1, Quad<S>>(h);
   return (q[0] + q[2]) + (q[1] + q[3]);
 }
 

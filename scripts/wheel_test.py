@@ -1,0 +1,101 @@
+#!/usr/bin/env python
+"""Builds the wheel as `pip install .` does, looks into it, installs it on its own and runs tests against it.
+
+The build starts from an empty folder and sees none of the environment's variables but PATH and HOME; only the CUDA
+kernels are left out, which take minutes. The wheel goes into a new virtual environment that finds the dependencies
+of this one, but not the checkout: the tests run on a copy of their folder.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SITE_PACKAGES = Path(sysconfig.get_path("purelib"))
+TESTS = ("test_presets.py", "ops/test_backend.py", "ops/test_kernels.py", "host/test_registration.py")
+
+WHERE = """
+import sys
+from pathlib import Path
+import bitymi_ns
+from bitymi_ns import _cpu, _cpu_features, presets
+for place in (bitymi_ns.__file__, _cpu.__file__, _cpu_features.__file__, presets.preset_dir()):
+    assert Path(place).is_relative_to(sys.prefix), f"{place} is not in {sys.prefix}"
+print("CPU kernels for a CPU with", _cpu_features.FEATURES or "nothing special")
+"""
+
+
+def run(*command: str | Path, cwd: Path = ROOT) -> None:
+    """Runs a command without the environment's variables; ends this script where it fails."""
+    variables = {name: os.environ[name] for name in ("HOME", "TMPDIR") if name in os.environ}
+    variables["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    if code := subprocess.run([str(word) for word in command], cwd=cwd, env=variables, check=False).returncode:
+        sys.exit(f"wheel test: exit status {code} of {' '.join(map(str, command))}")
+
+
+def build(folder: Path) -> Path:
+    """The wheel, built in `folder`."""
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
+    options = ("-q", "--no-build-isolation", "--no-deps", "--no-index", "-Ccmake.define.BITYMI_CUDA=OFF")
+    run(*pip, "wheel", *options, f"-Cbuild-dir={folder / 'build'}", "-w", folder, ROOT)
+    (wheel,) = folder.glob("bitymi_ns-*.whl")
+    return wheel
+
+
+def expected() -> set[str]:
+    """The files a wheel has, beside its metadata: those of the package, the presets, and what is compiled."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "bitymi_ns", "method_configs"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    files = {line.replace("method_configs/", "bitymi_ns/method_configs/") for line in listed.stdout.splitlines()}
+    return files | {"bitymi_ns/_cpu" + sysconfig.get_config_var("EXT_SUFFIX"), "bitymi_ns/_cpu_features.py"}
+
+
+def check_contents(wheel: Path) -> None:
+    """Ends this script where a file is missing from the wheel or superfluous in it."""
+    with zipfile.ZipFile(wheel) as archive:
+        files = {name for name in archive.namelist() if ".dist-info/" not in name}
+    if files != expected():
+        missing, superfluous = sorted(expected() - files), sorted(files - expected())
+        sys.exit(
+            f"wheel test: {wheel.name} lacks {missing or 'nothing'} and should not hold {superfluous or 'nothing'}"
+        )
+    print(f"{wheel.name}: {len(files)} files, {wheel.stat().st_size / 1e6:.1f} MB")
+
+
+def install(wheel: Path, folder: Path) -> Path:
+    """A virtual environment with the wheel in it, and behind it what is installed here; its interpreter."""
+    run(sys.executable, "-m", "venv", "--without-pip", folder)
+    python = folder / "bin" / "python"
+    site = folder / SITE_PACKAGES.relative_to(sys.prefix)
+    # A folder that a .pth file names is searched, but its own .pth files, the editable installation's among them, are
+    # not read. The remedy for torchvision (scripts/torchvision_remedy.py) has to be.
+    lines = [str(SITE_PACKAGES)] + [f"import {path.stem}" for path in SITE_PACKAGES.glob("_torchvision*.pth")]
+    (site / "dependencies.pth").write_text("\n".join(lines) + "\n", encoding="utf8")
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python)
+    run(*pip, "install", "-q", "--no-deps", "--no-index", "--ignore-installed", wheel)
+    return python
+
+
+def main() -> None:
+    """Command line."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        wheel = build(folder)
+        check_contents(wheel)
+        python = install(wheel, folder / "venv")
+        away = folder / "away"
+        shutil.copytree(ROOT / "tests", away / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", away)
+        run(python, "-c", WHERE, cwd=away)
+        run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *(f"tests/{name}" for name in TESTS), cwd=away)
+
+
+if __name__ == "__main__":
+    main()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -21,6 +20,7 @@ from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import random_scene
+from tests.bake.damage import signed
 from tests.ops.test_view_color import lean_parameters
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
@@ -65,14 +65,6 @@ def put(folder: Path, files: dict[str, bytes]) -> Path:
     return folder
 
 
-def without_hash(manifest: bytes, files: dict[str, bytes]) -> bytes:
-    """The manifest with sizes and hashes that fit, as of a bundle that was damaged before it was signed."""
-    info = json.loads(manifest)
-    for name in info["files"]:
-        info["files"][name] = {"bytes": len(files[name]), "sha256": hashlib.sha256(files[name]).hexdigest()}
-    return json.dumps(info).encode()
-
-
 def test_an_undamaged_bundle_opens(bundle: dict[str, bytes], tmp_path: Path) -> None:
     assert load_and_draw(put(tmp_path / "b", bundle), verify=True)
 
@@ -95,7 +87,7 @@ def test_bit_flips(bundle: dict[str, bytes], name: str, tmp_path: Path) -> None:
             assert not opened or bytes(data) == bundle[name]
             load_and_draw(folder, verify=False)
             spoiled = {**bundle, name: bytes(data)}
-            (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], spoiled))
+            (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), spoiled))
             load_and_draw(folder, verify=True)
             (folder / "bundle.json").write_bytes(bundle["bundle.json"])
 
@@ -111,7 +103,7 @@ def test_truncation_and_growth(bundle: dict[str, bytes], name: str, tmp_path: Pa
         # JSON may be followed by white space, and by nothing else
         assert not load_and_draw(folder, verify=False) or (name == "bundle.json" and data.strip() == whole.strip())
         if name != "bundle.json":
-            (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], {**bundle, name: data}))
+            (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), {**bundle, name: data}))
             load_and_draw(folder, verify=True)
             (folder / "bundle.json").write_bytes(bundle["bundle.json"])
 
@@ -159,5 +151,5 @@ def test_columns_of_extreme_values(bundle: dict[str, bytes], tmp_path: Path) -> 
             every = {**elements, element: spoiled}
             write_ply(folder / "surfels.ply", every.pop("vertex"), more=every)
             files = {**bundle, "surfels.ply": (folder / "surfels.ply").read_bytes()}
-            (folder / "bundle.json").write_bytes(without_hash(bundle["bundle.json"], files))
+            (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), files))
             load_and_draw(folder, verify=True)

@@ -55,7 +55,7 @@ TERM_LIMITS: dict[str, tuple[float, ...]] = {
 """The same of the terms of lean view colours (`view_terms`), by kind."""
 
 
-def outside(name: str, kind: str, values: Tensor) -> Tensor:
+def beyond(name: str, kind: str, values: Tensor) -> Tensor:
     """Which numbers of a parameter are beyond its limit: bool of the shape of `values`.
 
     Args:
@@ -64,10 +64,10 @@ def outside(name: str, kind: str, values: Tensor) -> Tensor:
         values: [N] or [N, ...].
     """
     largest = TERM_LIMITS[kind] if name == "view_terms" else LIMITS.get(name, (float("inf"),))
-    return values.abs() > (values.new_tensor(largest) if values.dim() > 1 else largest[0])
+    return values.abs() > (torch.tensor(largest, device=values.device) if values.dim() > 1 else largest[0])
 
 
 def within(surfels: Mapping[str, Tensor], kind: str) -> Tensor:
     """Which surfels may be stored, [N] bool: their parameters, of which all have a row per surfel, keep the limits."""
-    bad = [outside(name, kind, value.detach()) for name, value in surfels.items()]
+    bad = [beyond(name, kind, value.detach()) for name, value in surfels.items()]
     return ~torch.stack([each.flatten(1).any(1) if each.dim() > 1 else each for each in bad]).any(0)

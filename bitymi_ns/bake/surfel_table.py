@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.directions import sphere
-from bitymi_ns.bake.limits import EXTENTS, LIMITS, TERM_LIMITS, UNIT_SLACK, outside
+from bitymi_ns.bake.limits import EXTENTS, LIMITS, TERM_LIMITS, UNIT_SLACK, beyond
 from bitymi_ns.bake.ply import PlyError
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, MAX_TERMS, check_lean
@@ -182,7 +182,7 @@ def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
         kind: sv, sh, sb or sg.
     """
     for name, values in surfels.items():
-        bad = outside(name, kind, values)
+        bad = beyond(name, kind, values)
         if bad.any():
             row, *inner = (int(i) for i in torch.nonzero(bad)[0])
             index = int(np.ravel_multi_index(inner, values.shape[1:])) if inner else 0

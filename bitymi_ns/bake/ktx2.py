@@ -17,6 +17,8 @@ Format = Literal["bc7", "uint8", "fp16"]
 
 _HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, and the one level
 _KEY_LIMIT = 1 << 20
+HEADER_LIMIT = 1 << 10
+"""Header, index, level and data format descriptor are shorter, in bytes."""
 
 
 @dataclass(frozen=True)
@@ -125,11 +127,38 @@ def write_ktx2(
             file.write(layer)
 
 
-def parse_ktx2(data: bytes | memoryview) -> Ktx2Image:
-    """Reads and checks a file written by `write_ktx2`, without copying the texels.
+@dataclass(frozen=True)
+class Header:
+    """What a KTX2 file declares.
+
+    Attributes:
+        format: one of bc7, uint8, fp16.
+        width, height: size in texels.
+        layers: number of layers.
+        metadata_at, metadata_size: where the key/value pairs lie, bytes.
+        data_at: where the texels begin, bytes; they end with the file.
+        nbytes: size of the whole file.
+    """
+
+    format: Format
+    width: int
+    height: int
+    layers: int
+    metadata_at: int
+    metadata_size: int
+    data_at: int
+    nbytes: int
+
+
+def read_header(data: bytes | bytearray | memoryview, size: int) -> Header:
+    """The header of a file, from its first `HEADER_LIMIT` bytes or more.
+
+    Args:
+        data: how the file begins.
+        size: bytes of the whole file.
 
     Raises:
-        Ktx2Error: the file is something else, is truncated, or contradicts itself.
+        Ktx2Error: the file is something else, has another size than its header says, or contradicts itself.
     """
     view = memoryview(data)
     if len(view) < _HEADER.size or bytes(view[:12]) != IDENTIFIER:
@@ -151,16 +180,28 @@ def parse_ktx2(data: bytes | memoryview) -> Ktx2Image:
     expected_dfd = descriptor(format)
     if dfd_at != _HEADER.size or bytes(view[dfd_at : dfd_at + dfd_size]) != expected_dfd:
         raise Ktx2Error("the data format descriptor does not match the texel format")
-    if kvd_size > _KEY_LIMIT or (kvd_size and kvd_at != dfd_at + dfd_size) or kvd_at + kvd_size > len(view):
+    if kvd_size > _KEY_LIMIT or (kvd_size and kvd_at != dfd_at + dfd_size) or kvd_at + kvd_size > size:
         raise Ktx2Error("the key/value data lies outside the file")
-    size = layer_bytes(format, width, height)
-    if data_size != size * layers or raw_size != data_size or data_at % max(layout.block_bytes, 4):
+    expected = layer_bytes(format, width, height) * layers
+    if data_size != expected or raw_size != data_size or data_at % max(layout.block_bytes, 4):
         raise Ktx2Error(f"the level index does not match {layers} layers of {width} x {height} texels")
-    if data_at < kvd_at + kvd_size or data_at < dfd_at + dfd_size or data_at + data_size != len(view):
-        raise Ktx2Error(f"truncated: {len(view)} bytes, {data_at + data_size} expected")
-    metadata = _unpack_metadata(bytes(view[kvd_at : kvd_at + kvd_size]))
-    payload = [view[data_at + i * size : data_at + (i + 1) * size] for i in range(layers)]
-    return Ktx2Image(payload, format, width, height, metadata)
+    if data_at < kvd_at + kvd_size or data_at < dfd_at + dfd_size or data_at + data_size != size:
+        raise Ktx2Error(f"truncated or too long: {size} bytes, {data_at + data_size} expected")
+    return Header(format, width, height, layers, kvd_at, kvd_size, data_at, size)
+
+
+def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
+    """Reads and checks a file written by `write_ktx2`, without copying the texels.
+
+    Raises:
+        Ktx2Error: the file is something else, is truncated, or contradicts itself.
+    """
+    view = memoryview(data)
+    header = read_header(view, len(view))
+    metadata = _unpack_metadata(bytes(view[header.metadata_at : header.metadata_at + header.metadata_size]))
+    size = layer_bytes(header.format, header.width, header.height)
+    payload = [view[at : at + size] for at in range(header.data_at, header.nbytes, size)]
+    return Ktx2Image(payload, header.format, header.width, header.height, metadata)
 
 
 def _pack_metadata(metadata: Mapping[str, str]) -> bytes:

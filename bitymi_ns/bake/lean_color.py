@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, sphere, view_directions
+from bitymi_ns.bake.limits import beyond
 from bitymi_ns.bake.plan import STEPS
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.surfel_table import SH_C0
@@ -109,7 +110,9 @@ def reduce_view_color(
         high = target.masked_fill(~at.valid[..., None], -torch.inf).amax(1)
         middle = 0.5 * (low + high) - COLOR_BIAS
         base[at.rows] = middle / SH_C0 if kind == "sh" else middle  # there the constant is a coefficient
-        rest = torch.nonzero(STEPS * 0.5 * (high - low).amax(1) > allowed).squeeze(1)
+        needs_more = STEPS * 0.5 * (high - low).amax(1) > allowed
+        needs_more |= beyond("view_base", kind, base[at.rows]).any(1)  # a bundle cannot hold this colour
+        rest = torch.nonzero(needs_more).squeeze(1)
         if kind == "sv":
             fitted = _fewer_sites(at, rest, own, target, allowed)
         else:
@@ -149,8 +152,10 @@ def _fewer_sites(
         v, r = vectors[rest].gather(1, kept), rgb[rest].gather(1, kept)
         b, r = fit_sites(v[:, 1:] - v[:, :1], r, looked[rest], colors[rest], weight[rest], FIT_STEPS)
         shown = (site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r + COLOR_BIAS).relu()
+        terms = torch.cat([b, r[:, 1:]], dim=2)
         good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
-        result.append((rest[good], r[good, 0], torch.cat([b, r[:, 1:]], dim=2)[good]))
+        good &= ~beyond("view_terms", "sv", terms).flatten(1).any(1) & ~beyond("view_base", "sv", r[:, 0]).any(1)
+        result.append((rest[good], r[good, 0], terms[good]))
         rest = rest[~good]
     v = vectors[rest].double()
     relative = (v[:, 1:] - v[:, :1]).to(rgb)

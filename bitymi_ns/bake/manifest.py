@@ -1,172 +1,336 @@
-"""bundle.json: what a bundle states about itself, and its checks."""
+"""bundle.json: the one description of what it holds, for writing and for reading, and the digest that protects it."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
-from torch import Tensor
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
+from pydantic_core import PydanticCustomError
+
+from bitymi_ns.bake import strict_json
+from bitymi_ns.bake.ktx2 import Format
+from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
+from bitymi_ns.bake.options import BakeOptions
 
 FORMAT = "bitymi-bundle"
-VERSION = (2, 0)
+VERSION = (2, 1)
 """The newest version that is read. Lean view colours are version 2, which readers of version 1 refuse."""
-FULL_VERSION = (1, 1)
+FULL_VERSION = (1, 2)
 """Version of a bundle whose surfels have all parameters."""
+_DIGEST_SINCE = {1: 2, 2: 1}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
-_NUMBER_LIMIT = 1e30
+SUPPORT = 3.0
+"""Radius of the kernel in scale units."""
+ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class BundleError(ValueError):
     """A bundle cannot be written or read; the message says what is wrong and what to do."""
 
 
-class Fields:
-    """Typed access to a JSON object, by path: `fields.integer("surfels.count")`."""
-
-    def __init__(self, info: Any, source: str) -> None:
-        self.info, self.source = info, source
-
-    def _fail(self, path: str, what: str) -> BundleError:
-        return BundleError(f"{self.source}: {path} {what}")
-
-    def get(self, path: str) -> Any:
-        """The value at `path`."""
-        value = self.info
-        for key in path.split("."):
-            if not isinstance(value, dict) or key not in value:
-                raise self._fail(path, "is missing")
-            value = value[key]
-        return value
-
-    def text(self, path: str, *choices: str) -> str:
-        """A string, one of `choices` when any are given."""
-        value = self.get(path)
-        if not isinstance(value, str) or (choices and value not in choices):
-            raise self._fail(path, f"must be {' or '.join(choices) if choices else 'text'}, not {_short(value)}")
-        return value
-
-    def integer(self, path: str, low: int = 0, high: int = 2**31 - 1) -> int:
-        """A whole number in [low, high]."""
-        value = self.get(path)
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-            raise self._fail(path, f"must be a whole number from {low} to {high}, not {_short(value)}")
-        return value
-
-    def number(self, path: str) -> float:
-        """A finite number."""
-        return self._number(path, self.get(path))
-
-    def numbers(self, path: str, *shape: int) -> np.ndarray:
-        """Nested lists of finite numbers of the given shape, as float64."""
-
-        def nested(value: Any, sizes: tuple[int, ...]) -> list:
-            if not isinstance(value, list) or len(value) != sizes[0]:
-                raise self._fail(path, f"must be numbers of shape {list(shape)}")
-            return [nested(each, sizes[1:]) if len(sizes) > 1 else self._number(path, each) for each in value]
-
-        return np.array(nested(self.get(path), shape))
-
-    def _number(self, path: str, value: Any) -> float:
-        if not isinstance(value, (int, float)) or isinstance(value, bool) or not abs(value) <= _NUMBER_LIMIT:
-            raise self._fail(path, f"must be a finite number, not {_short(value)}")
-        return float(value)
-
-
-def dump(info: Mapping[str, Any]) -> bytes:
-    """bundle.json of `info`; values that JSON cannot hold (NaN, infinity) become null."""
-    return (json.dumps(_plain(info), indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
-
-
-def parse(data: bytes, source: str = MANIFEST) -> dict[str, Any]:
-    """Reads bundle.json and checks everything a reader relies on; keys it does not know are kept and ignored.
+def check_file_name(name: str, source: str) -> None:
+    """Refuses names that are not a plain file name: a bundle never reaches out of its folder.
 
     Raises:
-        BundleError: not a bundle, a newer major version, or a value that is missing or out of range.
+        BundleError: naming `source`.
     """
-    try:
-        info = json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise BundleError(f"{source} is not a bundle: it cannot be read as JSON ({error})") from error
-    if not isinstance(info, dict) or info.get("format") != FORMAT:
-        raise BundleError(f"{source} is not a bundle: its format is not {FORMAT!r}")
-    fields = Fields(info, source)
-    version = re.fullmatch(r"([0-9]{1,6})\.([0-9]{1,6})", fields.text("version"))
-    if version is None:
-        raise BundleError(f"{source}: version must look like 1.0, not {_short(info['version'])}")
-    if int(version[1]) > VERSION[0]:
-        raise BundleError(
-            f"{source} has version {version[0]}, this program reads up to {VERSION[0]}.x: update bitymi-ns to open it"
-        )
-    fields.integer("surfels.count")
-    fields.text("surfels.view_color", "sv", "sh", "sb", "sg")
-    if "terms" in fields.get("surfels"):  # lean view colours
-        fields.integer("surfels.terms")
-    fields.number("color_bias")
-    for name in ("alpha_max", "alpha_min", "t_min", "near", "weight_bound", "low_pass"):
-        fields.number(f"render.{name}")
-    if "prefilter" in info["render"]:  # bundles of earlier versions have the low pass
-        fields.text("render.prefilter", "low_pass", "pixel")
-    fields.numbers("render.background", 3)
-    fields.numbers("world.transform", 3, 4)
-    fields.number("world.scale")
-    fields.numbers("bounds.min", 3)
-    fields.numbers("bounds.max", 3)
-    _check_files(fields)
-    if fields.get("atlas") is not None:
-        _check_atlas(fields)
-    return info
-
-
-def _check_files(fields: Fields) -> None:
-    files = fields.get("files")
-    if not isinstance(files, dict) or SURFELS not in files:
-        raise BundleError(f"{fields.source}: files must list {SURFELS}")
-    if (ATLAS in files) != (fields.get("atlas") is not None):
-        raise BundleError(f"{fields.source}: files and atlas disagree whether there is an {ATLAS}")
-    for name, entry in files.items():
-        check_file_name(name, fields.source)
-        each = Fields(entry, f"{fields.source}: {name}")
-        each.integer("bytes", high=2**50)
-        if _DIGEST.fullmatch(each.text("sha256")) is None:
-            raise BundleError(f"{fields.source}: {name}: sha256 must be 64 hexadecimal digits")
-
-
-def _check_atlas(fields: Fields) -> None:
-    fields.text("atlas.format", "bc7", "uint8", "fp16")
-    for name in ("width", "height", "layers"):
-        fields.integer(f"atlas.{name}", low=1, high=1 << 20)
-    fields.number("atlas.offset")
-    if not fields.number("atlas.scale") > 0:
-        raise BundleError(f"{fields.source}: atlas.scale must be positive")
-    if not fields.number("atlas.extent") > 0:
-        raise BundleError(f"{fields.source}: atlas.extent must be positive")
-
-
-def check_file_name(name: Any, source: str) -> None:
-    """Refuses names that are not a plain file name: a bundle never reaches out of its folder."""
-    if not isinstance(name, str) or _FILE_NAME.fullmatch(name) is None or name == MANIFEST:
+    if not _is_file_name(name):
         raise BundleError(f"{source}: {_short(name)} cannot be the name of a file of the bundle")
 
 
-def _plain(value: Any) -> Any:
-    """`value` with arrays as lists and non-finite numbers as None."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    if isinstance(value, (Tensor, np.ndarray, np.generic)):
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int)):
-        return value
-    return str(value)
+def _is_file_name(name: str) -> bool:
+    return _FILE_NAME.fullmatch(name) is not None and name != MANIFEST
+
+
+def _only(value: float) -> Any:
+    """The type of a constant that the renderers draw with: stated for other programs, and no other value will do."""
+
+    def check(found: float) -> float:
+        if found != value:
+            raise PydanticCustomError("constant", "must be {value}, which is what is drawn with", {"value": value})
+        return found
+
+    return Annotated[float, AfterValidator(check)]
+
+
+Whole = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Count = Annotated[int, Field(ge=0, le=2**60)]
+Positive = Annotated[float, Field(gt=0, le=1e12)]
+NotNegative = Annotated[float, Field(ge=0, le=1e12)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Decibels = Annotated[float, Field(ge=-1e3, le=1e3)]
+Side = Annotated[int, Field(ge=1, le=1 << 20)]
+Coordinate = Annotated[float, Field(ge=-LIMITS["means"][0], le=LIMITS["means"][0])]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+
+
+class _Part(BaseModel):
+    """An object of bundle.json. Keys that it does not know are kept and ignored; numbers are finite, and no bool or
+    text is taken for one."""
+
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+    @model_serializer(mode="wrap")
+    def _without_what_was_not_given(self, serialize: Any) -> dict[str, Any]:
+        given = self.model_fields_set
+        return {key: value for key, value in serialize(self).items() if value is not None or key in given}
+
+
+class Surfels(_Part):
+    """What surfels.ply holds, and how it is to be read."""
+
+    file: Literal["surfels.ply"] = SURFELS
+    count: Whole
+    view_color: Literal["sv", "sh", "sb", "sg"]
+    kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
+    support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
+    residual: str = "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound"
+    activations: dict[str, str] = ACTIVATIONS
+    sites: Whole | None = None
+    """Spherical Voronoi sites per surfel, where all are kept."""
+    terms: Whole | None = None
+    """Terms of all lean view colours together; None = view colours are complete."""
+    view_terms: str | None = None
+    """How a lean view colour is evaluated."""
+
+
+class Atlas(_Part):
+    """What atlas.ktx2 holds: residual = offset + scale * value, value = stored / 255 for bc7 and uint8."""
+
+    file: Literal["atlas.ktx2"] = ATLAS
+    format: Format
+    width: Side
+    height: Side
+    layers: Side
+    extent: Annotated[float, Field(ge=EXTENTS[0], le=EXTENTS[1])] = SUPPORT
+    """Half side of the tiles of a surfels.ply without the extents' column."""
+    extent_column: str | None = None
+    offset: Annotated[float, Field(ge=-RESIDUAL_LIMIT, le=RESIDUAL_LIMIT)]
+    scale: Annotated[float, Field(gt=0, le=2 * RESIDUAL_LIMIT)]
+    range: str | None = None
+    clipped_fraction: Share | None = None
+    encoder: str | None = None
+    psnr: Decibels | None = None
+
+    @model_validator(mode="after")
+    def _half_floats_are_residuals(self) -> Atlas:
+        if self.format == "fp16" and (self.offset, self.scale) != (0.0, 1.0):
+            raise PydanticCustomError("range", "must have offset 0 and scale 1, as its format is fp16")
+        return self
+
+
+class Render(_Part):
+    """What the renderers draw with."""
+
+    alpha_max: _only(0.99) = 0.99  # type: ignore[valid-type]
+    alpha_min: _only(1.0 / 255.0) = 1.0 / 255.0  # type: ignore[valid-type]
+    t_min: _only(1e-4) = 1e-4  # type: ignore[valid-type]
+    near: Annotated[float, Field(ge=1e-9, le=1e6)]
+    weight_bound: Share
+    low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
+    prefilter: Literal["low_pass", "pixel"] = "low_pass"
+    background: tuple[Share, Share, Share]
+
+
+class Place(_Part):
+    """How the scene lies in the capture's own frame: x_scene = scale * (transform @ [x_capture, 1])."""
+
+    transform: tuple[Row, Row, Row]
+    scale: Positive
+
+
+class Bounds(_Part):
+    """Corners of the box around the surfels' means."""
+
+    min: Point
+    max: Point
+
+
+class FileEntry(_Part):
+    """Size and hash of a file of the bundle."""
+
+    bytes: Annotated[int, Field(ge=0, le=2**50)]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class Percentiles(_Part):
+    """Of an error over the surfels; p100 is the largest."""
+
+    p100: NotNegative | None = None
+
+
+class TileError(_Part):
+    """Error of the stored tiles against the field, 8-bit steps."""
+
+    tolerance: NotNegative
+    rms: Percentiles
+    largest: Percentiles
+
+
+class KeptSites(_Part):
+    """Numbers of sites, coefficients or lobes."""
+
+    after: Count
+
+
+class ViewColorError(_Part):
+    """What the view colours kept, and their error in 8-bit steps."""
+
+    tolerance: NotNegative
+    sites: KeptSites
+    one_color: Whole
+    error: Percentiles
+
+
+class KeptSurfels(_Part):
+    """Numbers of surfels."""
+
+    kept: Whole | None = None
+    without_tile: Whole | None = None
+
+
+class KeptTexels(_Part):
+    """Numbers of texels."""
+
+    kept: Count | None = None
+
+
+class FieldLevels(_Part):
+    """Which levels of the field the bake evaluated."""
+
+    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]
+    """The first one and how many."""
+
+
+class HeldOut(_Part):
+    """PSNR over the held-out views, dB."""
+
+    psnr_baked_against_neural_worst: Decibels | None = None
+
+
+class Statistics(_Part):
+    """What the bake left out and what that cost: for people and reports, and for `bitymi verify` to measure again. The
+    fields are what this package reads back; there is more."""
+
+    surfels: KeptSurfels | None = None
+    texels: KeptTexels | None = None
+    error: TileError | None = None
+    view_color: ViewColorError | None = None
+    field: FieldLevels | None = None
+    options: BakeOptions | None = None
+    held_out: HeldOut | None = None
+
+
+class Manifest(_Part):
+    """bundle.json."""
+
+    format: Literal["bitymi-bundle"] = FORMAT
+    version: Annotated[str, Field(pattern=r"^[0-9]{1,6}\.[0-9]{1,6}$")]
+    generator: str = "an unnamed program"
+    surfels: Surfels
+    atlas: Atlas | None
+    color_bias: _only(0.5) = 0.5  # type: ignore[valid-type]
+    render: Render
+    world: Place
+    bounds: Bounds
+    statistics: Statistics
+    files: dict[str, FileEntry]
+    digest: str | None = None
+    """SHA-256 of the canonical JSON of everything else."""
+
+    @model_validator(mode="after")
+    def _files_fit(self) -> Manifest:
+        for name in self.files:
+            if not _is_file_name(name):
+                raise PydanticCustomError("files", "files: {name} cannot be the name of a file", {"name": _short(name)})
+        if SURFELS not in self.files:
+            raise PydanticCustomError("files", f"files must list {SURFELS}")
+        if (ATLAS in self.files) != (self.atlas is not None):
+            raise PydanticCustomError("files", f"files and atlas disagree whether there is an {ATLAS}")
+        return self
+
+
+def describe(info: Mapping[str, Any]) -> Manifest:
+    """The manifest of `info`, whose arrays become lists and numbers that are not finite null.
+
+    Raises:
+        BundleError: a value is missing or out of range: what would be refused when read is not written.
+    """
+    try:
+        return Manifest.model_validate_json(strict_json.canonical(strict_json.plain(info)))
+    except ValidationError as error:
+        raise BundleError(f"the bundle cannot be described: {_problems(error)}") from error
+
+
+def dump(manifest: Manifest) -> bytes:
+    """bundle.json of a manifest, with the digest of its contents.
+
+    Raises:
+        BundleError: a value was set that `parse` would refuse.
+    """
+    info = describe(manifest.model_dump(mode="json", exclude={"digest"})).model_dump(mode="json")
+    info["digest"] = strict_json.digest(info)
+    return (json.dumps(info, indent=2, ensure_ascii=False) + "\n").encode()
+
+
+def parse(data: bytes, source: str = MANIFEST) -> Manifest:
+    """Reads bundle.json and checks everything a reader relies on; keys it does not know are kept and ignored.
+
+    Raises:
+        BundleError: not a bundle, a newer major version, a value that is missing or out of range, or a digest that is
+            not that of the contents.
+    """
+    try:
+        info = strict_json.loads(data)
+        if not isinstance(info, dict) or info.get("format") != FORMAT:
+            raise BundleError(f"{source} is not a bundle: its format is not {FORMAT!r}")
+        stated = info.pop("digest", None)
+        version = _version(info.get("version"), source)
+        text, found = strict_json.canonical(info), strict_json.digest(info)
+    except BundleError:
+        raise
+    except ValueError as error:
+        raise BundleError(f"{source} is not a bundle: it cannot be read as JSON ({error})") from error
+    try:
+        manifest = Manifest.model_validate_json(text)
+    except ValidationError as error:
+        raise BundleError(f"{source}: {_problems(error)}") from error
+    if stated is None and version[1] >= _DIGEST_SINCE.get(version[0], 0):
+        raise BundleError(f"{source}: digest is missing{_ON_PURPOSE.format(found)}")
+    if stated is not None and stated != found:
+        raise BundleError(f"{source} is altered: its digest is not that of its contents{_ON_PURPOSE.format(found)}")
+    manifest.digest = stated
+    return manifest
+
+
+_ON_PURPOSE = '; if you have edited it on purpose, set "digest" to "{}"'
+
+
+def _version(version: Any, source: str) -> tuple[int, int]:
+    found = re.fullmatch(r"([0-9]{1,6})\.([0-9]{1,6})", version) if isinstance(version, str) else None
+    if found is None:
+        raise BundleError(f"{source}: version must look like 1.0, not {_short(version)}")
+    if int(found[1]) > VERSION[0]:
+        raise BundleError(
+            f"{source} has version {found[0]}, this program reads up to {VERSION[0]}.x: update bitymi-ns to open it"
+        )
+    return int(found[1]), int(found[2])
+
+
+def _problems(error: ValidationError) -> str:
+    """One line: where in the JSON, what must be there, what is there; and how many more there are."""
+    first = error.errors(include_url=False, include_context=False)[0]
+    path = ".".join(str(part) if re.fullmatch(r"[\w.-]+", str(part)) else _short(part) for part in first["loc"])
+    what = "is missing" if first["type"] == "missing" else re.sub(r"^\w+ should", "must", first["msg"])
+    if what.startswith("must") and not isinstance(first["input"], BaseModel) and first["type"] != "too_long":
+        what += f", not {_short(first['input'])}"
+    more = error.error_count() - 1
+    return f"{path} {what}".strip() + (f" (and {more} more)" if more else "")
 
 
 def _short(value: Any) -> str:

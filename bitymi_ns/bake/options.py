@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bitymi_ns.bake.ktx2 import Format
+from bitymi_ns.bake.limits import EXTENTS
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Profile, RangeRule, bc7_encoder
 
 
@@ -56,8 +57,8 @@ class BakeOptions:
 
     def check(self) -> None:
         """Refuses values that the bake would stumble over later."""
-        if not self.extent > 0:
-            raise ValueError(f"the extent must be positive, not {self.extent}")
+        if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
+            raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
         if not 0 <= self.tolerance < 255:
             raise ValueError(f"the tolerance must be from 0 to below 255 steps, not {self.tolerance}")
         for name in ("range_samples", "chunk"):

@@ -18,6 +18,7 @@ from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
 from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
 from bitymi_ns.bake.lean_field import lean_field
+from bitymi_ns.bake.limits import RESIDUAL_LIMIT, within
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
@@ -99,9 +100,10 @@ def bake(
 ) -> Baked:
     """Bakes a scene's residual field into an atlas (paper, section Texture Baking).
 
-    Surfels that can never be drawn (opacity below 1/255), rows that are not finite and rotations of length zero are
-    left out and counted; so are surfels that no training view blends. A scene without a field has no atlas and its
-    tiles are zeros; nor has one whose tiles are all constant within the tolerance.
+    Surfels that can never be drawn (opacity below 1/255), rows that are not finite or beyond what a bundle holds
+    (`limits.LIMITS`) and rotations of length zero are left out and counted; so are surfels that no training view
+    blends. A scene without a field has no atlas and its tiles are zeros; nor has one whose tiles are all constant
+    within the tolerance.
 
     Args:
         scene: a trained scene.
@@ -209,7 +211,7 @@ def export(
         baked.packing.tiles,
         baked.atlas,
         extent=baked.extent,
-        mean_residual=baked.mean_residual,
+        mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT),
         near=baked.near,
         weight_bound=baked.weight_bound,
         prefilter=baked.prefilter,
@@ -256,9 +258,11 @@ def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
     turned = surfels["quats"].norm(dim=1)
     finite &= torch.isfinite(turned) & (turned > 1e-12)
-    transparent = finite & (surfels["opacity_logits"].sigmoid() < OPACITY_FLOOR)
-    kept = torch.nonzero(finite & ~transparent).squeeze(1)
-    return kept, {"not_finite": int((~finite).sum()), "transparent": int(transparent.sum())}
+    storable = finite & within(surfels, view_color_kind(surfels))
+    transparent = storable & (surfels["opacity_logits"].sigmoid() < OPACITY_FLOOR)
+    kept = torch.nonzero(storable & ~transparent).squeeze(1)
+    counts = {"not_finite": ~finite, "beyond_limits": finite & ~storable, "transparent": transparent}
+    return kept, {name: int(rows.sum()) for name, rows in counts.items()}
 
 
 def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 _TYPES = {"float": "<f4", "float32": "<f4", "int": "<i4", "int32": "<i4"}
-_HEADER_LIMIT = 1 << 16
+HEADER_LIMIT = 1 << 16
+"""No header is longer, in bytes."""
 
 
 class PlyError(ValueError):
@@ -50,7 +52,49 @@ def write_ply(
             file.write(rows.tobytes())
 
 
-def parse_ply(data: bytes) -> dict[str, dict[str, npt.NDArray]]:
+@dataclass(frozen=True)
+class Header:
+    """What a PLY file declares.
+
+    Attributes:
+        elements: element to its number of rows and the type of one, in the file's order.
+        start: where the rows begin, bytes.
+    """
+
+    elements: dict[str, tuple[int, np.dtype]]
+    start: int
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the whole file."""
+        return self.start + sum(count * dtype.itemsize for count, dtype in self.elements.values())
+
+
+def read_header(data: bytes | bytearray, size: int) -> Header:
+    """The header of a file, from its first `HEADER_LIMIT` bytes or more.
+
+    Args:
+        data: how the file begins.
+        size: bytes of the whole file.
+
+    Raises:
+        PlyError: another kind of PLY, or a size that does not match.
+    """
+    end = data.find(b"end_header\n", 0, HEADER_LIMIT)
+    if not data.startswith(b"ply\n") or end < 0:
+        raise PlyError("not a PLY file")
+    try:
+        lines = data[:end].decode("ascii").split("\n")[1:-1]
+    except UnicodeDecodeError as error:
+        raise PlyError("the PLY header is not ASCII text") from error
+    header = Header(_layout(lines), end + len(b"end_header\n"))
+    if header.nbytes != size:
+        counts = ", ".join(f"{count} of {element}" for element, (count, _) in header.elements.items())
+        raise PlyError(f"truncated or too long: {counts} need {header.nbytes} bytes, the file has {size}")
+    return header
+
+
+def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
     """Reads a file written by `write_ply`.
 
     Returns:
@@ -59,15 +103,10 @@ def parse_ply(data: bytes) -> dict[str, dict[str, npt.NDArray]]:
     Raises:
         PlyError: another kind of PLY, a length that does not match the header, or a value that is not finite.
     """
-    header, body = _split(data)
-    layout = _layout(header)
-    expected = sum(count * dtype.itemsize for count, dtype in layout.values())
-    if len(body) != expected:
-        counts = ", ".join(f"{count} of {element}" for element, (count, _) in layout.items())
-        raise PlyError(f"truncated or too long: {counts} need {expected} bytes, the file has {len(body)}")
-    elements, at = {}, 0
-    for element, (count, dtype) in layout.items():
-        rows = np.frombuffer(body, dtype=dtype, count=count, offset=at)
+    header = read_header(data, len(data))
+    elements, at = {}, header.start
+    for element, (count, dtype) in header.elements.items():
+        rows = np.frombuffer(data, dtype=dtype, count=count, offset=at)
         at += rows.nbytes
         elements[element] = {name: np.ascontiguousarray(rows[name]) for name in dtype.names or ()}
         for name, column in elements[element].items():
@@ -75,17 +114,6 @@ def parse_ply(data: bytes) -> dict[str, dict[str, npt.NDArray]]:
             if bad.any():
                 raise PlyError(f"{name} is not finite in row {int(np.flatnonzero(bad)[0])}")
     return elements
-
-
-def _split(data: bytes) -> tuple[list[str], memoryview]:
-    end = data.find(b"end_header\n", 0, _HEADER_LIMIT)
-    if not data.startswith(b"ply\n") or end < 0:
-        raise PlyError("not a PLY file")
-    try:
-        header = data[:end].decode("ascii").split("\n")[1:-1]
-    except UnicodeDecodeError as error:
-        raise PlyError("the PLY header is not ASCII text") from error
-    return header, memoryview(data)[end + len(b"end_header\n") :]
 
 
 def _layout(header: Sequence[str]) -> dict[str, tuple[int, np.dtype]]:

@@ -14,6 +14,7 @@ from PIL import Image
 
 from bitymi_ns.bake.evaluate import coverage
 from bitymi_ns.bake.ktx2 import Format
+from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.progress import Progress, no_progress
 
@@ -22,7 +23,6 @@ Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
 
 BYTES_PER_TEXEL: dict[str, int] = {"bc7": 1, "uint8": 4, "fp16": 8}
 _STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
-_HALF_MAX = float(np.finfo(np.float16).max)
 _SMALLEST_SPAN = 1e-6
 
 
@@ -130,6 +130,7 @@ def choose_range(
         low, high = _extremes(texels, packing)
     else:
         raise ValueError(f"the range rule must be sigma6, minmax or auto, not {rule!r}")
+    low, high = (float(np.clip(end, -RESIDUAL_LIMIT, RESIDUAL_LIMIT)) for end in (low, high))
     if high - low < _SMALLEST_SPAN:  # a constant atlas: its value is code 0
         low, high = (low + high) / 2, (low + high) / 2 + _SMALLEST_SPAN
     return Range(low, high - low, rule)
@@ -173,7 +174,7 @@ def encode(
         decoded = decode([data], format, width, len(values), value_range.offset, value_range.scale)[0]
         inside = values[mask]
         if format == "fp16":
-            low, high = -_HALF_MAX, _HALF_MAX
+            low, high = -RESIDUAL_LIMIT, RESIDUAL_LIMIT
         else:
             low, high = value_range.offset, value_range.offset + value_range.scale
         slack = 1e-6 * (high - low)  # the extremes themselves, rounded to float32, are not clipped
@@ -236,7 +237,7 @@ def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Ran
     """RGBA texels with full alpha: [h, w, 4] uint8, or little-endian float16."""
     if format == "fp16":
         rgba = np.ones((*values.shape[:2], 4), dtype="<f2")
-        rgba[..., :3] = np.clip(values, -_HALF_MAX, _HALF_MAX)
+        rgba[..., :3] = np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT)
         return rgba
     rgba = np.full((*values.shape[:2], 4), 255, dtype=np.uint8)
     rgba[..., :3] = value_range.to_unorm8(values)

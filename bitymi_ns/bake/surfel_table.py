@@ -19,9 +19,11 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.directions import sphere
+from bitymi_ns.bake.limits import EXTENTS, LIMITS, TERM_LIMITS, UNIT_SLACK, beyond
 from bitymi_ns.bake.ply import PlyError
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, MAX_TERMS, check_lean
+from bitymi_ns.scene.scene import GEOMETRY
 
 SH_C0 = 0.28209479177387814
 FLAT_LOG_SCALE = -31.0
@@ -29,6 +31,17 @@ TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
 EXTENT_COLUMN = "tile_extent"
 COUNT_COLUMN = "view_terms"
 TERMS = "view_term"
+
+# Columns of the parameters whose columns are not `<parameter>_<i>`.
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "means": ("x", "y", "z"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+    "log_scales": ("scale_0", "scale_1"),
+    "opacity_logits": ("opacity",),
+    "beta_raw": ("beta",),
+    "mean_residual": ("residual_0", "residual_1", "residual_2"),
+    "view_terms": tuple(f"term_{i}" for i in range(max(LEAN_WIDTH.values()))),
+}
 
 # Trailing shape of every view-colour parameter; -1 is read from the number of columns.
 VIEW_COLORS: dict[str, dict[str, tuple[int, ...]]] = {
@@ -98,11 +111,11 @@ def to_columns(
     quats = torch.nn.functional.normalize(surfels["quats"], dim=1)
     flat = torch.full((len(quats), 1), FLAT_LOG_SCALE)
     groups: dict[tuple[str, ...], Tensor] = {
-        ("x", "y", "z"): surfels["means"],
+        COLUMNS["means"]: surfels["means"],
         _numbered("f_dc", 3): color,
         ("opacity",): surfels["opacity_logits"][:, None],
         _numbered("scale", 3): torch.cat([surfels["log_scales"], flat], dim=1),
-        _numbered("rot", 4): quats,
+        COLUMNS["quats"]: quats,
         ("beta",): surfels["beta_raw"][:, None],
     }
     for name in ("view_base",) if lean else VIEW_COLORS[kind]:
@@ -116,7 +129,7 @@ def to_columns(
         columns[EXTENT_COLUMN] = extent.detach().float().cpu().numpy()
     if mean_residual is not None:
         residual = mean_residual.detach().float().cpu().numpy()
-        columns |= {name: residual[:, i] for i, name in enumerate(_numbered("residual", 3))}
+        columns |= {name: residual[:, i] for i, name in enumerate(COLUMNS["mean_residual"])}
     return columns
 
 
@@ -134,22 +147,57 @@ def tile_extents(columns: Mapping[str, npt.NDArray], default: float) -> Tensor:
     """[N] float32 half sides of the tiles in scale units; `default` where the file has no such column.
 
     Raises:
-        PlyError: a value is not positive, or the column has the wrong type.
+        PlyError: a value is out of range, or the column has the wrong type.
     """
     if EXTENT_COLUMN not in columns:
         return torch.full((len(columns["x"]),), default)
     extent = _stack(columns, (EXTENT_COLUMN,))[:, 0].contiguous()
-    if not (extent > 0).all():
-        raise PlyError(f"{EXTENT_COLUMN} is not positive in row {int(torch.nonzero(extent <= 0)[0])}")
+    low, high = EXTENTS
+    bad = (extent < low) | (extent > high)
+    if bad.any():
+        row = int(torch.nonzero(bad)[0])
+        raise PlyError(f"{EXTENT_COLUMN} is {extent[row]:g} in row {row}; it must be from {low:g} to {high:g}")
     return extent
 
 
 def mean_residuals(columns: Mapping[str, npt.NDArray]) -> Tensor:
-    """[N, 3] float32 mean residuals, 0 where the file has no such columns."""
-    names = _numbered("residual", 3)
+    """[N, 3] float32 mean residuals, 0 where the file has no such columns.
+
+    Raises:
+        PlyError: a value is beyond its limit (`limits.LIMITS`), or a column has the wrong type.
+    """
+    names = COLUMNS["mean_residual"]
     if names[0] not in columns:
         return torch.zeros(len(columns["x"]), 3)
-    return _stack(columns, names)
+    residuals = _stack(columns, names)
+    _check_limits({"mean_residual": residuals}, "")
+    return residuals
+
+
+def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
+    """The first number beyond its limit (`limits.LIMITS`), by column and row of surfels.ply; None where there is none.
+
+    Args:
+        surfels: parameters by name, mean_residual too.
+        kind: sv, sh, sb or sg.
+    """
+    for name, values in surfels.items():
+        bad = beyond(name, kind, values)
+        if bad.any():
+            row, *inner = (int(i) for i in torch.nonzero(bad)[0])
+            index = int(np.ravel_multi_index(inner, values.shape[1:])) if inner else 0
+            largest = TERM_LIMITS[kind] if name == "view_terms" else LIMITS[name]
+            bound = largest[inner[-1] if len(largest) > 1 else 0]
+            value = float(values[(row, *inner)])
+            column = COLUMNS[name][index] if name in COLUMNS else f"{name}_{index}"
+            return f"{column} is {value:g} in row {row}; it must be from {-bound:g} to {bound:g}"
+    return None
+
+
+def _check_limits(surfels: Mapping[str, Tensor], kind: str) -> None:
+    problem = first_problem(surfels, kind)
+    if problem is not None:
+        raise PlyError(problem)
 
 
 def from_columns(
@@ -167,21 +215,28 @@ def from_columns(
         tiles: [N, 5] int32.
 
     Raises:
-        PlyError: a column is missing or has the wrong type, or the view colour has the wrong number of columns.
+        PlyError: a column is missing or has the wrong type, the view colour has the wrong number of columns, or a value
+            is beyond its limit.
     """
     if kind not in VIEW_COLORS:
         raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
     tiles = _stack(columns, TILE_COLUMNS, np.int32)
-    surfels = {
-        "means": _stack(columns, ("x", "y", "z")),
-        "quats": _stack(columns, _numbered("rot", 4)),
-        "log_scales": _stack(columns, _numbered("scale", 3))[:, :2].contiguous(),
-        "opacity_logits": _stack(columns, ("opacity",))[:, 0].contiguous(),
-        "beta_raw": _stack(columns, ("beta",))[:, 0].contiguous(),
-    }
+    surfels = {name: _stack(columns, COLUMNS[name]) for name in GEOMETRY}
+    surfels |= {name: surfels[name][:, 0].contiguous() for name in ("opacity_logits", "beta_raw")}
     count = len(surfels["means"])
     if terms is not None:
-        return surfels | _lean_from_columns(columns, terms, kind), tiles
+        surfels |= _lean_from_columns(columns, terms, kind)
+    else:
+        surfels |= _full_from_columns(columns, kind, count)
+    _check_limits(surfels, kind)
+    turned = (surfels["quats"].norm(dim=1) - 1.0).abs() > UNIT_SLACK
+    if turned.any():
+        raise PlyError(f"rot_0 to rot_3 have not the length 1 in row {int(torch.nonzero(turned)[0])}")
+    return surfels, tiles
+
+
+def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int) -> dict[str, Tensor]:
+    surfels = {}
     for name, shape in VIEW_COLORS[kind].items():
         found = [int(column[len(name) + 1 :]) for column in columns if _is_number_of(column, name)]
         width = int(np.prod([size for size in shape if size > 0]))
@@ -191,7 +246,7 @@ def from_columns(
         surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
     if kind == "sv" and len({surfels[name].shape[1] for name in VIEW_COLORS["sv"]}) != 1:
         raise PlyError("the Spherical Voronoi parameters disagree about the number of sites")
-    return surfels, tiles
+    return surfels
 
 
 def _lean_from_columns(

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.bundle import Bundle, BundleError, file_problem, read_bundle, read_manifest
+from bitymi_ns.bake.bundle_reader import Bundle, assemble, enough_memory, read_file, read_manifest
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
-from bitymi_ns.bake.manifest import MANIFEST
+from bitymi_ns.bake.manifest import MANIFEST, BundleError
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
 from bitymi_ns.bake.visibility import visibility
@@ -44,14 +43,21 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
         info = read_manifest(folder)
     except BundleError as error:
         return None, [Check(MANIFEST, False, str(error))]
-    checks = [Check(MANIFEST, True, f"version {info['version']}, by {info.get('generator', 'an unnamed program')}")]
-    for name, entry in info["files"].items():
-        problem = file_problem(folder / name, entry)
-        checks.append(Check(name, problem is None, problem or f"{entry['bytes']:,} bytes, sha256 as stated"))
+    signed = "" if info.digest else ", without a digest (of an earlier version)"
+    checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{signed}")]
+    files: dict[str, bytearray] = {}
+    for name, entry in info.files.items():
+        try:
+            with enough_memory(folder, info):
+                files[name] = read_file(folder, info, name)
+            checks.append(Check(name, True, f"{entry.bytes:,} bytes, sha256 as stated"))
+        except BundleError as error:
+            checks.append(Check(name, False, str(error)))
     if not all(check.ok for check in checks):
         return None, checks
     try:
-        bundle = read_bundle(folder, verify=False)
+        with enough_memory(folder, info):
+            bundle = assemble(folder, info, files)
     except BundleError as error:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
@@ -66,30 +72,31 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
         field: the residual field of the scene that was baked.
         cameras: its training views.
     """
-    stated = bundle.info["statistics"].get("error")
+    name, statistics, render = "error against the field", bundle.info.statistics, bundle.info.render
+    stated = statistics.error
     if stated is None:
-        return Check("error against the field", True, "not stated: the texels were changed after the bake")
-    levels = bundle.info["statistics"].get("field")
-    if levels is not None and isinstance(field, HashField):
-        field = field.only(*levels["kept"])
-    options = bake_options(bundle)
-    render = bundle.info["render"]
-    near, weight_bound = float(render["near"]), float(render["weight_bound"])
+        return Check(name, True, "not stated: the texels were changed after the bake")
+    if statistics.field is not None and isinstance(field, HashField):
+        first, count = statistics.field.kept
+        if first + count > field.levels:
+            return Check(name, False, f"levels {first} to {first + count - 1} stated, the field has {field.levels}")
+        field = field.only(first, count)
+    options = statistics.options or BakeOptions()
+    near, weight_bound = render.near, render.weight_bound
     transmittance = None
     if cameras and options.looks_at_views:
-        seen = visibility(bundle.surfels, cameras, near, render.get("prefilter", "low_pass"))
-        transmittance = seen.in_front
+        transmittance = visibility(bundle.surfels, cameras, near, render.prefilter).in_front
     plan = make_plan(bundle.surfels, field, options, cameras, transmittance, near, weight_bound)
     tiled = bundle.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.extent, plan.extent)
     residuals = None if bundle.atlas is None else bundle.residuals().numpy()
     found = tile_errors(field, plan, bundle.tiles.numpy(), bundle.mean_residual, residuals).summary()
     lines, ok = [], True
-    for name in ("rms", "largest"):
-        bound, measured = float(stated[name]["p100"]), found[name]["p100"]
-        ok &= measured <= bound * _SLACK + _SLACK_STEPS
-        lines.append(f"{name} {measured:.3f} (stated {bound:.3f})")
-    return Check("error against the field", ok, ", ".join(lines) + " steps")
+    for what, bound in (("rms", stated.rms.p100), ("largest", stated.largest.p100)):
+        measured = found[what]["p100"]
+        ok &= bound is not None and measured <= bound * _SLACK + _SLACK_STEPS
+        lines.append(f"{what} {measured:.3f} (stated {_steps(bound)})")
+    return Check(name, ok, ", ".join(lines) + " steps")
 
 
 def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
@@ -103,7 +110,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     name = "error of the view colours"
     if "view_terms" not in bundle.surfels:
         return Check(name, True, "none: all of them are kept")
-    stated = bundle.info["statistics"].get("view_color")
+    stated = bundle.info.statistics.view_color
     if stated is None:
         return Check(name, True, "not stated")
     trained = {name: value.detach().float().cpu() for name, value in surfels.items()}
@@ -112,17 +119,17 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     if None in rows:
         return Check(name, False, f"surfel {rows.index(None)} is none of the trained scene")
     trained = {name: value[torch.tensor(rows)] for name, value in trained.items()}
-    means, render = bundle.surfels["means"], bundle.info["render"]
+    means, render = bundle.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
-        views = visibility(trained, cameras, float(render["near"]), render.get("prefilter", "low_pass"))
+        views = visibility(trained, cameras, render.near, render.prefilter)
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)
     found = float(view_color_errors(bundle.view_color, trained, bundle.surfels, *at).amax())
-    bound, tolerance = float(stated["error"]["p100"]), float(stated["tolerance"])
-    ok = found <= bound * _SLACK + _SLACK_STEPS
-    return Check(name, ok, f"largest {found:.3f} (stated {bound:.3f}, tolerance {tolerance:g}) steps")
+    bound = stated.error.p100
+    ok = bound is not None and found <= bound * _SLACK + _SLACK_STEPS
+    return Check(name, ok, f"largest {found:.3f} (stated {_steps(bound)}, tolerance {stated.tolerance:g}) steps")
 
 
 def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
@@ -131,22 +138,18 @@ def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
     return [row.tobytes() for row in torch.cat(parts, dim=1).numpy()]
 
 
-def bake_options(bundle: Bundle) -> BakeOptions:
-    """The options that a bundle was baked with, as far as it states them."""
-    stated = bundle.info["statistics"].get("options", {})
-    return BakeOptions(**{f.name: stated[f.name] for f in fields(BakeOptions) if f.name in stated})
+def _steps(error: float | None) -> str:
+    return "not as a number" if error is None else f"{error:.3f}"
 
 
 def _tiles(bundle: Bundle) -> Check:
-    """Sides are powers of two on the grid of 4 x 4 blocks, no texel belongs to two tiles, extents are in range."""
+    """Sides are powers of two on the grid of 4 x 4 blocks, and no texel belongs to two tiles."""
     tiled = bundle.tiles[bundle.tiles[:, 3] > 0].long()
     if len(tiled) == 0:
         return Check("tiles", True, "none")
     sides = tiled[:, 3:]
     if ((sides & (sides - 1)) != 0).any() or (tiled[:, [0, 1, 3, 4]] % 4 != 0).any():
         return Check("tiles", False, "a tile is not a power of two on the grid of 4 x 4 blocks")
-    if not torch.isfinite(bundle.extent).all() or (bundle.extent > 16.0).any():
-        return Check("tiles", False, "a tile's extent is out of range")
     blocks = int((sides // 4).prod(1).sum())
     owned = _blocks(tiled, bundle.atlas)
     if int((owned > 0).sum()) != blocks:
@@ -167,27 +170,26 @@ def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
 
 def _statements(bundle: Bundle) -> Check:
     """What bundle.json states about the bake agrees with the files."""
-    statistics: dict[str, Any] = bundle.info["statistics"]
-    tiled = bundle.tiles[:, 3] > 0
+    statistics = bundle.info.statistics
+    surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
     found = {"surfels kept": len(bundle), "texels kept": int(bundle.tiles[:, 3:].long().prod(1).sum())}
+    found["surfels without_tile"] = int((bundle.tiles[:, 3] == 0).sum())
     stated = {
-        "surfels kept": statistics.get("surfels", {}).get("kept"),
-        "texels kept": statistics.get("texels", {}).get("kept"),
-        "surfels without_tile": statistics.get("surfels", {}).get("without_tile"),
+        "surfels kept": surfels and surfels.kept,
+        "texels kept": texels and texels.kept,
+        "surfels without_tile": surfels and surfels.without_tile,
     }
-    found["surfels without_tile"] = int((~tiled).sum())
-    lean = statistics.get("view_color")
     if lean is not None and "view_terms" in bundle.surfels:
-        stated |= {"view colour sites": lean["sites"]["after"], "surfels of one colour": lean["one_color"]}
+        stated |= {"view colour sites": lean.sites.after, "surfels of one colour": lean.one_color}
         found["view colour sites"] = len(bundle) + len(bundle.surfels["view_terms"])
         found["surfels of one colour"] = int((bundle.surfels["view_span"][:, 1] == 0).sum())
     for name, value in stated.items():
         if value is not None and value != found[name]:
             return Check("statistics", False, f"{name}: {value:,} stated, {found[name]:,} found")
-    error = statistics.get("error")
+    error = statistics.error
     detail = "agree with the files"
     if error is not None:
-        detail += f"; error of a tile at most {error['rms']['p100']:.3f} steps, tolerance {error['tolerance']}"
+        detail += f"; error of a tile at most {_steps(error.rms.p100)} steps, tolerance {error.tolerance:g}"
     if lean is not None:
-        detail += f"; of a view colour at most {lean['error']['p100']:.3f}, tolerance {lean['tolerance']:g}"
+        detail += f"; of a view colour at most {_steps(lean.error.p100)}, tolerance {lean.tolerance:g}"
     return Check("statistics", True, detail)

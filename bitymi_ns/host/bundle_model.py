@@ -21,16 +21,16 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        from bitymi_ns.bake import BundleError, read_bundle
+        from bitymi_ns.bake import REMEDY, BundleError, read_bundle
+        from bitymi_ns.bake.manifest import ATLAS
         from bitymi_ns.scene.baked import BakedScene
 
         folder = Path(self.config.bundle)
         try:
             bundle = read_bundle(folder)
         except BundleError as error:
-            fail(f"{error}. Export the scene again with ns-export bitymi-atlas.", error)
-        atlas = bundle.info.get("atlas")
-        self._atlas_bytes = bundle.info["files"][atlas["file"]]["bytes"] if atlas else 0
+            fail(f"{error}. {REMEDY}", error)
+        self._atlas_bytes = bundle.info.files[ATLAS].bytes if ATLAS in bundle.info.files else 0
         self._scene = [BakedScene.from_bundle(bundle)]  # in a list: it has no parameters to register
         self._count = len(bundle)
 

@@ -26,7 +26,7 @@ from rich.table import Table
 from bitymi_ns.bake import BakeOptions, BundleError, TuneOptions, bake, export, read_bundle, rich_progress, tune_atlas
 from bitymi_ns.bake.bundle import World
 from bitymi_ns.bake.folder import check_target
-from bitymi_ns.bake.manifest import MANIFEST, SURFELS, dump
+from bitymi_ns.bake.manifest import MANIFEST, SURFELS, HeldOut, dump
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.host.bundle_config import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
@@ -124,9 +124,9 @@ class ExportAtlas(BakeOptions):
 
             scene = BakedScene.from_bundle(bundle)
             held_out = compare(model, datamanager, lambda c: scene.render(c, background=torch.tensor(background)).rgb)
-            bundle.info["statistics"]["held_out"] = held_out
+            bundle.info.statistics.held_out = HeldOut(**held_out)
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
-        print_summary(self.output_dir, bundle.info)
+        print_summary(self.output_dir, bundle.info.model_dump(mode="json"))
 
 
 def default_export() -> ExportAtlas:

@@ -37,7 +37,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         scene, background = BakedScene.from_bundle(bundle), model.background.cpu()
         rows = held_out_psnr(model, datamanager, lambda c: scene.render(c, background=background).rgb, views)
         worst, photos = min(row[0] for row in rows), sum(row[2] - row[1] for row in rows) / len(rows)
-        stated = bundle.info["statistics"].get("held_out", {}).get("psnr_baked_against_neural_worst")
+        stated = bundle.info.statistics.held_out and bundle.info.statistics.held_out.psnr_baked_against_neural_worst
         detail = f"at least {worst:.2f} dB in {len(rows)} views"
         detail += "" if stated is None else f" (stated {stated:.2f})"
         detail += f"; against the photographs {photos:+.3f} dB"

@@ -18,7 +18,7 @@ from bitymi_ns.ops.trace_cpu import tracers
 from .camera import Camera
 
 if TYPE_CHECKING:
-    from bitymi_ns.bake.bundle import Bundle
+    from bitymi_ns.bake.bundle_reader import Bundle
 
 
 @dataclass
@@ -87,9 +87,9 @@ class BakedScene:
             scale=bundle.scale,
             extent=bundle.extent,
             mean_residual=bundle.mean_residual,
-            near=info["render"]["near"],
-            weight_bound=info["render"]["weight_bound"],
-            prefilter=info["render"].get("prefilter", "low_pass"),
+            near=info.render.near,
+            weight_bound=info.render.weight_bound,
+            prefilter=info.render.prefilter,
             blocks=bundle.blocks,
         )
 

@@ -136,10 +136,10 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     export(baked, tmp_path / "b", statistics={"options": vars(options)})
     bundle, checks = check_files(tmp_path / "b")
     assert all(check.ok for check in checks) and bundle.view_color == kind
-    assert bundle.info["version"] == "2.0" and bundle.info["surfels"]["terms"] == len(bundle.surfels["view_terms"])
+    assert bundle.info.version == "2.1" and bundle.info.surfels.terms == len(bundle.surfels["view_terms"])
     for name in LEAN:
         assert torch.equal(bundle.surfels[name], baked.surfels[name])
-    stated = bundle.info["statistics"]["view_color"]
+    stated = bundle.info.statistics.view_color.model_dump()
     assert stated["error"]["p100"] <= 2.0 and stated["sites"]["after"] < stated["sites"]["before"]
     assert stated["one_color"] == int((bundle.surfels["view_span"][:, 1] == 0).sum())
     check = check_view_color(bundle, made.surfels, cameras)
@@ -148,7 +148,7 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     assert "view_color" not in full.statistics and set(full.surfels) == set(made.surfels)
     export(full, tmp_path / "full")
     whole = read_bundle(tmp_path / "full")
-    assert whole.info["version"] == "1.1" and check_view_color(whole, made.surfels, cameras).ok
+    assert whole.info.version == "1.2" and check_view_color(whole, made.surfels, cameras).ok
     saved = stated["bytes"]["before"] - stated["bytes"]["after"]
     sizes = [(tmp_path / name / "surfels.ply").stat().st_size for name in ("full", "b")]
     assert abs(sizes[0] - sizes[1] - saved) < 2500  # the header names fewer columns

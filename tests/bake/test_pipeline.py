@@ -50,19 +50,21 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
     made.surfels["log_scales"][8, 0] = 1e30
     made.surfels["quats"][9] = 0.0
     made.surfels["sv_rgb"][10, 3, 1] = float("inf")
+    made.surfels["sv_rgb"][11, 0, 0] = 1e4  # no bundle holds that
+    made.surfels["means"][12, 2] = -1e12
     baked = bake(made)
     assert baked.statistics["surfels"] == {
         "trained": 100,
-        "kept": 89,
-        "left_out": {"not_finite": 4, "transparent": 7},
+        "kept": 87,
+        "left_out": {"not_finite": 4, "beyond_limits": 2, "transparent": 7},
         "without_tile": int((baked.packing.tiles[:, 3] == 0).sum()),
     }
-    assert baked.rows.tolist() == list(range(11, 100))
-    torch.testing.assert_close(baked.surfels["means"], made.surfels["means"][11:])
+    assert baked.rows.tolist() == list(range(13, 100))
+    torch.testing.assert_close(baked.surfels["means"], made.surfels["means"][13:])
     export(baked, tmp_path / "b", statistics={"psnr": 30.0})
     info = read_bundle(tmp_path / "b").info
-    assert info["statistics"]["surfels"]["left_out"]["transparent"] == 7 and info["statistics"]["psnr"] == 30.0
-    assert info["render"]["near"] == 0.25 and info["atlas"]["extent"] == 3.0
+    assert info.statistics.surfels.left_out["transparent"] == 7 and info.statistics.psnr == 30.0
+    assert info.render.near == 0.25 and info.atlas.extent == 3.0
 
 
 def test_nothing_left_is_an_error(scene):
@@ -121,7 +123,7 @@ def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
     assert baked.atlas is None and baked.texels is None and not baked.packing.tiles.any()
     export(baked, tmp_path / "b")
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.atlas is None and not loaded.tiles.any() and loaded.info["atlas"] is None
+    assert loaded.atlas is None and not loaded.tiles.any() and loaded.info.atlas is None
     with pytest.raises(ValueError):
         baked.with_texels(torch.zeros(1, 4, 4, 3))
 

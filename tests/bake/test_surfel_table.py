@@ -87,7 +87,7 @@ def test_extents_and_mean_residuals_are_optional_columns(surfels):
     columns = to_columns(params, TILES, residual, extent)
     assert torch.equal(tile_extents(columns, 3.0), extent) and torch.equal(mean_residuals(columns), residual)
     columns["tile_extent"] = np.float32([1, 0, 1, 1, 1])
-    with pytest.raises(PlyError, match="tile_extent is not positive in row 1"):
+    with pytest.raises(PlyError, match="tile_extent is 0 in row 1; it must be from 1e-06 to 16"):
         tile_extents(columns, 3.0)
     del columns["residual_2"]
     with pytest.raises(PlyError, match="residual_2 is missing"):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, check_view_color, export, ply
+from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, check_view_color, export
 from bitymi_ns.cli import main
+from tests.bake.damage import amend, change_columns
 
 
 @pytest.fixture
@@ -21,26 +20,6 @@ def made(scene, camera, tmp_path):
     options = BakeOptions(format="uint8", tolerance=0.2)
     export(bake(trained, views, options), tmp_path / "b", statistics={"options": vars(options)})
     return tmp_path / "b", trained, views
-
-
-def restate(folder: Path, change=None) -> None:
-    """Gives the files the hashes that they have now, after change(bundle.json)."""
-    info = json.loads((folder / "bundle.json").read_text())
-    if change is not None:
-        change(info)
-    for name, entry in info["files"].items():
-        data = (folder / name).read_bytes()
-        entry.update(bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
-    (folder / "bundle.json").write_text(json.dumps(info))
-
-
-def change_columns(folder: Path, change) -> None:
-    """Rewrites surfels.ply after change(columns), and its hash."""
-    elements = ply.parse_ply((folder / "surfels.ply").read_bytes())
-    columns = elements.pop("vertex")
-    change(columns)
-    ply.write_ply(folder / "surfels.ply", columns, more=elements)
-    restate(folder)
 
 
 def failures(folder: Path) -> list[str]:
@@ -122,7 +101,7 @@ def test_tiles_that_overlap_or_break_blocks_are_found(made):
 
 
 def test_statistics_that_do_not_fit_the_files_are_found(made):
-    restate(made[0], lambda info: info["statistics"]["surfels"].update(kept=7))
+    amend(made[0], lambda info: info["statistics"]["surfels"].update(kept=7))
     assert failures(made[0]) == ["statistics"]
 
 
@@ -131,7 +110,7 @@ def test_texels_that_do_not_hold_the_field_are_found_behind_a_good_hash(made):
     data = bytearray((folder / "atlas.ktx2").read_bytes())
     data[-4096:] = bytes(255 - value for value in data[-4096:])
     (folder / "atlas.ktx2").write_bytes(data)
-    restate(folder)
+    amend(folder)
     bundle, checks = check_files(folder)
     assert all(check.ok for check in checks)
     assert not check_field(bundle, trained.field, views).ok

@@ -1,0 +1,251 @@
+"""Reading a bundle: every size is known from a header before more is read, and every file is read once."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake import ktx2, ply
+from bitymi_ns.bake.limits import RESIDUAL_LIMIT
+from bitymi_ns.bake.manifest import ATLAS, MANIFEST, SUPPORT, SURFELS, BundleError, FileEntry, Manifest, parse
+from bitymi_ns.bake.quantise import decode_pages
+from bitymi_ns.bake.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
+
+REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
+"""What to do about a damaged bundle."""
+_MANIFEST_LIMIT = 64 << 20
+_HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
+_CHUNK = 1 << 22
+
+
+@dataclass
+class Bundle:
+    """A loaded bundle.
+
+    Attributes:
+        surfels: per-surfel parameters as in docs/architecture.md, float32 on the CPU; the view colour may be lean
+            (`ops.view_color.LEAN`).
+        view_color: sv, sh, sb or sg.
+        tiles: [N, 5] int32 (x, y, layer, r_u, r_v), zeros for a surfel without a tile.
+        atlas: [layers, height, width, 4] uint8 (bc7, uint8) or float32 (fp16); None when the scene has no texture, or
+            its blocks were not decoded.
+        blocks: [layers, height / 4, width / 4, 16] uint8, the atlas as it is in the file; None unless it is BC7.
+        offset, scale: residual colour = offset + scale * value, value = stored / 255 for uint8, stored for float32.
+        extent: [N] float32 half side of the tile in scale units.
+        mean_residual: [N, 3] float32 mean of the tile; the residual of a surfel without a tile.
+        info: bundle.json.
+    """
+
+    surfels: dict[str, Tensor]
+    view_color: str
+    tiles: Tensor
+    atlas: Tensor | None
+    blocks: Tensor | None
+    offset: float
+    scale: float
+    extent: Tensor
+    mean_residual: Tensor
+    info: Manifest
+
+    def __len__(self) -> int:
+        return len(self.tiles)
+
+    def residuals(self) -> Tensor:
+        """Residual colours of the atlas: [layers, height, width, 3] float32."""
+        if self.atlas is None:
+            raise BundleError("the bundle has no atlas" if self.blocks is None else "the atlas was not decoded")
+        rgb = self.atlas[..., :3].float()
+        unorm = rgb / 255.0 if self.atlas.dtype == torch.uint8 else rgb
+        return unorm * self.scale + self.offset
+
+
+def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) -> Bundle:
+    """Loads a bundle.
+
+    Args:
+        folder: the bundle's folder.
+        verify: compare every file with its sha256 (sizes are always compared).
+        decode: also decode a BC7 atlas, four bytes a texel; a CUDA device draws from the blocks alone.
+
+    Raises:
+        BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
+            new, or there is too little memory.
+    """
+    folder = Path(folder)
+    info = read_manifest(folder)
+    with enough_memory(folder, info):
+        return assemble(folder, info, {name: read_file(folder, info, name, verify) for name in info.files}, decode)
+
+
+def verify_bundle(folder: str | Path) -> Manifest:
+    """Checks everything `read_bundle` checks, hashes included, and returns bundle.json."""
+    return read_bundle(folder, verify=True).info
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """bundle.json of a bundle, checked as far as it can be without the other files.
+
+    Raises:
+        BundleError: it is missing, malformed or altered, or a value is out of range.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise BundleError(f"{folder} is not a bundle: it has no {MANIFEST}")
+    try:
+        if path.stat().st_size > _MANIFEST_LIMIT:
+            raise BundleError(f"{path} is too large for a bundle.json")
+        return parse(path.read_bytes(), str(path))
+    except OSError as error:
+        raise BundleError(f"{path} cannot be read: {error}") from error
+
+
+def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> bytearray:
+    """The bytes of a file that bundle.json lists: all of surfels.ply and atlas.ktx2, none of others.
+
+    Args:
+        folder: the bundle's folder.
+        info: bundle.json.
+        name: one of `info.files`.
+        verify: compare the file with its sha256, while it is read.
+
+    Raises:
+        BundleError: the file is missing, its size or hash is not the one stated, or its header contradicts its size or
+            bundle.json. What the header says is checked before more than it is read.
+    """
+    path = folder / name
+    check = {SURFELS: _check_surfels_header, ATLAS: _check_atlas_header}.get(name)
+    try:
+        return _read(path, info.files[name], verify, None if check is None else lambda *head: check(info, *head))
+    except (ply.PlyError, ktx2.Ktx2Error) as error:
+        raise BundleError(f"{path}: {error}") from error
+    except OSError as error:
+        raise BundleError(f"{path} cannot be read: {error}") from error
+
+
+def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
+    """The bundle of what `read_file` read.
+
+    Args:
+        folder: the bundle's folder, for messages.
+        info: bundle.json.
+        files: contents of surfels.ply and atlas.ktx2 by name.
+        decode: as in `read_bundle`.
+
+    Raises:
+        BundleError: a file is malformed, or a value is out of range.
+    """
+    path = folder / SURFELS
+    kind = info.surfels.view_color
+    try:
+        elements = ply.parse_ply(files[SURFELS])
+        columns = elements["vertex"]
+        surfels, tiles = from_columns(columns, kind, elements.get(TERMS))
+        extent = tile_extents(columns, info.atlas.extent if info.atlas else SUPPORT)
+        mean_residual = mean_residuals(columns)
+    except ply.PlyError as error:
+        raise BundleError(f"{path}: {error}") from error
+    _check_tiles(tiles, info, path)
+    if info.atlas is None:
+        return Bundle(surfels, kind, tiles, None, None, 0.0, 1.0, extent, mean_residual, info)
+    try:
+        image = ktx2.parse_ktx2(files[ATLAS])
+    except ktx2.Ktx2Error as error:
+        raise BundleError(f"{folder / ATLAS}: {error}") from error
+    atlas, blocks = _texels(image, decode, folder / ATLAS)
+    offset, scale = info.atlas.offset, info.atlas.scale
+    return Bundle(surfels, kind, tiles, atlas, blocks, offset, scale, extent, mean_residual, info)
+
+
+@contextmanager
+def enough_memory(folder: Path, info: Manifest) -> Iterator[None]:
+    """Reports a lack of memory as a BundleError with the size of the files."""
+    try:
+        yield
+    except MemoryError as error:
+        size = sum(entry.bytes for entry in info.files.values())
+        raise BundleError(f"{folder} needs more memory than there is: its files have {size / 1e6:.0f} MB") from error
+
+
+def _read(path: Path, entry: FileEntry, verify: bool, check: Callable[[bytes, int], None] | None = None) -> bytearray:
+    """The file's bytes, kept where there is a `check`, which is called with the head and the size of the file."""
+    if not path.is_file():
+        raise BundleError(f"{path} is missing")
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size != entry.bytes:
+            problem = "truncated" if size < entry.bytes else "altered"
+            raise BundleError(f"{path} is {problem}: it has {size} bytes, {entry.bytes} were written")
+        if check is None and not verify:
+            return bytearray()
+        at, sha256 = 0, hashlib.sha256()
+        head = file.read(min(size, _HEAD))
+        if check is not None:
+            check(head, size)
+        file.seek(0)
+        data = bytearray(size if check is not None else min(size, _CHUNK))
+        view = memoryview(data)
+        while at < size:
+            window = view[at : at + _CHUNK] if check is not None else view[: size - at]
+            count = file.readinto(window)  # type: ignore[attr-defined]
+            if not count:
+                raise BundleError(f"{path} is truncated: it ended after {at} bytes while it was read")
+            if verify:
+                sha256.update(window[:count])
+            at += count
+    if verify and sha256.hexdigest() != entry.sha256:
+        raise BundleError(f"{path} is altered: its sha256 is not the one in {MANIFEST}")
+    return data if check is not None else bytearray()
+
+
+def _check_surfels_header(info: Manifest, head: bytes, size: int) -> None:
+    elements = ply.read_header(head, size).elements
+    count, terms = elements["vertex"][0], elements[TERMS][0] if TERMS in elements else None
+    if count != info.surfels.count:
+        raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {info.surfels.count}")
+    if terms != info.surfels.terms:
+        raise ply.PlyError(f"it has {terms} view-colour terms, surfels.terms of {MANIFEST} says {info.surfels.terms}")
+
+
+def _check_atlas_header(info: Manifest, head: bytes, size: int) -> None:
+    header, stated = ktx2.read_header(head, size), info.atlas
+    found = (header.format, header.width, header.height, header.layers)
+    if stated is None or found != (stated.format, stated.width, stated.height, stated.layers):
+        raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
+
+
+def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
+    """Refuses tiles that reach out of the atlas."""
+    layers, height, width = (info.atlas.layers, info.atlas.height, info.atlas.width) if info.atlas else (1, 0, 0)
+    x, y, layer, r_u, r_v = tiles.long().unbind(1)
+    good = (tiles >= 0).all(1) & (x + r_u <= width) & (y + r_v <= height) & (layer < layers)
+    good &= (r_u > 0) == (r_v > 0)
+    if not good.all():
+        raise BundleError(f"{source}: the tile of surfel {int(torch.nonzero(~good)[0])} lies outside the atlas")
+
+
+def _texels(image: ktx2.Ktx2Image, decode: bool, source: Path) -> tuple[Tensor | None, Tensor | None]:
+    """The texels, and the BC7 blocks where the atlas has such."""
+    blocks = None
+    if image.format == "bc7":
+        pages = [np.frombuffer(page, np.uint8) for page in image.payload]
+        blocks = torch.from_numpy(np.stack(pages).reshape(len(pages), image.height // 4, image.width // 4, 16))
+        if not decode:
+            return None, blocks
+    texels = decode_pages(image.payload, image.format, image.width, image.height)
+    if image.format != "fp16":
+        return torch.from_numpy(texels), blocks
+    bad = ~(np.abs(texels) <= RESIDUAL_LIMIT)
+    if bad.any():
+        layer, y, x, _ = (int(i) for i in np.argwhere(bad)[0])
+        raise BundleError(
+            f"{source}: the texel ({x}, {y}) of layer {layer} is not from {-RESIDUAL_LIMIT:g} to {RESIDUAL_LIMIT:g}"
+        )
+    return torch.from_numpy(texels.astype(np.float32)), None

@@ -1,0 +1,40 @@
+"""Bundles that were changed on purpose and signed again, as a determined forger would."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bitymi_ns.bake import ply, strict_json
+
+
+def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) -> bytes:
+    """bundle.json of `info` with its digest, and with the sizes and hashes of `files`, where they are given."""
+    info = {key: value for key, value in info.items() if key != "digest"}
+    if files is not None:
+        names = info["files"]
+        info["files"] = {
+            name: {"bytes": len(files[name]), "sha256": hashlib.sha256(files[name]).hexdigest()} for name in names
+        }
+    return json.dumps({**info, "digest": strict_json.digest(info)}).encode()
+
+
+def amend(folder: Path, change: Callable[[dict[str, Any]], object] = lambda info: None) -> None:
+    """Rewrites bundle.json after change(bundle.json), with the hashes that the files have now and its digest."""
+    info = json.loads((folder / "bundle.json").read_text())
+    files = {name: (folder / name).read_bytes() for name in info["files"]}
+    info = json.loads(signed(info, files))
+    change(info)
+    (folder / "bundle.json").write_bytes(signed(info))
+
+
+def change_columns(folder: Path, change: Callable[..., object], element: str = "vertex") -> None:
+    """Rewrites surfels.ply after change(columns of the element), its hash and the digest."""
+    elements = ply.parse_ply((folder / "surfels.ply").read_bytes())
+    change(elements[element])
+    columns = elements.pop("vertex")
+    ply.write_ply(folder / "surfels.ply", columns, more=elements)
+    amend(folder)

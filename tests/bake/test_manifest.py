@@ -1,0 +1,112 @@
+"""bundle.json: no change goes unnoticed, and every refusal is one sentence."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from bitymi_ns.bake import strict_json
+from bitymi_ns.bake.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
+from bitymi_ns.bake.manifest import Atlas, BundleError, describe, dump, parse
+from bitymi_ns.ops.view_color import MAX_TERMS
+from tests.bake.damage import signed
+
+INFO = {
+    "format": "bitymi-bundle",
+    "version": "1.2",
+    "surfels": {"count": 3, "view_color": "sv"},
+    "atlas": None,
+    "render": {"near": 0.2, "weight_bound": 0.02, "background": [0, 0.5, 1]},
+    "world": {"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1.0},
+    "bounds": {"min": [0, 0, 0], "max": [1, 1, 1]},
+    "statistics": {"views": 7, "never": None, "surfels": {"kept": 3}},
+    "files": {"surfels.ply": {"bytes": 10, "sha256": "0" * 64}},
+}
+
+
+def refusal(data: bytes) -> str:
+    with pytest.raises(BundleError) as refused:
+        parse(data, "b/bundle.json")
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
+    return str(refused.value)
+
+
+def test_what_is_written_is_read_and_nothing_is_added_by_writing_again():
+    manifest = describe(INFO)
+    data = dump(manifest)
+    assert parse(data) == manifest.model_copy(update={"digest": json.loads(data)["digest"]})
+    assert dump(parse(data)) == data
+    stated = json.loads(data)
+    assert stated["statistics"] == INFO["statistics"] and stated["atlas"] is None and "held_out" not in stated
+    assert stated["render"]["alpha_max"] == 0.99 and "terms" not in stated["surfels"]
+
+
+def test_a_digest_covers_everything_else_and_not_the_layout():
+    data = dump(describe(INFO))
+    info = json.loads(data)
+    backwards = dict(reversed(info.items()))
+    assert parse(json.dumps(backwards).encode()) == parse(data)
+    found = strict_json.digest({key: value for key, value in info.items() if key != "digest"})
+    assert info["digest"] == found
+
+    for change in ({"generator": "other"}, {"note": 1}, {"statistics": {}}, {"version": "1.1"}):
+        edited = {**info, **change}
+        message = refusal(json.dumps(edited).encode())
+        assert "is altered: its digest is not that of its contents" in message
+        right = message.rsplit('"', 2)[1]  # what the message says to do when the edit was meant
+        assert parse(json.dumps({**edited, "digest": right}).encode()).digest == right
+
+
+def test_bundles_of_earlier_versions_have_no_digest_and_later_ones_must():
+    for version, lean in (("1.0", {}), ("1.1", {}), ("2.0", {"terms": 4})):
+        info = {**INFO, "version": version, "surfels": {**INFO["surfels"], **lean}}
+        assert parse(json.dumps(info).encode()).digest is None
+        near = {**info, "render": {**INFO["render"], "near": -1}}
+        assert "render.near must be greater than or equal" in refusal(json.dumps(near).encode())
+    for version in ("1.2", "1.10", "2.1", "0.9"):
+        message = refusal(json.dumps({**INFO, "version": version}).encode())
+        assert 'digest is missing; if you have edited it on purpose, set "digest" to "' in message
+    assert "update bitymi-ns" in refusal(signed({**INFO, "version": "3.0"}))
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        (b'"count": 3, "count": 3', "the key 'count' is there twice"),
+        (b'"count": NaN', "NaN is not a finite number"),
+        (b'"count": -Infinity', "-Infinity is not a finite number"),
+        (b'"count": 1e999', "1e999 is not a finite number"),
+        (b'"count": ' + b"9" * 5000, "cannot be read as JSON"),
+        (b'"count": ' + b"[" * 100_000, "nested too deeply"),
+        (b'"count": ' + b"[" * 400 + b"]" * 400, "recursion limit"),
+        (b'"count": 03', "cannot be read as JSON"),
+        (b'"count": "\xff"', "cannot be read as JSON"),
+        (b'"count": "\\ud800"', "cannot be read|hex escape"),
+    ],
+    ids=lambda value: str(value[:24]),
+)
+def test_traps_of_json_are_refused(text, reason):
+    data = signed(INFO).replace(b'"count": 3', text)
+    assert re.search(reason, refusal(data))
+
+
+def test_a_value_that_would_be_refused_is_not_written():
+    with pytest.raises(BundleError, match="cannot be described: render.near must be"):
+        describe({**INFO, "render": {**INFO["render"], "near": 0.0}})
+    manifest = describe(INFO)
+    manifest.render.near = float("nan")
+    with pytest.raises(BundleError, match="render.near"):
+        dump(manifest)
+
+
+def test_the_limits_keep_colours_below_the_stated_bound():
+    lobes = (1 + MAX_TERMS) * COLOR_LIMIT + MAX_TERMS * 0.1  # softplus adds 0.1 at 0
+    harmonics = COLOR_LIMIT * 16 * (16 / 12.57) ** 0.5  # the squares of the basis add up to 16 / 4 pi
+    residual = 3 * RESIDUAL_LIMIT  # the largest offset and the largest scale
+    atlas = {"format": "bc7", "width": 4, "height": 4, "layers": 1, "offset": RESIDUAL_LIMIT}
+    Atlas.model_validate({**atlas, "scale": 2 * RESIDUAL_LIMIT})
+    with pytest.raises(ValueError):
+        Atlas.model_validate({**atlas, "scale": 2.01 * RESIDUAL_LIMIT})
+    assert max(lobes, harmonics) + 0.5 + residual + 1.0 < BRIGHTEST

@@ -15,17 +15,19 @@ from bitymi_ns.bake.evaluate import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops import (
+    Fragments,
     TexelFragments,
     TexelTiles,
     add_texel_gradient,
     composite_image,
+    fitting_lists,
     project,
     shade,
     texel_image,
-    trace,
     view_color,
 )
 from bitymi_ns.train.losses import photometric, psnr
+from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import View, as_float, over_background, training_order
 
 FEWEST_VIEWS = 4
@@ -51,8 +53,9 @@ class TuneOptions:
     """How often these views are looked at over the run."""
     patience: int = 6
     """Looks without a gain after which the run ends."""
-    cache_bytes: int = 4 << 30
-    """Memory for the fragments of the views; what does not fit is traced anew at every step."""
+    cache_bytes: int = 1_000_000_000
+    """Memory for the fragments of the views, first of those set aside, which are looked at most often; what does not
+    fit is traced anew whenever it is needed."""
     seed: int = 0
     """Of the order of the views."""
 
@@ -86,7 +89,8 @@ class TexelView:
     @property
     def nbytes(self) -> int:
         """Memory that it takes."""
-        return self.fragments.nbytes + sum(a.numel() * a.element_size() for a in (self.base, self.rest, self.target))
+        arrays = (self.base, self.rest, self.target, *(() if self.mask is None else (self.mask,)))
+        return self.fragments.nbytes + sum(array.nbytes for array in arrays)
 
 
 class TexelScene:
@@ -140,10 +144,16 @@ class TexelScene:
         p, camera = self._baked.surfels, view.camera.to("cpu")
         geometry = (p[name] for name in ("means", "quats", "log_scales", "opacity_logits", "beta_raw"))
         projection = project(*geometry, camera, self._baked.near, self._baked.prefilter == "pixel")
-        fragments = trace(projection)
         base = view_color(self._baked.view_color, p, p["means"], camera.exact_center, projection.visible)
-        plain = composite_image(fragments, projection, shade(fragments, base, projection.frames))
-        chosen = TexelFragments.of(fragments, fragments.weight >= self._baked.weight_bound)
+        drawn: list[Tensor] = []
+
+        def chosen_lists() -> Iterator[tuple[Fragments, Tensor]]:
+            for fragments in fitting_lists(projection):
+                drawn.append(composite_image(fragments, projection, shade(fragments, base, projection.frames)))
+                yield fragments, fragments.weight >= self._baked.weight_bound
+
+        chosen = TexelFragments.of_lists(chosen_lists())
+        plain = torch.cat(drawn)
         without = texel_image(chosen, base, self.texels, self.tiles, bound=math.inf)  # their colours without residual
         rest = plain[:, :3] - without + (1 - plain[:, 3:4]) * self._background
         size = (camera.height, camera.width)
@@ -162,10 +172,10 @@ class TexelScene:
 
 
 class TexelViews(Sequence[TexelView]):
-    """Views of a scene, traced when they are needed and kept while there is memory for them."""
+    """Views of a scene, traced when they are needed and kept while there is room for them."""
 
-    def __init__(self, scene: TexelScene, views: Sequence[View], memory: int) -> None:
-        self._scene, self._views, self._memory = scene, views, memory
+    def __init__(self, scene: TexelScene, views: Sequence[View], room: Room) -> None:
+        self._scene, self._views, self._room = scene, views, room
         self._kept: dict[int, TexelView] = {}
 
     def __len__(self) -> int:
@@ -175,14 +185,16 @@ class TexelViews(Sequence[TexelView]):
         if index in self._kept:
             return self._kept[index]
         view = self._scene.view(self._views[index])
-        if view.nbytes <= self._memory:
-            self._memory -= view.nbytes
+        if self._room.take(view.nbytes):
             self._kept[index] = view
         return view
 
-    def psnr(self, texels: Tensor) -> float:
+    def psnr(self, texels: Tensor, progress: Progress = no_progress) -> float:
         """Mean dB over the views."""
-        values = [psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask) for view in self]
+        values = []
+        for view in self:
+            values.append(psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask))
+            progress("looking at the set-aside views", len(values), len(self))
         return sum(values) / len(values)
 
 
@@ -220,9 +232,11 @@ def tune_atlas(
         return replace(baked, statistics={**baked.statistics, "finetune": {"steps": 0, "views": len(views)}})
     started, cpu_started = time.perf_counter(), time.process_time()
     scene = TexelScene(baked, background)
-    held_in = TexelViews(scene, views[:: options.held_in_every], options.cache_bytes // options.held_in_every)
-    rest = [view for i, view in enumerate(views) if i % options.held_in_every]
-    tuned = TexelViews(scene, rest, options.cache_bytes - options.cache_bytes // options.held_in_every)
+    room, every = Room(options.cache_bytes), options.held_in_every
+    held_in, tuned = (
+        TexelViews(scene, OnDemand(len(rows), lambda i, rows=rows: views[rows[i]]), room)
+        for rows in (range(0, len(views), every), [i for i in range(len(views)) if i % every])
+    )
     texels, curve = _descend(scene, tuned, held_in, options, progress)
     statistics: dict[str, Any] = {
         "views": len(tuned),
@@ -237,7 +251,7 @@ def tune_atlas(
     if "error" in baked.statistics:
         statistics["error_before"] = baked.statistics["error"]  # of the texels as baked, against the field
     if eval_views:
-        held_out = TexelViews(scene, eval_views, 0)
+        held_out = TexelViews(scene, eval_views, Room(0))
         both = {"before": held_out.psnr(scene.texels), "after": held_out.psnr(texels)}
         statistics["psnr_held_out"] = {name: round(value, 4) for name, value in both.items()}
     result = scene.baked(texels, progress)
@@ -248,9 +262,9 @@ def _descend(
     scene: TexelScene, views: TexelViews, held_in: TexelViews, options: TuneOptions, progress: Progress
 ) -> tuple[Tensor, list[tuple[int, float]]]:
     """The texels [T, 3] that show the set-aside views best, and the curve: (step, dB over these views)."""
+    best, curve = scene.texels, [(0, held_in.psnr(scene.texels, progress))]  # first: these views are kept first
     inverse = 1.0 / (coverage(scene, views, progress) + options.prior)  # [T, 1]
     texels, gradient = scene.texels.clone(), torch.zeros_like(scene.texels)
-    best, curve = scene.texels, [(0, held_in.psnr(scene.texels))]
     every = -(-options.steps // options.checks)
     for step in range(options.steps):
         view = views[training_order(len(views), options.seed, step)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -22,6 +23,8 @@ from bitymi_ns.host.capture import (
 )
 from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
 from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES, Photographs
+from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import training_order
 
 FEW_VIEWS = 10
@@ -65,6 +68,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         local_rank: int = 0,
         **kwargs: Any,
     ) -> None:
+        self._room = Room(PHOTOGRAPH_BYTES)
         check_capture(config, images=test_mode != "inference")
         with reporting_input_errors(config):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
@@ -112,19 +116,33 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
                 "from elsewhere will look poor. Twenty or more photographs are advisable."
             )
 
-    def _load_images(
+    def _load_images(  # type: ignore[override]
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
-    ) -> list[dict[str, torch.Tensor]]:
-        # "cpu" means pinned memory there, which needs CUDA; "gpu" means self.device, whatever it is
-        device = cache_images_device if torch.cuda.is_available() else "gpu"
-        with reporting_input_errors(self.config):
-            images = super()._load_images(split, device)  # type: ignore[arg-type]
+    ) -> Sequence[dict[str, torch.Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        # undistorted now, and their intrinsics changed with them
-        if dataset.cameras.distortion_params is not None:
-            dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
+        if torch.device(self.device).type == "cpu":
+            images = Photographs(
+                dataset, self.config.cache_images_type, self._room, self.config, f"Reading the {split} images"
+            )
+        else:
+            with reporting_input_errors(self.config):
+                images = super()._load_images(split, cache_images_device)
+            # undistorted now, and their intrinsics changed with them
+            if dataset.cameras.distortion_params is not None:
+                dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         return images
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of the first training view, without reading it."""
+        cameras = self.train_dataset.cameras
+        return int(cameras.width[0]) * int(cameras.height[0])
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> Sequence[tuple[Cameras, dict[str, Any]]]:  # type: ignore[override]
+        """All held-out views in turn, each read when it is asked for."""
+        _ = self.cached_eval  # undistorts, which changes the intrinsics
+        return OnDemand(len(self.eval_dataset), self.eval_view)
 
     def train_index(self, step: int) -> int:
         """The training view of a step."""

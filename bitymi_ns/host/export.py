@@ -31,10 +31,12 @@ from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.host.bundle_config import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
+from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.views import View, as_float, over_background
 
 INTERRUPTED = 130
@@ -59,6 +61,9 @@ class ExportAtlas(BakeOptions):
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
     finetune_steps: int = TuneOptions.steps
     """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
+    finetune_memory: float = TuneOptions.cache_bytes / 1e9
+    """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
+    not."""
     compare: bool = True
     """Render the held-out views from the bundle and from the trained scene and state the difference."""
 
@@ -89,10 +94,14 @@ class ExportAtlas(BakeOptions):
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
+        tune = TuneOptions(steps=self.finetune_steps, cache_bytes=int(self.finetune_memory * 1e9))
+        finetunes = self.finetune_steps != 0 and not self.exact and model.scene.field is not None
+        if model.device.type == "cpu":
+            state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
         try:
             with rich_progress() as progress:
                 baked = bake(model.scene, views, options, progress)
-                if self.finetune_steps and not self.exact and baked.atlas is not None:
+                if finetunes and baked.atlas is not None:
                     photos = photographs(views, datamanager.train_view)
                     shown = range(len(datamanager.eval_dataset) if self.compare else 0)
                     held_out = [to_camera(datamanager.eval_view(i)[0]) for i in shown]
@@ -100,7 +109,7 @@ class ExportAtlas(BakeOptions):
                         baked,
                         photos,
                         model.background.cpu(),
-                        TuneOptions(steps=self.finetune_steps),
+                        tune,
                         progress,
                         photographs(held_out, datamanager.eval_view),
                     )
@@ -159,10 +168,14 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
     return config, pipeline
 
 
-def photographs(cameras: list[Camera], view: Callable[[int], tuple[Any, dict[str, Any]]]) -> list[View]:
-    """The cameras with their images and masks, which `view` gives by index."""
-    batches = (view(index)[1] for index in range(len(cameras)))
-    return [View(camera, b["image"], b.get("mask")) for camera, b in zip(cameras, batches, strict=True)]
+def photographs(cameras: list[Camera], view: Callable[[int], tuple[Any, dict[str, Any]]]) -> OnDemand[View]:
+    """The cameras with their images and masks, which `view` gives by index whenever they are asked for."""
+
+    def photograph(index: int) -> View:
+        batch = view(index)[1]
+        return View(cameras[index], batch["image"], batch.get("mask"))
+
+    return OnDemand(len(cameras), photograph)
 
 
 @torch.no_grad()

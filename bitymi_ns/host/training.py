@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
@@ -16,18 +15,19 @@ from torch.nn import Parameter
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
 from bitymi_ns.host.errors import fail
+from bitymi_ns.host.memory import state_training
 from bitymi_ns.train import bounds
 from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.trainer import LossWatch, training_step
 from bitymi_ns.train.views import ReducedViews, View, as_float, over_background
 
 if TYPE_CHECKING:
-    from bitymi_ns.host.datamanager import BitymiDataManager
     from bitymi_ns.host.model import BitymiModel
 
 
@@ -82,13 +82,21 @@ class TrainingRun:
         for sentence in bounds.short_run(self.schedule, len(self.datamanager.train_dataset)):
             CONSOLE.print(sentence, soft_wrap=True)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
-        self.views = ReducedViews(_TrainViews(self.datamanager), model.device)
+        if model.device.type == "cpu":
+            train = self.datamanager.train_dataset.cameras
+            state_training(model.scene, OnDemand(len(train), lambda i: to_camera(train[i : i + 1])), self.strategy.most)
+        views = OnDemand(len(self.datamanager.train_dataset), self._train_view)
+        self.views = ReducedViews(views, model.device)
 
     def callbacks(self) -> list[TrainingCallback]:
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.before),
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self.after),
         ]
+
+    def _train_view(self, index: int) -> View:
+        cameras, batch = self.datamanager.train_view(index)
+        return View(to_camera(cameras), batch["image"], batch.get("mask"))
 
     # state
 
@@ -230,17 +238,3 @@ class TrainingRun:
             )
         first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
         return first, second
-
-
-class _TrainViews(Sequence):
-    """The data manager's training views in the form that the training code takes, read when they are asked for."""
-
-    def __init__(self, datamanager: BitymiDataManager) -> None:
-        self._datamanager = datamanager
-
-    def __len__(self) -> int:
-        return len(self._datamanager.train_dataset)
-
-    def __getitem__(self, index: Any) -> View:
-        cameras, batch = self._datamanager.train_view(int(index))
-        return View(to_camera(cameras), batch["image"], batch.get("mask"))

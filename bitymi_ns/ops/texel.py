@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -68,17 +69,32 @@ class TexelFragments:
     @classmethod
     def of(cls, fragments: Fragments, keep: Tensor | None = None) -> TexelFragments:
         """The fragments of a view, or those of them that `keep` [F] bool names."""
-        _, _, weight, uv, _, _ = fragments.arrays
-        surfel, pixel, tile_start = fragments.surfel, fragments.pixel, fragments.tile_start
-        if keep is not None:
-            rows = torch.nonzero(keep).squeeze(1)
-            weight, uv, surfel, pixel = weight[rows], uv[:, rows].contiguous(), surfel[rows], pixel[rows]
-            tile_start = torch.searchsorted(rows, tile_start)
+        return cls.of_lists([(fragments, keep)])
+
+    @classmethod
+    def of_lists(cls, lists: Iterable[tuple[Fragments, Tensor | None]]) -> TexelFragments:
+        """The same of a view whose fragments come in several lists, from top to bottom."""
+        parts: list[tuple[Tensor, ...]] = []
+        starts, count, height, width = [torch.zeros(1, dtype=torch.int64)], 0, 0, 0
+        for fragments, keep in lists:
+            _, _, weight, uv, _, _ = fragments.arrays
+            surfel, pixel, tile_start = fragments.surfel, fragments.pixel, fragments.tile_start
+            width = fragments.width
+            if keep is not None:
+                rows = torch.nonzero(keep).squeeze(1)
+                weight, uv, surfel, pixel = weight[rows], uv[:, rows].contiguous(), surfel[rows], pixel[rows]
+                tile_start = torch.searchsorted(rows, tile_start)
+            parts.append((weight, uv, surfel, pixel + height * width if height else pixel))
+            starts.append(tile_start[1:] + count)
+            count, height = count + len(surfel), height + fragments.height
+        weight, uv, surfel, pixel = (
+            column[0] if len(column) == 1 else torch.cat(column, dim=-1) for column in zip(*parts, strict=True)
+        )
         new = torch.ones(len(surfel) + 1, dtype=torch.bool)
         new[1:-1] = surfel[1:] != surfel[:-1]
         run_start = torch.nonzero(new).squeeze(1) if len(surfel) else torch.zeros(1, dtype=torch.int64)
         order = torch.argsort(surfel[run_start[:-1]], stable=True)
-        return cls(weight, uv, surfel, pixel, tile_start, run_start, order, fragments.width, fragments.height)
+        return cls(weight, uv, surfel, pixel, torch.cat(starts), run_start, order, width, height)
 
     def __len__(self) -> int:
         return self.weight.shape[0]

@@ -109,7 +109,7 @@ def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) ->
         projection: of `project`; geom [N, 16].
         rim: lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1.
         most: fragments that there may be; 0 = on a CUDA device as many as its free memory holds together with what
-            shading, blending and their backward pass need; None = as many as there are.
+            shading, blending and their backward pass need, on the CPU `trace_cpu.MOST`; None = as many as there are.
 
     Raises:
         TooManyFragments: there are more, or their list does not fit the memory of the CUDA device.

@@ -13,6 +13,10 @@ from .backend import kernel, kernel_class
 from .errors import TooManyFragments
 from .project import Projection
 
+MOST = 1 << 25
+"""Fragments of a list whose length memory decides: 1.9 GB with what shading, blending and their backward pass add, 56
+bytes per fragment. Fixed, so that what is computed does not depend on the machine."""
+
 
 class _Tracers:
     """Tracers keep their memory from view to view; one is used by one thread at a time."""
@@ -40,7 +44,7 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
     Args:
         geom: [N, 16] without graph.
         projection: the view's.
-        most: fragments that there may be; 0 or None = any number.
+        most: fragments that there may be; 0 = `MOST`, None = any number.
 
     Returns:
         layout (tile_start), tile_start, surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
@@ -49,8 +53,9 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
         TooManyFragments: there are more than `most`.
     """
     camera = projection.camera
+    most = MOST if most == 0 else most or 0
     tracer = tracers.take(geom)
-    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near)
+    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near, most)
     if most and n > most:
         tracers.give(tracer)
         raise TooManyFragments(n, most, camera.width, camera.height, 8 + 5 * geom.element_size())
@@ -61,6 +66,15 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
     tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
     tracers.give(tracer)
     return tile_start, tile_start, surfel, pixel, weight, uv, depth, sigma
+
+
+def count(projection: Projection) -> int:
+    """Number of fragments of a view; their list is not made."""
+    camera, geom = projection.camera, projection.geom.detach()
+    tracer = tracers.take(geom)
+    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near, 1)
+    tracers.give(tracer)
+    return n
 
 
 def backward(

@@ -38,7 +38,7 @@ class SceneConfig:
     """How discs of a pixel or less are drawn: low_pass = never less than a fixed blob around their centre; pixel = as
     much as they cover of a pixel, moments kept (docs/numerics.md)."""
     max_fragments: int = 0
-    """Fragments that are kept at once: views with more are drawn in bands, and once more in the backward pass; 0 = as
-    many as memory holds."""
+    """Fragments that are kept at once: views with more are drawn in bands, and once more in the backward pass; 0 = on a
+    GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""

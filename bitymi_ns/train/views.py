@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -10,6 +11,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.memory import Room
+
+REDUCED_BYTES = 1 << 28
+"""Memory for reduced pictures on the CPU; the others are reduced anew at every use."""
 
 
 class View(NamedTuple):
@@ -24,6 +29,11 @@ class View(NamedTuple):
     camera: Camera
     image: Tensor
     mask: Tensor | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the picture and its mask."""
+        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
 def as_float(image: Tensor) -> Tensor:
@@ -102,8 +112,8 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
 class ReducedViews:
     """Training views at the resolution of the moment; reduced pictures are kept until the resolution changes.
 
-    On a CUDA device the full-size pictures stay there as they came, up to a quarter of the memory that is free at the
-    start: else every step would wait for one to be copied.
+    On the CPU those are kept that fit `REDUCED_BYTES`. On a CUDA device the full-size pictures stay there as they came,
+    up to a quarter of the memory that is free at the start: else every step would wait for one to be copied.
 
     Args:
         views: at full size.
@@ -117,7 +127,9 @@ class ReducedViews:
         self._kept: dict[int, View] = {}
         self._resident: dict[int, View] = {}
         cuda = self._device.type == "cuda"
-        self._room = torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0
+        self._room = Room(torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0)
+        self._reduced_bytes = sys.maxsize if cuda else REDUCED_BYTES
+        self._reduced_room = Room(self._reduced_bytes)
 
     def __len__(self) -> int:
         return len(self._views)
@@ -129,15 +141,15 @@ class ReducedViews:
     def at(self, index: int, factor: float) -> View:
         """View number `index`, its image resized by `factor`."""
         if factor != self._factor:
-            self._factor, self._kept = factor, {}
-        if index not in self._kept:
-            view = self._full_size(index)
-            camera = view.camera
-            view = at_size(view, camera.scaled(factor) if factor < 1.0 else camera, self._device)
-            if factor == 1.0:
-                return view
+            self._factor, self._kept, self._reduced_room = factor, {}, Room(self._reduced_bytes)
+        if index in self._kept:
+            return self._kept[index]
+        view = self._full_size(index)
+        camera = view.camera
+        view = at_size(view, camera.scaled(factor) if factor < 1.0 else camera, self._device)
+        if factor < 1.0 and self._reduced_room.take(view.nbytes):
             self._kept[index] = view
-        return self._kept[index]
+        return view
 
     def _full_size(self, index: int) -> View:
         if index in self._resident:
@@ -145,9 +157,8 @@ class ReducedViews:
         view = self._views[index]
         pictures = [None if picture is None else picture.to(self._device) for picture in view[1:]]
         moved = View(view.camera.to(self._device), *pictures)
-        size = sum(picture.nbytes for picture in pictures if picture is not None)
-        if size <= self._room:
-            self._resident[index], self._room = moved, self._room - size
+        if self._room.take(moved.nbytes):
+            self._resident[index] = moved
         return moved
 
     def draw(self, k: int, generator: torch.Generator, factor: float) -> list[View]:

@@ -7,6 +7,8 @@ namespace {
 // What trace() found: tile boundaries and, until copied, the fragments.
 template <class S>
 struct Trace {
+  Trace() = default;
+  Trace(const Trace&) = delete;  // nanobind would else offer copies
   Bins bins;
   FragmentList<S> list;
 };
@@ -58,22 +60,24 @@ void bind(nb::module_& m, const char* suffix) {
       .def(nb::init<>())
       .def(
           "run",
-          [](Trace<S>& t, In geom, In radii, int width, int height, double near, bool fragments_too) {
+          [](Trace<S>& t, In geom, In radii, int width, int height, double near, int64_t most, bool fragments_too) {
             const int64_t n = int64_t(radii.size()) / 2;
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data();
             nb::gil_scoped_release release;
             bin(n, g, r, width, height, t.bins);
-            if (fragments_too) trace_forward(g, r, S(near), t.bins, width, height, t.list);
+            if (fragments_too) trace_forward(g, r, S(near), t.bins, width, height, most, t.list);
             return t.list.total;
           },
-          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "fragments"_a = true)
+          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "most"_a = 0,
+          "fragments"_a = true)
       .def_prop_ro("tiles", [](const Trace<S>& t) { return int64_t(t.bins.tiles_x) * t.bins.tiles_y; })
       .def_prop_ro("pairs", [](const Trace<S>& t) { return int64_t(t.bins.surfels.size()); })
       .def(
           "copy",
-          [](const Trace<S>& t, Array<int64_t> tile_start, Ints surfel, Ints pixel, Out weight, Out uv, Out depth,
+          [](Trace<S>& t, Array<int64_t> tile_start, Ints surfel, Ints pixel, Out weight, Out uv, Out depth,
              Out sigma) {
             const int64_t n = t.list.total;
+            if (n && t.list.blocks.empty()) throw std::logic_error("the fragments were counted only, or copied before");
             int64_t* to = data(tile_start, int64_t(t.list.tile_start.size()), "tile_start");
             const FragmentArrays<S> f = fragments<S>(n, surfel, pixel, weight, uv, depth, sigma);
             nb::gil_scoped_release release;

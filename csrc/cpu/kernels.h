@@ -39,15 +39,20 @@ template <class S>
 struct FragmentList {
   std::vector<int64_t> tile_start;  // [tiles + 1], in fragments
   int64_t total = 0;
-  // filled by trace, read out by copy: one arena a thread
-  struct Arena {
-    std::vector<int32_t> surfel, pixel;
-    std::vector<S> weight, u, v, depth, sigma;
+  // Filled by trace, read out by copy. Blocks are large, so that what is not written to takes no memory and what is
+  // freed goes back to the operating system. A tile's fragments lie in one block.
+  struct Block {
+    static constexpr int64_t kSize = int64_t(1) << 21;
+    std::unique_ptr<unsigned char[]> memory{new unsigned char[kSize * (2 * sizeof(int32_t) + 5 * sizeof(S))]};
+    int32_t* surfel = reinterpret_cast<int32_t*>(memory.get());
+    int32_t* pixel = surfel + kSize;
+    S *weight = reinterpret_cast<S*>(pixel + kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,
+      *sigma = depth + kSize;
     int64_t used = 0;
   };
-  std::vector<Arena> arenas;
+  std::vector<std::vector<Block>> blocks;  // per thread
   struct Piece {
-    int arena;
+    int thread, block;
     int64_t from, count;
   };
   std::vector<Piece> pieces;  // [tiles]
@@ -57,11 +62,13 @@ struct FragmentArrays {
   int32_t *surfel, *pixel;
   S *weight, *uv, *depth, *sigma;  // uv [2, F]; sigma is negative in the low-pass branch
 };
+// Where there are more than `most` (0 = any number) they are only counted.
 template <class S>
-void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, int64_t most,
                    FragmentList<S>& list);
+// Large lists give their memory back.
 template <class S>
-void trace_copy(const FragmentList<S>& list, const FragmentArrays<S>& out);
+void trace_copy(FragmentList<S>& list, const FragmentArrays<S>& out);
 
 // dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero).
 template <class S>

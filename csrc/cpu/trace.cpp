@@ -1,4 +1,6 @@
 // Fragments of a view and their backward pass; per-surfel counts.
+#include <atomic>
+
 #include "core/fragment.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
@@ -8,25 +10,26 @@
 namespace bt {
 
 namespace {
-template <class S>
-void reserve(typename FragmentList<S>::Arena& a, int64_t more) {
-  const int64_t need = a.used + more;
-  if (int64_t(a.surfel.size()) >= need) return;
-  const int64_t size = need + need / 2 + 4096;
-  a.surfel.resize(size), a.pixel.resize(size);
-  a.weight.resize(size), a.u.resize(size), a.v.resize(size), a.depth.resize(size), a.sigma.resize(size);
-}
+// A tile cannot have more: every blended fragment takes at least 1/255 of a transmittance that stays above 1e-4, which
+// makes 2344 of them per pixel. Vectors may be written past the last one.
+constexpr int64_t kTileMost = 2400 * kTile * kTile + kLanes;
+constexpr int64_t kKept = int64_t(1) << 22;  // lists up to this length keep their memory for the next view
 }  // namespace
 
 template <class S>
-void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, int64_t most,
                    FragmentList<S>& list) {
   using P = Pack<S>;
+  using Block = typename FragmentList<S>::Block;
+  static_assert(kTileMost < Block::kSize, "a tile fits a block");
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   const int threads = num_threads();
-  if (int(list.arenas.size()) < threads) list.arenas.resize(threads);
-  for (auto& a : list.arenas) a.used = 0;
+  if (int(list.blocks.size()) < threads) list.blocks.resize(threads);
+  for (auto& own : list.blocks)
+    for (auto& block : own) block.used = 0;
   list.pieces.assign(tiles, {});
+  std::vector<int> current(threads, 0);
+  std::atomic<int64_t> found{0};
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
   for (int64_t tile = 0; tile < tiles; ++tile) {
 #if defined(_OPENMP)
@@ -34,16 +37,25 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
 #else
     const int thread = 0;
 #endif
-    auto& a = list.arenas[thread];
+    const bool keep = !most || found.load(std::memory_order_relaxed) <= most;
+    auto& own = list.blocks[thread];
+    int& at_block = current[thread];
+    if (at_block < int(own.size()) && own[at_block].used + kTileMost > Block::kSize) ++at_block;
+    if (at_block == int(own.size())) own.emplace_back();
+    Block& a = own[at_block];
     const int64_t from = a.used;
+    int64_t count = 0;
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height);
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
-      reserve<S>(a, kTile * kTile + kLanes);
       state.blend(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
                   [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
-                    const int64_t at = a.used;
+                    if (!keep) {
+                      count += __builtin_popcount(lanes);
+                      return;
+                    }
+                    const int64_t at = from + count;
                     const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width + tx * kTile +
                                            pack % kPacksAcross * kPackSide;
                     int n = 0;
@@ -57,32 +69,37 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
                     compress(&a.v[at], f.v, lanes);
                     compress(&a.depth[at], f.depth, lanes);
                     compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
-                    a.used = at + n;
+                    count += n;
                   });
     }
-    list.pieces[tile] = {thread, from, a.used - from};
+    if (keep) a.used += count;
+    found.fetch_add(count, std::memory_order_relaxed);
+    list.pieces[tile] = {thread, at_block, from, count};
   }
   list.tile_start.assign(tiles + 1, 0);
   for (int64_t t = 0; t < tiles; ++t) list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
   list.total = list.tile_start[tiles];
+  if (most && list.total > most) list.blocks.clear();  // nothing will be copied
 }
 
 template <class S>
-void trace_copy(const FragmentList<S>& list, const FragmentArrays<S>& out) {
+void trace_copy(FragmentList<S>& list, const FragmentArrays<S>& out) {
   const int64_t tiles = int64_t(list.pieces.size());
 #pragma omp parallel for num_threads(num_threads()) schedule(static)
   for (int64_t t = 0; t < tiles; ++t) {
     const auto& p = list.pieces[t];
-    const auto& a = list.arenas[p.arena];
+    if (!p.count) continue;
+    const auto& a = list.blocks[p.thread][p.block];
     const int64_t to = list.tile_start[t];
-    std::copy_n(a.surfel.data() + p.from, p.count, out.surfel + to);
-    std::copy_n(a.pixel.data() + p.from, p.count, out.pixel + to);
-    std::copy_n(a.weight.data() + p.from, p.count, out.weight + to);
-    std::copy_n(a.u.data() + p.from, p.count, out.uv + to);
-    std::copy_n(a.v.data() + p.from, p.count, out.uv + list.total + to);
-    std::copy_n(a.depth.data() + p.from, p.count, out.depth + to);
-    std::copy_n(a.sigma.data() + p.from, p.count, out.sigma + to);
+    std::copy_n(a.surfel + p.from, p.count, out.surfel + to);
+    std::copy_n(a.pixel + p.from, p.count, out.pixel + to);
+    std::copy_n(a.weight + p.from, p.count, out.weight + to);
+    std::copy_n(a.u + p.from, p.count, out.uv + to);
+    std::copy_n(a.v + p.from, p.count, out.uv + list.total + to);
+    std::copy_n(a.depth + p.from, p.count, out.depth + to);
+    std::copy_n(a.sigma + p.from, p.count, out.sigma + to);
   }
+  if (list.total > kKept) list.blocks.clear();
 }
 
 template <class S>
@@ -164,8 +181,8 @@ void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixe
 }
 
 #define BT_INSTANTIATE(S)                                                                                          \
-  template void trace_forward<S>(const S*, const S*, S, const Bins&, int, int, FragmentList<S>&);                  \
-  template void trace_copy<S>(const FragmentList<S>&, const FragmentArrays<S>&);                                   \
+  template void trace_forward<S>(const S*, const S*, S, const Bins&, int, int, int64_t, FragmentList<S>&);         \
+  template void trace_copy<S>(FragmentList<S>&, const FragmentArrays<S>&);                                         \
   template void trace_backward<S>(int64_t, const S*, S, S, int, const int64_t*, int64_t, const FragmentArrays<S>&, \
                                   const S*, const S*, const S*, S*, S*);
 BT_INSTANTIATE(float)

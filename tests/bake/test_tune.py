@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
-from bitymi_ns.bake.tune import TexelScene, TexelViews, coverage
+from bitymi_ns.bake.tune import TexelScene, TexelView, TexelViews, coverage
+from bitymi_ns.ops import fitting_lists, project, trace_cpu
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.train.memory import Room
 from bitymi_ns.train.views import View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
@@ -97,7 +100,7 @@ def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
 
 def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
     scene = TexelScene(wrong, BACKGROUND)
-    seen = coverage(scene, TexelViews(scene, [v for i, v in enumerate(views) if i % 4], 1 << 30))[:, 0]
+    seen = coverage(scene, TexelViews(scene, [v for i, v in enumerate(views) if i % 4], Room(1 << 30)))[:, 0]
     tuned = TexelScene(tune_atlas(wrong, views, BACKGROUND, OPTIONS), BACKGROUND).texels
     moved = (tuned - 0.1).abs().amax(1)
     last = scene.tiles.first[59]
@@ -111,7 +114,7 @@ def test_masked_pixels_are_not_seen(wrong: Baked, views: list[View]) -> None:
     scene = TexelScene(wrong, BACKGROUND)
     hidden = torch.zeros(40, 48, 1, dtype=torch.bool)
     masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
-    one, all_but_masked = (coverage(scene, TexelViews(scene, each, 1 << 30)) for each in (views[:1], masked))
+    one, all_but_masked = (coverage(scene, TexelViews(scene, each, Room(1 << 30))) for each in (views[:1], masked))
     assert torch.equal(one, all_but_masked) and one.any()
 
 
@@ -130,6 +133,47 @@ def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: li
     few = replace(OPTIONS, steps=8)
     results = [tune_atlas(wrong, views, BACKGROUND, replace(few, cache_bytes=b)) for b in (0, 200_000, 1 << 30)]
     assert all(torch.equal(r.texels, results[0].texels) for r in results)
+
+
+def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, trace = TexelScene(wrong, BACKGROUND), TexelScene.view
+    set_aside = [scene.view(view) for view in views[::4]]
+    traced, kept = [], []
+
+    def counted(self: TexelScene, view: View) -> TexelView:
+        traced.append(next(i for i, v in enumerate(views) if v.image is view.image))
+        return trace(self, view)
+
+    def keep(self: Room, nbytes: int) -> bool:
+        fits = take(self, nbytes)
+        kept.append(nbytes if fits else 0)
+        return fits
+
+    take = Room.take
+    monkeypatch.setattr(TexelScene, "view", counted)
+    monkeypatch.setattr(Room, "take", keep)
+    budget = sum(view.nbytes for view in set_aside)
+    tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, steps=8, cache_bytes=budget))
+    assert all(traced.count(i) == 1 for i in range(0, 12, 4)), "looked at most often, and traced once"
+    assert 0 < sum(kept) <= budget
+    assert all(traced.count(i) > 1 for i in (1, 5, 9))  # for the coverage, and at every step
+
+
+def test_a_view_with_many_fragments_is_traced_in_bands(
+    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = TexelScene(wrong, BACKGROUND)
+    whole = scene.view(views[0])
+    monkeypatch.setattr(trace_cpu, "MOST", 3500)
+    camera, p = views[0].camera, wrong.surfels
+    projection = project(*(p[name] for name in GEOMETRY), camera, wrong.near)
+    assert len(list(fitting_lists(projection))) > 1
+    parts = scene.view(views[0])
+    for name in ("surfel", "pixel", "tile_start", "run_start", "order"):
+        assert torch.equal(getattr(parts.fragments, name), getattr(whole.fragments, name)), name
+    assert (parts.fragments.width, parts.fragments.height) == (48, 40)
+    torch.testing.assert_close(parts.fragments.weight, whole.fragments.weight, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(parts.rest, whole.rest, rtol=1e-4, atol=1e-5)
 
 
 def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:

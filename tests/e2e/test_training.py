@@ -293,7 +293,9 @@ def test_points_that_are_nan_are_left_out_and_counted(
     config = start(data=spoiled_points(room, tmp_path, slice(3, 8)))
     config.max_num_iterations = 2
     ns_train.main(config)
-    assert "5 of 200 points" in " ".join(capsys.readouterr().out.split())
+    out = " ".join(capsys.readouterr().out.split())
+    assert "5 of 200 points" in out
+    assert "Training will take about" in out and "GB of memory for 10 training photographs of 48 x 36" in out
 
 
 def test_a_cloud_of_nothing_but_nan(room: Path, start: Start, tmp_path: Path) -> None:

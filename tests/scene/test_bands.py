@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from bitymi_ns import ops
+from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene import scene as scene_module
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.trainer import Trainer
@@ -63,6 +64,16 @@ def test_lists_that_fit_are_the_whole_view(most: int) -> None:
     assert torch.equal(counts, torch.bincount(whole.fragments.surfel, minlength=len(scene)))
     with pytest.raises(ops.TooManyFragments):
         list(ops.fitting_lists(whole.projection, 50))
+
+
+def test_memory_bounds_a_list_where_nothing_else_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, want = bands.step(CPU, 0)
+    monkeypatch.setattr(trace_cpu, "MOST", 1500)
+    parts, got = bands.step(CPU, 0)
+    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Bands)
+    bands.assert_same(got, want)
+    found = list(ops.fitting_lists(parts.projection))
+    assert len(found) > 1 and all(len(f) <= 1500 for f in found)
 
 
 def test_a_beta_map_that_moves_beta_alone() -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bitymi_ns.train import views as views_module
 from bitymi_ns.train.views import (
     ReducedViews,
     View,
@@ -66,6 +67,18 @@ def test_reduced_views_are_kept_until_the_resolution_changes(views):
     assert reduced.at(1, 0.5) is half
     assert reduced.at(1, 1.0).image.shape == (48, 48, 3)
     assert reduced.camera(1).width == 48
+
+
+def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = ReducedViews(views)
+    monkeypatch.setattr(views_module, "REDUCED_BYTES", 2 * everything.at(0, 0.5).nbytes)
+    few = ReducedViews(views)
+    for factor in (0.5, 0.25, 0.5):  # the room is there again at every size
+        for _ in range(2):
+            pairs = [(few.at(i, factor), everything.at(i, factor)) for i in range(len(views))]
+        assert all(torch.equal(a.image, b.image) for a, b in pairs)
+        again = [few.at(i, factor) is pairs[i][0] for i in range(len(views))]
+        assert sum(again) == min(len(views), 2 if factor == 0.5 else 8)
 
 
 def test_views_are_drawn_without_replacement(views):

@@ -1,0 +1,95 @@
+"""The memory that training or an export will take on the CPU, stated before it starts.
+
+What decides is the fragment list of one view (docs/architecture.md, Memory), whose length is found by counting those of
+a few views. The other numbers are measured; they belong to the default preset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import psutil
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns.host.errors import warn
+from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES
+from bitymi_ns.ops import project
+from bitymi_ns.ops.trace_cpu import MOST, count
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import GEOMETRY, Scene
+from bitymi_ns.train.views import REDUCED_BYTES
+
+COUNTED_VIEWS = 3
+"""Views whose fragments are counted."""
+MARGIN = 1.1
+"""Another view may have so many times the fragments of these."""
+PROGRAM = 800e6
+"""Python, the libraries, and a capture's cameras and points."""
+PER_FRAGMENT = 56
+"""Bytes: a list and the kernel's copy of it; or the list, its colours, and their gradients in the backward pass."""
+PER_PIXEL = 400
+"""Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
+PER_SURFEL = 3000
+"""Bytes: in training, parameters, gradients, Adam's averages and the two states that a run could go back to."""
+
+
+@torch.no_grad()
+def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
+    """Fragments that are held at once when these views are drawn, by a count of a few of them.
+
+    Args:
+        scene: as it is.
+        cameras: of all views, on the CPU.
+        bound: views with more are drawn in bands; 0 = that of the CPU kernels.
+    """
+    p, most = scene.surfels, 0
+    for i in range(min(COUNTED_VIEWS, len(cameras))):
+        camera = cameras[i * len(cameras) // min(COUNTED_VIEWS, len(cameras))]
+        geometry = (p[name] for name in GEOMETRY)
+        most = max(most, count(project(*geometry, camera, scene.near, scene.config.prefilter == "pixel")))
+    return min(int(MARGIN * most), bound or MOST)
+
+
+def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int) -> None:
+    """Say what a training run will take.
+
+    Args:
+        scene: as the run finds it.
+        cameras: of the training views, on the CPU.
+        most_surfels: that densification may make; 0 = any number.
+    """
+    pixels = cameras[0].width * cameras[0].height
+    kept = min(PHOTOGRAPH_BYTES, 3 * pixels * len(cameras)) + min(REDUCED_BYTES, 6 * pixels * len(cameras))
+    fragments = most_fragments(scene, cameras, scene.config.max_fragments)
+    needed = PROGRAM + kept + PER_PIXEL * pixels + PER_FRAGMENT * fragments
+    needed += PER_SURFEL * max(len(scene), most_surfels)
+    advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
+    _state("Training", needed, cameras, f"{advice} {max(1, fragments // 4)}")
+
+
+def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float) -> None:
+    """Say what an export will take.
+
+    Args:
+        scene: a trained one.
+        cameras: of the training views, on the CPU.
+        finetune_bytes: that the fine-tuning may keep of the views; 0 = there is none.
+    """
+    pixels = cameras[0].width * cameras[0].height
+    kept = min(PHOTOGRAPH_BYTES, 3 * pixels * len(cameras))
+    needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels + PER_FRAGMENT * most_fragments(scene, cameras)
+    _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
+
+
+def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> None:
+    """One line, and a warning where the machine has less."""
+    photographs = f"{len(cameras)} training photographs of {cameras[0].width} x {cameras[0].height}"
+    CONSOLE.print(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.", soft_wrap=True)
+    # what this process has taken already is a part of what it needs
+    available = psutil.virtual_memory().available + psutil.Process().memory_info().rss
+    if needed > available:
+        warn(
+            f"That is more than the {available / 1e9:.1f} GB that this machine has available. Close other programs, or "
+            f"{advice}."
+        )

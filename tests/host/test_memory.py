@@ -1,0 +1,70 @@
+"""The statement of the memory that a run will take."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import psutil
+import pytest
+import torch
+
+from bitymi_ns.host import memory
+from bitymi_ns.ops import trace_cpu
+from bitymi_ns.scene import Camera, Scene
+from tests.scene import bands
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def scene() -> tuple[Scene, Camera]:
+    return bands.make(CPU, 0)
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    return " ".join(capsys.readouterr().out.split())
+
+
+def gigabytes(text: str) -> float:
+    return float(text.split(" GB")[0].split()[-1])
+
+
+@pytest.mark.parametrize("what", ["training", "export"])
+def test_one_line_says_what_will_be_taken(
+    scene: tuple[Scene, Camera], what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = {"training": memory.state_training, "export": memory.state_export}[what]
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**12))
+    state(scene[0], [scene[1]] * 20, 0)
+    text = said(capsys)
+    assert "will take about" in text and "20 training photographs of 24 x 150" in text and "available" not in text
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))
+    monkeypatch.setattr(memory, "PROGRAM", 1e15)
+    state(scene[0], [scene[1]] * 20, 0)
+    assert "GB that this machine has available" in said(capsys)
+
+
+def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, camera = scene
+    with torch.no_grad():
+        count = len(one.render(camera).fragments)
+    assert memory.most_fragments(one, [camera] * 5) == int(memory.MARGIN * count)
+    assert memory.most_fragments(one, [camera], 1000) == 1000
+    monkeypatch.setattr(memory, "PER_FRAGMENT", 1e6)
+    memory.state_training(one, [camera], 0)
+    assert gigabytes(said(capsys)) == pytest.approx(0.8 + 1e-3 * memory.MARGIN * count, abs=0.1)
+    large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs alone: more than are kept
+    monkeypatch.setattr(memory, "most_fragments", lambda *_: 0)
+    needed = []
+    for views in (100, 1000):
+        memory.state_training(one, [large] * views, 0)
+        memory.state_export(one, [large] * views, 1e9)
+        needed.append(said(capsys).split(" for ")[0])
+    assert needed[0] == needed[1]
+
+
+def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:
+    output = scene[0].render(scene[1])
+    assert trace_cpu.count(output.projection) == len(output.fragments)

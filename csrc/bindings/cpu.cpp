@@ -1,4 +1,5 @@
-// bitymi_ns._cpu, or a module of another name for another CPU: arrays in, arrays out. The caller allocates; shapes and dtypes are checked here, values in Python.
+// bitymi_ns._cpu, or a module of another name for another CPU: arrays in, arrays out. The caller allocates; shapes and
+// dtypes are checked here, values in Python.
 #include "bindings/cpu.h"
 
 #include <nanobind/stl/tuple.h>

@@ -3,12 +3,14 @@
 
 The build starts from an empty folder and sees none of the environment's variables but PATH and HOME; only the CUDA
 kernels are left out, which take minutes. The wheel goes into a new virtual environment that finds the dependencies
-of this one, but not the checkout: the tests run on a copy of their folder.
+of this one, but not the checkout: the tests run on a copy of their folder, those of the kernels with each module that
+this CPU can run.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -19,16 +21,30 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 SITE_PACKAGES = Path(sysconfig.get_path("purelib"))
-TESTS = ("test_presets.py", "ops/test_backend.py", "ops/test_kernels.py", "host/test_registration.py")
+KERNELS = "tests/ops/test_kernels.py"
+TESTS = ("tests/test_presets.py", "tests/ops/test_backend.py", KERNELS, "tests/host/test_registration.py")
 
 WHERE = """
 import sys
 from pathlib import Path
+import torch
 import bitymi_ns
-from bitymi_ns import _cpu, _cpu_features, presets
-for place in (bitymi_ns.__file__, _cpu.__file__, _cpu_features.__file__, presets.preset_dir()):
+from bitymi_ns import presets
+from bitymi_ns.ops.backend import module
+kernels = module(torch.device("cpu"))
+for place in (bitymi_ns.__file__, kernels.__file__, presets.preset_dir()):
     assert Path(place).is_relative_to(sys.prefix), f"{place} is not in {sys.prefix}"
-print("CPU kernels for a CPU with", _cpu_features.FEATURES or "nothing special")
+print("This CPU runs", kernels.__name__)
+"""
+
+FIRST = """
+import sys
+from pathlib import Path
+import pytest
+from bitymi_ns.ops import backend
+backend.CPUINFO = Path("/dev/null")
+assert backend.cpu_module() == "_cpu"
+sys.exit(pytest.main(sys.argv[1:]))
 """
 
 
@@ -54,7 +70,9 @@ def expected() -> set[str]:
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "bitymi_ns", "method_configs"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     files = {line.replace("method_configs/", "bitymi_ns/method_configs/") for line in listed.stdout.splitlines()}
-    return files | {"bitymi_ns/_cpu" + sysconfig.get_config_var("EXT_SUFFIX"), "bitymi_ns/_cpu_features.py"}
+    modules = ("_cpu", "_cpu_x86_64_v4") if platform.machine() == "x86_64" else ("_cpu",)
+    compiled = {f"bitymi_ns/{name}{sysconfig.get_config_var('EXT_SUFFIX')}" for name in modules}
+    return files | compiled | {"bitymi_ns/_cpu_features.py"}
 
 
 def check_contents(wheel: Path) -> None:
@@ -94,7 +112,10 @@ def main() -> None:
         shutil.copytree(ROOT / "tests", away / "tests", ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy(ROOT / "pyproject.toml", away)
         run(python, "-c", WHERE, cwd=away)
-        run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *(f"tests/{name}" for name in TESTS), cwd=away)
+        options = ("-q", "-p", "no:cacheprovider", "--disable-warnings")
+        run(python, "-m", "pytest", *options, *TESTS, cwd=away)
+        # the module for CPUs without AVX-512, which is taken where nothing is known about the CPU
+        run(python, "-c", FIRST, *options, KERNELS, cwd=away)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from functools import cache, lru_cache
 import torch
 
 from bitymi_ns.host.errors import fail, warn
-from bitymi_ns.ops.backend import why_not_cpu
+from bitymi_ns.ops.backend import cpu_module
 
 
 def has_cuda_kernels() -> bool:
@@ -53,8 +53,10 @@ def kernel_device(device: torch.device | str) -> torch.device:
         if problem is None:
             return device
         _say_once(f"The scene stays on the CPU: {problem}.")
-    if problem := why_not_cpu():
-        fail(problem)
+    try:
+        cpu_module()
+    except RuntimeError as error:
+        fail(str(error), error)
     return torch.device("cpu")
 
 

@@ -41,33 +41,37 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
 
 
 @cache
-def why_not_cpu() -> str | None:
-    """Why the CPU kernels cannot run on this CPU and what can be done about it; None when they can.
+def cpu_module() -> str:
+    """Name of the module of CPU kernels: of those that were built, the last for which this CPU has all that it needs.
 
-    Asked before they are loaded: a CPU ends a process at an instruction that it does not have. Only Linux says what a
-    CPU has; elsewhere they are taken to run.
+    Asked before it is loaded: a CPU ends a process at an instruction that it does not have. Only Linux says what a CPU
+    has; elsewhere the first module is taken to run.
+
+    Raises:
+        RuntimeError: this CPU has not what any of them needs; says what to do.
     """
     try:
-        needed = importlib.import_module("bitymi_ns._cpu_features").FEATURES
+        needs = importlib.import_module("bitymi_ns._cpu_features").FEATURES
         lines = CPUINFO.read_text(encoding="utf8").splitlines()
     except (ImportError, OSError):
-        return None
+        return "_cpu"
     flags = next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), None)
-    missing = [name for name in needed.split() if flags is not None and name not in flags]
-    if not missing:
-        return None
-    return (
-        f"the CPU kernels were compiled for a CPU with {', '.join(missing)}, which this one lacks: install bitymi-ns "
-        "again on this machine from its source, with `pip install . -Ccmake.define.BITYMI_MARCH=native` (in a "
-        "checkout: `make clean setup`)"
-    )
+    if flags is None:
+        return "_cpu"
+    lacking = {name: [flag for flag in needed.split() if flag not in flags] for name, needed in needs.items()}
+    usable = [name for name, missing in lacking.items() if not missing]
+    if not usable:
+        raise RuntimeError(
+            f"the CPU kernels were compiled for a CPU with {', '.join(lacking['_cpu'])}, which this one lacks: install "
+            "bitymi-ns again on this machine from its source, with `pip install . -Ccmake.define.BITYMI_MARCH=native` "
+            "(in a checkout: `make clean setup`)"
+        )
+    return usable[-1]
 
 
 def _load(name: str) -> ModuleType:
-    if name == "_cpu" and (problem := why_not_cpu()):
-        raise RuntimeError(problem)
     try:
-        return importlib.import_module(f"bitymi_ns.{name}")
+        return importlib.import_module(f"bitymi_ns.{cpu_module() if name == '_cpu' else name}")
     except ImportError as error:
         advice = {
             "_cpu": "install the package (`pip install .`, or `make setup` in a checkout)",
@@ -88,7 +92,7 @@ def module(device: torch.device) -> ModuleType:
     """The kernel module for a device.
 
     Raises:
-        RuntimeError: the kernels for that device are not built.
+        RuntimeError: the kernels for that device are not built, or not for this CPU.
     """
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")

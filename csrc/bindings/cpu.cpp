@@ -1,4 +1,5 @@
-// bitymi_ns._cpu: arrays in, arrays out. The caller allocates; shapes and dtypes are checked here, values in Python.
+// bitymi_ns._cpu, or a module of another name for another CPU: arrays in, arrays out. The caller allocates; shapes and
+// dtypes are checked here, values in Python.
 #include "bindings/cpu.h"
 
 #include <nanobind/stl/tuple.h>
@@ -9,7 +10,7 @@
 
 #include "cpu/threads.h"
 
-NB_MODULE(_cpu, m) {
+NB_MODULE(BITYMI_MODULE, m) {
   using namespace bt;
 #if defined(__GLIBC__)
   // Every view allocates and frees the same tens of megabytes. Given back to the system in between, they cost more in
@@ -21,7 +22,7 @@ NB_MODULE(_cpu, m) {
   wait_without_spinning();
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
-  m.attr("FEATURES") = BITYMI_CPU_FEATURES;  // of the CPU, as in bitymi_ns._cpu_features
+  m.attr("FEATURES") = BITYMI_CPU_FEATURES;  // what of a CPU this needs, as in bitymi_ns._cpu_features
   nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
       .def(
           "__init__",

@@ -55,7 +55,10 @@ def test_kernels_that_cannot_be_loaded_are_no_traceback(card: ModuleType, monkey
 
 
 def test_a_cpu_that_the_kernels_cannot_run_on_ends_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "why_not_cpu", lambda: "this CPU lacks avx2: install again")
+    def refuse() -> str:
+        raise RuntimeError("this CPU lacks avx2: install again")
+
+    monkeypatch.setattr(device, "cpu_module", refuse)
     with pytest.raises(InputError, match="this CPU lacks avx2: install again"):
         device.kernel_device("cpu")
 

@@ -1,4 +1,4 @@
-"""The kernels are not loaded on a CPU that lacks what they were compiled for."""
+"""The CPU kernels that are loaded are the best that this CPU can run, and none where it can run none."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
-from bitymi_ns import _cpu, _cpu_features
+from bitymi_ns import _cpu_features
 from bitymi_ns.ops import backend
 
-needs_features = pytest.mark.skipif(not _cpu_features.FEATURES, reason="compiled for every CPU of its kind")
+BUILT = {"_cpu": "fma avx2", "_cpu_x86_64_v4": "fma avx2 avx512f"}
 
 OLD_CPU = """
 import sys
@@ -24,40 +25,45 @@ try:
     backend.module(torch.device("cpu"))
 except RuntimeError as error:
     print(error)
-print("bitymi_ns._cpu" in sys.modules)
+print([name for name in sys.modules if name.startswith("bitymi_ns._cpu")])
 """
 
 
 @pytest.fixture
 def cpuinfo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """What stands for /proc/cpuinfo."""
+    """What stands for /proc/cpuinfo; the modules are those of a wheel."""
     monkeypatch.setattr(backend, "CPUINFO", tmp_path / "cpuinfo")
-    backend.why_not_cpu.cache_clear()
+    monkeypatch.setattr(_cpu_features, "FEATURES", BUILT)
+    backend.cpu_module.cache_clear()
     yield tmp_path / "cpuinfo"
-    backend.why_not_cpu.cache_clear()
+    backend.cpu_module.cache_clear()
 
 
 def test_the_record_is_that_of_the_module() -> None:
-    assert _cpu_features.FEATURES == _cpu.FEATURES
+    assert _cpu_features.FEATURES[backend.cpu_module()] == backend.module(torch.device("cpu")).FEATURES
 
 
-@needs_features
-def test_an_old_cpu_gets_a_message_before_the_module_is_loaded(cpuinfo: Path) -> None:
-    had, lacked = _cpu_features.FEATURES.split()[:-1], _cpu_features.FEATURES.split()[-1]
+@pytest.mark.skipif(not _cpu_features.FEATURES["_cpu"], reason="compiled for every CPU of its kind")
+def test_an_old_cpu_gets_a_message_and_nothing_is_loaded(tmp_path: Path) -> None:
+    *had, lacked = _cpu_features.FEATURES["_cpu"].split()
+    cpuinfo = tmp_path / "cpuinfo"
     cpuinfo.write_text(f"processor\t: 0\nflags\t\t: fpu sse2 {' '.join(had)}\n\nprocessor\t: 1\n")
-    command = [sys.executable, "-c", OLD_CPU, str(cpuinfo)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", OLD_CPU, cpuinfo], capture_output=True, text=True, check=True)
     message, loaded = done.stdout.splitlines()
-    assert f"compiled for a CPU with {lacked}, which this one lacks: install" in message and loaded == "False"
+    assert f"compiled for a CPU with {lacked}, which this one lacks: install" in message
+    assert loaded == "['bitymi_ns._cpu_features']"
 
 
-def test_this_cpu_is_accepted(cpuinfo: Path) -> None:
-    cpuinfo.write_text(f"flags\t\t: fpu {_cpu_features.FEATURES}\n")
-    assert backend.why_not_cpu() is None
+@pytest.mark.parametrize(
+    ("flags", "module"), [("fpu fma avx2", "_cpu"), ("fpu fma avx2 avx512f avx512bw", "_cpu_x86_64_v4")]
+)
+def test_the_last_module_that_the_cpu_can_run_is_taken(cpuinfo: Path, flags: str, module: str) -> None:
+    cpuinfo.write_text(f"flags\t\t: {flags}\n")
+    assert backend.cpu_module() == module
 
 
 @pytest.mark.parametrize("text", [None, "processor\t: 0\nFeatures\t: fp asimd\n"], ids=["no file", "no flags"])
-def test_what_cannot_be_known_is_no_reason(cpuinfo: Path, text: str | None) -> None:
+def test_where_nothing_is_known_about_the_cpu_the_first_is_taken(cpuinfo: Path, text: str | None) -> None:
     if text is not None:
         cpuinfo.write_text(text)
-    assert backend.why_not_cpu() is None
+    assert backend.cpu_module() == "_cpu"

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns import _cpu
+from bitymi_ns.ops import backend
 from tests.ops.golden import SURFEL_KEYS, dense, random_scene, reference, traced
 
 
@@ -42,7 +42,7 @@ def test_every_fragment_of_the_brute_force_is_found(
 def test_bounds_leave_most_tiles_out() -> None:
     case = random_scene(200, 1, width=320, height=240, scale=0.05)
     _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
-    tracer = _cpu.Trace_f64()
+    tracer = backend.module(torch.device("cpu")).Trace_f64()
     tracer.run(projection.geom, projection.radii, case.width, case.height, 0.2)
     boxes = (2 * projection.radii / 16 + 1).clamp(max=20).prod(-1).sum()
     assert tracer.pairs < 0.9 * float(boxes)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
@@ -323,17 +324,15 @@ def test_absolute_gradient_bounds_the_gradient_and_adds_over_fragments() -> None
 
 
 def test_results_do_not_depend_on_the_number_of_threads_beyond_rounding() -> None:
-    from bitymi_ns import _cpu
-
     case = random_scene(300, 9, width=150, height=90)
     results = []
     for threads in (1, 2, 3):
-        _cpu.set_num_threads(threads)
+        backend.module(torch.device("cpu")).set_num_threads(threads)
         scene, camera = scene_of(case, torch.float32)
         output = scene.render(camera)
         output.rgb.square().sum().backward()
         results.append((output.rgb.detach(), scene.surfels["means"].grad))
-    _cpu.set_num_threads(0)
+    backend.module(torch.device("cpu")).set_num_threads(0)
     for rgb, grad in results[1:]:
         assert torch.equal(rgb, results[0][0])
         torch.testing.assert_close(grad, results[0][1], rtol=1e-4, atol=1e-4)

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns import _cpu, ops
+from bitymi_ns import ops
+from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference.texel import texel_image as reference
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
@@ -100,12 +101,12 @@ def test_gradients_do_not_depend_on_the_number_of_threads() -> None:
     case = Case(300, torch.float32, width=150, height=90)
     results = []
     for threads in (1, 2, 3, 7):
-        _cpu.set_num_threads(threads)
+        backend.module(torch.device("cpu")).set_num_threads(threads)
         leaves = [case.base.clone().requires_grad_(), case.texels.clone().requires_grad_()]
         image = ops.texel_image(ops.TexelFragments.of(case.fragments), *leaves, case.tiles, 0.02)
         image.square().sum().backward()
         results.append([image.detach(), *(leaf.grad for leaf in leaves)])
-    _cpu.set_num_threads(0)
+    backend.module(torch.device("cpu")).set_num_threads(0)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(other, results[0], strict=True))
 

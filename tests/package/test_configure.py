@@ -26,11 +26,11 @@ def configure(folder: Path, **definitions: str) -> str:
     return done.stdout
 
 
-def cpu_features(folder: Path) -> set[str]:
-    """What the record in a build folder says the CPU kernels need."""
-    names: dict[str, str] = {}
+def cpu_features(folder: Path) -> dict[str, set[str]]:
+    """What the record in a build folder says that each module needs of a CPU."""
+    names: dict[str, dict[str, str]] = {}
     exec((folder / "_cpu_features.py").read_text("utf8"), names)
-    return set(names["FEATURES"].split())
+    return {name: set(features.split()) for name, features in names["FEATURES"].items()}
 
 
 def march(folder: Path) -> set[str]:
@@ -45,28 +45,33 @@ def x86() -> None:
         pytest.skip("not an x86-64 machine")
 
 
-def test_a_wheel_runs_on_every_cpu_with_avx2(x86: None, tmp_path: Path) -> None:
+AVX2 = set("pni ssse3 sse4_1 sse4_2 popcnt abm movbe bmi1 bmi2 f16c fma avx avx2".split())
+AVX512 = AVX2 | {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"}
+
+
+def test_a_wheel_has_kernels_for_avx2_and_for_avx512(x86: None, tmp_path: Path) -> None:
     configure(tmp_path, SKBUILD_STATE="wheel", BITYMI_CUDA="OFF")
-    assert march(tmp_path) == {"x86-64-v3"}
-    assert cpu_features(tmp_path) == set("pni ssse3 sse4_1 sse4_2 popcnt abm movbe bmi1 bmi2 f16c fma avx avx2".split())
+    assert march(tmp_path) == {"x86-64-v3", "x86-64-v4"}
+    assert cpu_features(tmp_path) == {"_cpu": AVX2, "_cpu_x86_64_v4": AVX512}
 
 
 def test_in_place_the_kernels_are_compiled_for_this_cpu(x86: None, tmp_path: Path) -> None:
     configure(tmp_path, SKBUILD_STATE="editable", BITYMI_CUDA="OFF")
     flags = next(line for line in Path("/proc/cpuinfo").read_text("utf8").splitlines() if line.startswith("flags"))
     features = cpu_features(tmp_path)
-    assert march(tmp_path) == {"native"} and features and features <= set(flags.split())
+    assert march(tmp_path) == {"native"} and features.keys() == {"_cpu"}
+    assert features["_cpu"] and features["_cpu"] <= set(flags.split())
 
 
 def test_the_cpu_can_be_chosen(x86: None, tmp_path: Path) -> None:
     configure(tmp_path, SKBUILD_STATE="wheel", BITYMI_CUDA="OFF", BITYMI_MARCH="x86-64")
-    assert march(tmp_path) == {"x86-64"} and cpu_features(tmp_path) == set()
+    assert march(tmp_path) == {"x86-64"} and cpu_features(tmp_path) == {"_cpu": set()}
 
 
 def test_other_processors_get_the_compilers_default(tmp_path: Path) -> None:
     processor = {"CMAKE_SYSTEM_NAME": "Linux", "CMAKE_SYSTEM_PROCESSOR": "aarch64"}
-    configure(tmp_path, SKBUILD_STATE="editable", BITYMI_CUDA="OFF", **processor)
-    assert march(tmp_path) == set()
+    configure(tmp_path, SKBUILD_STATE="wheel", BITYMI_CUDA="OFF", **processor)
+    assert march(tmp_path) == set() and cpu_features(tmp_path).keys() == {"_cpu"}
 
 
 @pytest.mark.slow

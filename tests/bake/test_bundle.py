@@ -310,7 +310,7 @@ def test_versions(surfels, tmp_path):
         (lambda i: i.update(color_bias=0), "color_bias must be 0.5"),
         (
             lambda i: i["world"].update(transform=[[1]]),
-            r"transform.0.1 is missing; .*transform.0.3 is missing \(and 2 more\)",
+            r"transform.0.1 is .*0.3 is missing \(and 2 more\)",
         ),
         (lambda i: i["world"].update(scale=-1), "world.scale must be greater than 0"),
         (lambda i: i["bounds"].update(min=[0, 0, 1e300]), "bounds.min.2 must be"),

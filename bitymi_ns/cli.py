@@ -189,11 +189,14 @@ class Verify:
         table = Table("", "check", "result", title=escape(f"Bundle {self.bundle}"))
         for check in checks:
             outcome = "[green]ok[/]" if check.ok else "[bold red]FAILED[/]"
-            table.add_row(outcome, escape(check.name), escape(check.detail))
+            table.add_row(outcome, escape(check.name), escape(check.detail) if check.ok else "see below")
         Console().print(table)
-        if bundle is None:
+        failed = [check for check in checks if not check.ok]
+        for check in failed:
+            print(f"{check.name}: {check.detail}")
+        if failed:
             print(REMEDY)
-        return 0 if all(check.ok for check in checks) else 1
+        return 1 if failed else 0
 
 
 Command = (

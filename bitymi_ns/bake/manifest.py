@@ -25,6 +25,7 @@ SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 SUPPORT = 3.0
 """Radius of the kernel in scale units."""
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
+_MOST_PROBLEMS = 3  # in one message
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -323,14 +324,18 @@ def _version(version: Any, source: str) -> tuple[int, int]:
 
 
 def _problems(error: ValidationError) -> str:
-    """One line: where in the JSON, what must be there, what is there; and how many more there are."""
-    first = error.errors(include_url=False, include_context=False)[0]
-    path = ".".join(str(part) if re.fullmatch(r"[\w.-]+", str(part)) else _short(part) for part in first["loc"])
-    what = "is missing" if first["type"] == "missing" else re.sub(r"^\w+ should", "must", first["msg"])
-    if what.startswith("must") and not isinstance(first["input"], BaseModel) and first["type"] != "too_long":
-        what += f", not {_short(first['input'])}"
-    more = error.error_count() - 1
-    return f"{path} {what}".strip() + (f" (and {more} more)" if more else "")
+    """One line: where in the JSON, what must be there, and what is there, of the first three values."""
+    found = error.errors(include_url=False, include_context=False)
+    more = len(found) - _MOST_PROBLEMS
+    return "; ".join(map(_problem, found[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
+
+
+def _problem(detail: Any) -> str:
+    path = ".".join(str(part) if re.fullmatch(r"[\w.-]+", str(part)) else _short(part) for part in detail["loc"])
+    what = "is missing" if detail["type"] == "missing" else re.sub(r"^\w+ should", "must", detail["msg"])
+    if what.startswith("must") and not isinstance(detail["input"], BaseModel) and detail["type"] != "too_long":
+        what += f", not {_short(detail['input'])}"
+    return f"{path} {what}".strip()
 
 
 def _short(value: Any) -> str:

@@ -262,7 +262,7 @@ def test_damaged_bundles_are_refused(copied: Path, name: str) -> None:
     path = copied / name
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=f"{name} is truncated.*Export the scene again"):
+    with pytest.raises(InputError, match=f"{name} is truncated.*or export the scene again"):
         eval_setup(copied / "config.yml")
     path.write_bytes(whole[:-9] + bytes(9))
     with pytest.raises(InputError, match=f"{name} is altered"):

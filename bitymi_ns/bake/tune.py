@@ -151,6 +151,7 @@ class TexelScene:
             for fragments in fitting_lists(projection):
                 drawn.append(composite_image(fragments, projection, shade(fragments, base, projection.frames)))
                 yield fragments, fragments.weight >= self._baked.weight_bound
+                del fragments  # before the next list is made
 
         chosen = TexelFragments.of_lists(chosen_lists())
         plain = torch.cat(drawn)

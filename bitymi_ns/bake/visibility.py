@@ -64,5 +64,6 @@ def visibility(
             rows = fragments.surfel.long()
             largest.scatter_reduce_(0, rows, in_front, "amax")
             seen[done - 1, rows] = True
+            del fragments, in_front, rows  # before the next list is made
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, seen)

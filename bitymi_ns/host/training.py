@@ -236,5 +236,6 @@ class TrainingRun:
             values.append(
                 (psnr(rgb, target, None if mask is None else mask.to(rgb.device)), float(len(output.fragments)))
             )
+            del output  # with its fragments, before the next view makes its own
         first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
         return first, second

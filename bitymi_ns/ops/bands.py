@@ -39,11 +39,13 @@ class Bands:
     def __len__(self) -> int:
         return self.count
 
-    @torch.no_grad()
     def lists(self) -> Iterator[Fragments]:
         """The fragments of one band after the other, without gradient."""
         for top, bottom in self.rows:
-            yield trace(band(self.projection, top, bottom), self.rim)
+            with torch.no_grad():
+                fragments = trace(band(self.projection, top, bottom), self.rim)
+            yield fragments
+            del fragments  # before the next list is made
 
     def overdraw(self) -> Tensor:
         """[H, W, 1] int32: blended surfels a pixel."""
@@ -61,7 +63,6 @@ class Bands:
         return counts
 
 
-@torch.no_grad()
 def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
     """The fragments of a view, as one list, or as several of some rows of tiles each where one has too many.
 
@@ -74,11 +75,13 @@ def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
     """
     height = projection.camera.height
 
+    @torch.no_grad()  # of the generator, it would hold on to what it has yielded
     def find(top: int, bottom: int) -> Fragments:
         return trace(projection if bottom - top == height else band(projection, top, bottom), most=most)
 
     for _, _, fragments in by_bands([(0, height)], find):
         yield fragments
+        del fragments  # before the next list is made
 
 
 def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> Iterator[tuple[int, int, T]]:
@@ -105,6 +108,7 @@ def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> I
             waiting = parts + rest
             continue
         yield top, bottom, drawn
+        del drawn  # a list of fragments, say: before the next one is made
         waiting = rest
 
 

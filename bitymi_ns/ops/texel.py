@@ -77,7 +77,7 @@ class TexelFragments:
         parts: list[tuple[Tensor, ...]] = []
         starts, count, height, width = [torch.zeros(1, dtype=torch.int64)], 0, 0, 0
         for fragments, keep in lists:
-            _, _, weight, uv, _, _ = fragments.arrays
+            weight, uv = fragments.weight.detach(), fragments.uv.detach()
             surfel, pixel, tile_start = fragments.surfel, fragments.pixel, fragments.tile_start
             width = fragments.width
             if keep is not None:
@@ -87,6 +87,7 @@ class TexelFragments:
             parts.append((weight, uv, surfel, pixel + height * width if height else pixel))
             starts.append(tile_start[1:] + count)
             count, height = count + len(surfel), height + fragments.height
+            del fragments, keep  # before the next list is made
         weight, uv, surfel, pixel = (
             column[0] if len(column) == 1 else torch.cat(column, dim=-1) for column in zip(*parts, strict=True)
         )

@@ -85,5 +85,6 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
         loss = photometric(output.rgb, target, config.loss.ssim_weight, mask)
         total += counts
         weighted += loss.double() * counts
+        del output  # with its fragments, before the next view makes its own
     importance = torch.div(total, max(1, len(views)), rounding_mode="floor")
     return Scores(importance, normalise(weighted).float())

@@ -297,6 +297,7 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> tuple[
         target = over_background(as_float(image.to(device)), background)
         quality.append(psnr(output.rgb.clamp(0.0, 1.0), target, None if mask is None else mask.to(device)))
         fragments.append(len(output.fragments))
+        del output  # with its fragments, before the next view makes its own
     return (sum(quality) / len(quality), sum(fragments) / len(fragments)) if quality else (math.nan, math.nan)
 
 

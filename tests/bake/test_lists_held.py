@@ -1,0 +1,68 @@
+"""A fragment list is let go before the next one is made: memory is that of one view, however many there are."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake.tune import TexelScene
+from bitymi_ns.bake.visibility import visibility
+from bitymi_ns.ops import Fragments, trace_cpu
+from bitymi_ns.ops import bands as bands_module
+from bitymi_ns.ops import trace as whole_trace
+from bitymi_ns.scene import scene as scene_module
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.score import multi_view_scores
+from bitymi_ns.train.trainer import evaluate
+from bitymi_ns.train.views import View
+from tests.bake.test_tune import BACKGROUND, cameras
+from tests.scene import bands
+
+PHOTO = torch.full((40, 48, 3), 0.5)
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """The lengths of the lists that were made, each when no other was there any more."""
+    alive: list[weakref.ref] = []
+    lengths: list[int] = []
+
+    def counted(*args, **kwargs) -> Fragments:
+        assert not any(other() is not None for other in alive), "an earlier list is still held"
+        fragments = whole_trace(*args, **kwargs)
+        alive.append(weakref.ref(fragments.surfel))
+        lengths.append(len(fragments))
+        return fragments
+
+    monkeypatch.setattr(bands_module, "trace", counted)
+    monkeypatch.setattr(scene_module, "trace", counted)
+    yield lengths
+    assert len(lengths) > 1
+
+
+@pytest.mark.parametrize("most", [3500, 1 << 25])
+def test_of_a_bake(scene, made: list[int], most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = scene(60)
+    large.surfels["log_scales"] += 1.5
+    baked = bake(large, options=BakeOptions(format="fp16", r_max=8))
+    monkeypatch.setattr(trace_cpu, "MOST", most)
+    views = cameras()[:3]
+    visibility(large.surfels, views, 0.2)
+    texels, first = TexelScene(baked, BACKGROUND), len(made)
+    for camera in views:
+        texels.view(View(camera, PHOTO))
+    assert len(made) - first == first and (first > 3) == (most == 3500)
+
+
+def test_of_scores_and_evaluation(made: list[int]) -> None:
+    scene, camera = bands.make(torch.device("cpu"), 0)
+    scene.float()
+    camera = type(camera)(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
+    views = [View(camera, torch.full((camera.height, camera.width, 3), 0.5))] * 3
+    multi_view_scores(scene, views, TrainConfig())
+    evaluate(scene, views, TrainConfig())
+    assert len(made) == 6

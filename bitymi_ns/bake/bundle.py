@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bitymi_ns import __version__
 from bitymi_ns.bake import ktx2, ply
-from bitymi_ns.bake.folder import check_target, complete_folder
+from bitymi_ns.bake.folder import check_target
 from bitymi_ns.bake.manifest import (
     ATLAS,
     FORMAT,
@@ -40,6 +40,7 @@ from bitymi_ns.bake.surfel_table import (
     to_columns,
     view_color_kind,
 )
+from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 
 __all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
@@ -155,7 +156,7 @@ def write_bundle(
         the folder.
 
     Raises:
-        BundleError: the target exists, the disk is full, the parameters are not finite.
+        BundleError: the target exists or cannot be written, or the parameters are not finite.
     """
     folder = Path(folder)
     kind = view_color or view_color_kind(surfels)
@@ -166,7 +167,7 @@ def write_bundle(
             raise BundleError(f"extra_files may not replace {name}")
     info = _describe(surfels, kind, atlas, near, weight_bound, prefilter, background, world or World(), statistics)
     try:
-        with complete_folder(folder, overwrite) as new:
+        with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
             columns = to_columns(surfels, tiles, mean_residual, extent, kind)
             terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
             ply.write_ply(new / SURFELS, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
@@ -179,12 +180,10 @@ def write_bundle(
             for name, data in (loose_files or {}).items():
                 (new / name).write_bytes(data)
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
-            raise BundleError(
-                f"the disk is full: {folder} needs about {size / 1e6:.0f} MB; nothing was left behind"
-            ) from error
-        raise BundleError(f"{folder} cannot be written: {error}; nothing was left behind") from error
+        size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
+        needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        why = reason(error, folder)
+        raise BundleError(f"{folder} cannot be written{needs}: {why}. Nothing was left behind") from error
     return folder
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bitymi_ns import __version__
-from bitymi_ns.files import check_writable, explained, staging, write_file
+from bitymi_ns.files import check_writable, explained, flush, staging
 from bitymi_ns.report.collect import collect
 from bitymi_ns.report.gallery import make_gallery, make_worst
 from bitymi_ns.report.knob_plots import knob_tables
@@ -79,7 +79,8 @@ def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
     """
     with staging(output_dir) as aside:
         for name, data in files.items():
-            write_file(aside / name, data)
+            (aside / name).write_bytes(data)
+            flush(aside / name)
         output_dir.mkdir(exist_ok=True)
         for name in sorted(files, key=lambda name: name == "index.html"):
             os.replace(aside / name, output_dir / name)

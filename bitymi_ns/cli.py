@@ -11,6 +11,7 @@ import tyro
 
 from bitymi_ns.bench.cli import BenchRun
 from bitymi_ns.bench.process import BenchError
+from bitymi_ns.files import explained
 
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
@@ -38,16 +39,17 @@ class Sample:
     def run(self) -> None:
         from bitymi_ns import sample
 
-        folder = sample.generate(
-            self.output_dir,
-            views=self.views,
-            width=self.width,
-            height=self.height,
-            seed=self.seed,
-            points=self.points,
-            overwrite=self.overwrite,
-            progress=True,
-        )
+        with explained(self.output_dir, ValueError):
+            folder = sample.generate(
+                self.output_dir,
+                views=self.views,
+                width=self.width,
+                height=self.height,
+                seed=self.seed,
+                points=self.points,
+                overwrite=self.overwrite,
+                progress=True,
+            )
         print(f"Wrote {self.views} images and {self.points} points to {folder}")
 
 
@@ -94,7 +96,8 @@ class Stability:
             raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")
         if why := missing(BACKENDS[self.backend]):
             raise ValueError(f"the backend '{self.backend}' cannot be used here: {why}")
-        rows = page.write(self.output, BACKENDS[self.backend], lambda text: print(text, file=sys.stderr))
+        with explained(self.output, ValueError):
+            rows = page.write(self.output, BACKENDS[self.backend], lambda text: print(text, file=sys.stderr))
         worse = [row.label for row in rows if "**" in row.verdict]
         print(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
 
@@ -219,10 +222,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         return command.run() or 0
     except (ValueError, OSError, BenchError) as error:
-        # a full disk does not say where it is full
-        folder = getattr(command, "output_dir", None)
-        where = f" ({folder})" if folder and isinstance(error, OSError) and not error.filename else ""
-        print(f"bitymi: {error}{where}", file=sys.stderr)
+        print(f"bitymi: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("bitymi: interrupted, nothing was left half-written", file=sys.stderr)

@@ -17,7 +17,7 @@ from torch import Tensor
 from bitymi_ns import __version__
 from bitymi_ns.bake import ktx2, ply
 from bitymi_ns.bake.bundle_reader import Bundle, read_bundle, verify_bundle
-from bitymi_ns.bake.folder import check_target, complete_folder
+from bitymi_ns.bake.folder import check_target
 from bitymi_ns.bake.manifest import (
     ACTIVATIONS,
     ATLAS,
@@ -39,6 +39,7 @@ from bitymi_ns.bake.surfel_table import (
     to_columns,
     view_color_kind,
 )
+from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 
 __all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
@@ -110,8 +111,8 @@ def write_bundle(
         the folder.
 
     Raises:
-        BundleError: the target exists, the disk is full, the parameters are not finite or beyond the limits of what is
-            read (`limits.py`, `manifest.py`).
+        BundleError: the target exists or cannot be written, or the parameters are not finite or beyond the limits of
+            what is read (`limits.py`, `manifest.py`).
     """
     folder = Path(folder)
     kind = view_color or view_color_kind(surfels)
@@ -122,7 +123,7 @@ def write_bundle(
             raise BundleError(f"extra_files may not replace {name}")
     info = _describe(surfels, kind, atlas, near, weight_bound, prefilter, background, world or World(), statistics)
     try:
-        with complete_folder(folder, overwrite) as new:
+        with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
             columns = to_columns(surfels, tiles, mean_residual, extent, kind)
             terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
             ply.write_ply(new / SURFELS, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
@@ -135,12 +136,10 @@ def write_bundle(
             for name, data in (loose_files or {}).items():
                 (new / name).write_bytes(data)
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
-            raise BundleError(
-                f"the disk is full: {folder} needs about {size / 1e6:.0f} MB; nothing was left behind"
-            ) from error
-        raise BundleError(f"{folder} cannot be written: {error}; nothing was left behind") from error
+        size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
+        needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        why = reason(error, folder)
+        raise BundleError(f"{folder} cannot be written{needs}: {why}. Nothing was left behind") from error
     return folder
 
 

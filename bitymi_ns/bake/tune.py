@@ -243,6 +243,7 @@ def tune_atlas(
         "views": len(tuned),
         "held_in_views": len(held_in),
         "steps": curve[-1][0],
+        "steps_asked": options.steps,
         "best_step": max(curve, key=lambda point: point[1])[0],
         "psnr_held_in": {"before": round(curve[0][1], 4), "after": round(max(psnr for _, psnr in curve), 4)},
         "curve": [[step, round(psnr, 4)] for step, psnr in curve],
@@ -282,6 +283,7 @@ def _descend(
             if curve[-1][1] == max(psnr for _, psnr in curve):
                 best = texels.clone()
             elif all(psnr < max(p for _, p in curve) for _, psnr in curve[-options.patience :]):
+                progress("tuning texels", step + 1, step + 1)  # no more is to come
                 break
     return best, curve
 

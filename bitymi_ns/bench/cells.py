@@ -17,6 +17,7 @@ from typing import Any
 
 from bitymi_ns.bench.machine import commit, machine, versions
 from bitymi_ns.bench.process import BenchError
+from bitymi_ns.files import reason
 
 FILE = "cells.jsonl"
 NAMES = ("suite", "row")
@@ -106,7 +107,7 @@ class Cells:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise BenchError(f"{self.path} cannot be written: {error}. Make room, or give another --work.") from error
+            raise BenchError(f"{self.path} cannot be written: {reason(error, self.path)}, with --work") from error
         self._known[identity(key)] = cell
         return cell
 

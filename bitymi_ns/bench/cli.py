@@ -16,6 +16,7 @@ from bitymi_ns.bench.process import BenchError, say
 from bitymi_ns.bench.progress import Display
 from bitymi_ns.bench.suites import format_bundles, local_scenes, read_plan, standard_scenes, suites
 from bitymi_ns.bench.tables import results_page
+from bitymi_ns.files import check_writable, explained, write_file
 
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
@@ -99,6 +100,9 @@ class BenchRun:
         """Do what is missing, then print the table; returns the exit status."""
         matrix, work = self.matrix(), self.work.expanduser().resolve()
         chains, cells = matrix.chains(), open_cells(work)
+        if self.output is not None:
+            with explained(self.output, BenchError):
+                check_writable(self.output)
         workers = 1 if self.cluster == "none" else len(self.gpus) or self.jobs
         try:
             with Display(chains, cells, workers) as display:
@@ -110,7 +114,9 @@ class BenchRun:
                     options = job_options(self.job_options)
                     failures = spread(work, chains, self.cluster, display, self.jobs, self.gpus, options)
         except KeyboardInterrupt:
-            say(f"interrupted; {len(open_cells(work))} finished cells are in {work}, and the same command goes on")
+            done = len(open_cells(work))
+            kept = f"{done} finished cells are in {work}" if done else "no cell was finished"
+            say(f"interrupted; {kept}. The same command goes on")
             return INTERRUPTED
         for failure in failures:
             say(failure)
@@ -119,6 +125,10 @@ class BenchRun:
         print(text)
         if self.output is not None:
             self.output.parent.mkdir(parents=True, exist_ok=True)
-            self.output.write_text(text, "utf8")
-        print(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}", file=sys.stderr)
+            with explained(self.output, BenchError):
+                write_file(self.output, text.encode("utf8"))
+        if len(cells):
+            print(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}", file=sys.stderr)
+        else:
+            print("No cell was finished.", file=sys.stderr)
         return FAILED if failures else 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +11,8 @@ from typing import Protocol
 from bitymi_ns.bench.cells import FILE, Cells, made
 from bitymi_ns.bench.commands import prepare, read_result, stage_command
 from bitymi_ns.bench.matrix import Stage
-from bitymi_ns.bench.process import BenchError, CommandFailed, run_measured
+from bitymi_ns.bench.process import BenchError, CommandFailed, run_measured, say
+from bitymi_ns.files import Busy, Lock, reason
 
 Chain = Sequence[Stage]
 """The cells of one run; each may need those before it."""
@@ -66,25 +66,25 @@ def missing(chain: Chain, cells: Cells) -> list[Stage]:
 
 
 @contextmanager
-def locked(work: Path, stage: Stage) -> Iterator[int]:
-    """Hold a run, so that no other process works in its folders; yields the file descriptor that holds it.
+def locked(work: Path, stage: Stage) -> Iterator[Lock]:
+    """Hold a run, so that no other process works in its folders.
 
     Raises:
         CommandFailed: another process holds it.
     """
     path = work / "locks" / f"{stage.run.folder.replace('/', '--')}.lock"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise CommandFailed(
-                f"{stage.run}: another process is at work on this run: wait for it or end it ({path})"
-            ) from error
-        yield file.fileno()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = Lock(path, say)
+    except Busy as error:
+        raise CommandFailed(f"{stage.run}: {error}") from error
+    except OSError as error:
+        raise BenchError(f"{work} cannot be written: {reason(error, work)}, with --work") from error
+    with lock:
+        yield lock
 
 
-def run_stage(work: Path, stage: Stage, cells: Cells, lock: int) -> float:
+def run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> float:
     """Do one cell and write its line; returns the seconds it took. The command holds the lock of the run, too.
 
     Raises:
@@ -92,7 +92,7 @@ def run_stage(work: Path, stage: Stage, cells: Cells, lock: int) -> float:
     """
     command = stage_command(work, stage)
     start = time.perf_counter()
-    cost = run_measured(command, prepare(work, stage), [lock])
+    cost = run_measured(command, prepare(work, stage), lock)
     value = read_result(work, stage, cost)
     seconds = time.perf_counter() - start
     cells.add(stage.key, value, made(command, seconds))

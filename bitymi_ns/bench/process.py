@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from bitymi_ns.files import Lock
+
 TAIL = 25
 """Lines of a failed command's log that are shown."""
 GRACE = 20.0
@@ -49,7 +51,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_WAIT_POLICY": "passive"}
 
 
-def run_measured(command: Sequence[str], log: Path, keep_open: Sequence[int] = ()) -> Cost:
+def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> Cost:
     """Run a command with its output in a file.
 
     An interrupt ends the command first, then this call.
@@ -57,8 +59,8 @@ def run_measured(command: Sequence[str], log: Path, keep_open: Sequence[int] = (
     Args:
         command: the command.
         log: the file for its output.
-        keep_open: file descriptors that the command inherits: a lock on them outlives this process, should it be killed
-            while the command goes on.
+        lock: what the command holds, too, and is named in: should this process be killed while the command goes on,
+            the lock outlives it and says who has it.
 
     Raises:
         CommandFailed: non-zero exit status, or the command cannot be started.
@@ -73,11 +75,13 @@ def run_measured(command: Sequence[str], log: Path, keep_open: Sequence[int] = (
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
-                pass_fds=tuple(keep_open),
+                pass_fds=() if lock is None else (lock.fileno(),),
             )
         except OSError as error:
             raise CommandFailed(f"{shlex.join(command)} cannot be started: {error}") from error
         try:
+            if lock is not None:
+                lock.name(process.pid)
             _, status, usage = os.wait4(process.pid, 0)
         except BaseException:
             process.terminate()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
-import os
 import pickle
 import zipfile
 import zlib
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from bitymi_ns.files import complete_file, reason
 from bitymi_ns.host.errors import fail
 from bitymi_ns.scene.config import SceneConfig
 
@@ -48,30 +49,24 @@ def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
         scratch: a folder of the same file system for the unfinished file; nerfstudio takes every name in the
             checkpoint folder for a checkpoint.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = scratch / f".{path.name}.{os.getpid()}.unfinished"
     try:
-        with open(unfinished, "wb") as file:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with complete_file(path, scratch) as file:
             torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    except (OSError, RuntimeError) as error:  # torch reports some write errors as RuntimeError
-        _remove(unfinished)
+    except (OSError, RuntimeError) as error:
         kept = sorted(p.name for p in path.parent.glob("*.ckpt"))
-        detail = error if isinstance(error, OSError) else "the disk took only a part of it"  # torch says which byte
-        then = f"resume with --load-dir {path.parent} (from {kept[-1]}, which is intact)" if kept else "train again"
-        fail(f"the checkpoint {path} could not be written: {detail}.\n  Free some disk space and {then}.", error)
-    except BaseException:  # Ctrl-C
-        _remove(unfinished)
-        raise
+        detail = reason(_of_the_system(error), path)
+        then = f"Resume with --load-dir {path.parent} (from {kept[-1]}, which is intact)" if kept else "Train again"
+        fail(f"the checkpoint {path} could not be written: {detail}.\n  {then}.", error)
 
 
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        pass
+def _of_the_system(error: BaseException) -> OSError:
+    """The system's error behind that of torch, which writes an archive's end after a write that failed and reports only
+    that this does not fit."""
+    behind: BaseException | None = error
+    while behind is not None and not isinstance(behind, OSError):
+        behind = behind.__context__
+    return behind or OSError(errno.EIO, "the disk took only a part of it")
 
 
 def newest_step(folder: Path) -> int:

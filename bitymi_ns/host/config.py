@@ -8,13 +8,16 @@ from typing import Any, Literal
 
 import torch
 import tyro
+import yaml
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host import checkpoints
+from bitymi_ns.files import reason, write_file
+from bitymi_ns.host import checkpoints, run_folder
 from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
 from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
@@ -73,13 +76,13 @@ class BitymiTrainerConfig(TrainerConfig):
         """Write config.yml. This is the first that a run writes, so a folder that cannot be used shows here. What
         can be checked before anything is written is checked now."""
         check_capture(self.pipeline.datamanager)
+        folder = self.get_base_dir()
+        run_folder.take(folder)
+        CONSOLE.log(f"Saving config to: {folder / 'config.yml'}")
         try:
-            super().save_config()
+            write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         except OSError as error:
-            fail(
-                f"{self.get_base_dir()} cannot be written: {error}. Free some disk space or give another --output-dir.",
-                error,
-            )
+            fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
 
     def resolve_length(self, trained_for: int | None = None) -> None:
         """Fill in the length of the run where it was not given.

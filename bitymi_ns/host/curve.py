@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from pathlib import Path
 from typing import Any
 
+from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.errors import fail, warn
 
 FILE = "training_curve.jsonl"
@@ -43,14 +43,12 @@ class TrainingCurve:
         """
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
-        unfinished = path.with_name(path.name + ".new")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
-            unfinished.write_text("".join(line + "\n" for line in kept), "utf8")
-            os.replace(unfinished, path)
+            write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
         except OSError as error:
-            fail(f"the training curve {path} cannot be written: {error}. Free some disk space.", error)
+            fail(f"the training curve {path} cannot be written: {reason(error, path)}.", error)
 
     def add(self, point: dict[str, Any]) -> None:
         """Write one point, whole and at once. A full disk costs the point, not the run."""
@@ -58,7 +56,7 @@ class TrainingCurve:
             with open(self.path, "a", encoding="utf8") as file:
                 file.write(json.dumps(point) + "\n")
         except OSError as error:
-            warn(f"A point of the training curve {self.path} could not be written: {error}.")
+            warn(f"A point of the training curve {self.path} could not be written: {reason(error, self.path)}.")
 
 
 def _points_until(path: Path, steps: int) -> list[str]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import io
-import os
 import pickle
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -25,15 +24,16 @@ from rich.table import Table
 
 from bitymi_ns.bake import BakeOptions, BundleError, TuneOptions, bake, export, read_bundle, rich_progress, tune_atlas
 from bitymi_ns.bake.bundle import World
-from bitymi_ns.bake.folder import check_target
 from bitymi_ns.bake.manifest import MANIFEST, SURFELS, HeldOut, dump
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
+from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_config import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.preset import build, load_preset
+from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.memory import OnDemand
@@ -69,23 +69,21 @@ class ExportAtlas(BakeOptions):
 
     def main(self) -> None:
         """Run the export."""
-        self._written = False
+        earlier = None
         try:
-            self._run()
+            with bundle_place(self.output_dir, self.overwrite):
+                earlier = bundle_version(self.output_dir)
+                check_room(self.output_dir, self.load_config, self, self.exact)
+                self._run()
         except KeyboardInterrupt:
-            there = (self.output_dir / MANIFEST).is_file()
-            state = "is complete" if self._written else "is the earlier one" if there else "was not written"
+            there = bundle_version(self.output_dir)
+            state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
             CONSOLE.print(f"[bold yellow]The export was interrupted; the bundle {self.output_dir} {state}.")
             raise SystemExit(INTERRUPTED) from None
         except BundleError as error:
             fail(str(error), error)
 
     def _run(self) -> None:
-        try:
-            check_target(self.output_dir, self.overwrite)
-        except BundleError as error:
-            hint = " Use --overwrite True to replace it." if not self.overwrite else ""
-            fail(f"{error}.{hint}", error)
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         outputs = datamanager.train_dataparser_outputs
@@ -126,7 +124,6 @@ class ExportAtlas(BakeOptions):
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
         )
-        self._written = True
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
             from bitymi_ns.scene.baked import BakedScene
@@ -237,14 +234,10 @@ def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> b
 
 def replace_file(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
     try:
-        unfinished.write_bytes(data)
-        os.replace(unfinished, path)
+        write_file(path, data)
     except OSError as error:
-        fail(f"{path} could not be written: {error}", error)
-    finally:
-        unfinished.unlink(missing_ok=True)
+        fail(f"{path} could not be written: {reason(error, path)}.", error)
 
 
 def print_summary(folder: Path, info: dict[str, Any]) -> None:
@@ -276,6 +269,10 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
     tuned = statistics.get("finetune")
     if tuned and tuned["steps"]:
         table.add_row("Fine-tuning", f"{tuned['steps']} steps, {tuned['seconds']:.0f} s")
+        if tuned["steps"] < tuned["steps_asked"]:
+            without = tuned["steps"] - tuned["best_step"]
+            table.add_row("", f"(stopped early at step {tuned['steps']} of {tuned['steps_asked']}: no gain on the")
+            table.add_row("", f"set-aside training views for {without} steps)")
         for name, views in (("psnr_held_in", "... set-aside training views"), ("psnr_held_out", "... held-out views")):
             if name in tuned:
                 table.add_row(views, f"{tuned[name]['before']:.2f} -> {tuned[name]['after']:.2f} dB")

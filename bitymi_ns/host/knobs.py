@@ -22,6 +22,7 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.preset import build, load_preset
+from bitymi_ns.host.target import see_writable
 from bitymi_ns.ops.trace import TRANSMITTANCE_MIN
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -311,6 +312,7 @@ def measure_to_file(load_config: Path, output: Path, knobs: Sequence[str], views
         fail(f"--repeats must be at least 1, not {repeats}")
     if not output.parent.is_dir():
         fail(f"there is no folder {output.parent} for {output.name}")
+    see_writable(output)
     config, pipeline = load_trained(load_config)
     held_out = HeldOut(pipeline, views)
     about = {"scene": config.experiment_name, "method": config.method_name, "views": len(held_out.cameras)}

@@ -15,10 +15,12 @@ from PIL import Image
 from torch import Tensor
 
 from bitymi_ns.bake.geometry import tangent_vectors
+from bitymi_ns.files import reason
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.metrics import image_metrics
+from bitymi_ns.host.target import see_writable
 from bitymi_ns.ops import composite
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.train.views import as_float, over_background
@@ -111,6 +113,7 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
+    see_writable(output_dir / FILE)
     config, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     count = len(datamanager.eval_dataset)
@@ -128,7 +131,7 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     try:
         output_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        fail(f"{output_dir} cannot be made: {error}", error)
+        fail(f"{output_dir} cannot be made: {reason(error, output_dir)}.", error)
     listed = []
     for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
         files = {}

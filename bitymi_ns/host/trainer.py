@@ -13,7 +13,8 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host import checkpoints
+from bitymi_ns import files
+from bitymi_ns.host import checkpoints, run_folder
 from bitymi_ns.host.errors import fail
 
 INTERRUPTED = 130
@@ -49,6 +50,7 @@ class BitymiTrainer(Trainer):
                 path = checkpoints.path_of(config.load_dir, step)
             else:
                 path = Path(config.load_checkpoint)
+            files.remove_unfinished(path.parent.parent)  # of the run that was killed
             self._restore(checkpoints.load(path, config.pipeline.model.scene), path)
             CONSOLE.print(f"Resuming after step {self._start_step - 1} from {path}")
         config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
@@ -66,6 +68,12 @@ class BitymiTrainer(Trainer):
 
     def train(self) -> None:
         """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
+        try:
+            self._train_to_the_end()
+        finally:
+            run_folder.leave(self.base_dir)
+
+    def _train_to_the_end(self) -> None:
         total = self.config.max_num_iterations
         if self._start_step >= total:
             CONSOLE.print(
@@ -73,6 +81,8 @@ class BitymiTrainer(Trainer):
                 "For a longer run give a larger --max-num-iterations."
             )
             return
+        # of every parameter a checkpoint holds the value and Adam's two moments
+        run_folder.check_space(self.base_dir, 3 * sum(p.nbytes for p in self.pipeline.parameters() if p.requires_grad))
         CONSOLE.print(f"[bold yellow]{self.config.announcement()}", soft_wrap=True)
         restore_handler = self._catch_interrupt()
         self.config.max_num_iterations = total - self._start_step

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from bitymi_ns import __version__
+from bitymi_ns.files import check_writable, explained, flush, staging
 from bitymi_ns.report.collect import collect
 from bitymi_ns.report.gallery import make_gallery, make_worst
 from bitymi_ns.report.knob_plots import knob_tables
@@ -78,26 +77,16 @@ def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
     A write that fails leaves an older report as it was. Plots that an older report had and this one has not are
     removed; other files in the folder stay.
     """
-    aside: Path | None = None
-    try:
-        output_dir.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=f".{output_dir.name}-", dir=output_dir.parent))
+    with staging(output_dir) as aside:
         for name, data in files.items():
             (aside / name).write_bytes(data)
+            flush(aside / name)
         output_dir.mkdir(exist_ok=True)
         for name in sorted(files, key=lambda name: name == "index.html"):
             os.replace(aside / name, output_dir / name)
         for path in output_dir.glob("*.png"):
             if is_plot_name(path.stem) and path.name not in files:
                 path.unlink(missing_ok=True)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ReportError(
-            f"the report cannot be written to {output_dir}: {reason}. Make room or give another folder."
-        ) from error
-    finally:
-        if aside is not None:
-            shutil.rmtree(aside, ignore_errors=True)
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report", published: bool = False) -> Path:
@@ -119,9 +108,12 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
     """
     output_dir = Path(output_dir).expanduser().absolute()
     _check_output(output_dir)
+    with explained(output_dir, ReportError):
+        check_writable(output_dir)
     content = compose(collect(list(inputs), output_dir), title, published)
     files = {f"{plot.name}.png": plot.light for plot in content.plots}
     files["report.md"] = to_report_md(content).encode("utf8")
     files["index.html"] = to_page(content).encode("utf8")
-    write_aside(files, output_dir)
+    with explained(output_dir, ReportError):
+        write_aside(files, output_dir)
     return output_dir / "index.html"

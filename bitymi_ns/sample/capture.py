@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PILImage
 
+from bitymi_ns.files import complete_folder
 from bitymi_ns.sample.room import Hits, Room
 
 FOCAL = 0.80  # focal length in image widths
@@ -137,21 +137,15 @@ def generate(
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}")
     output_dir = Path(output_dir).absolute()
-    if output_dir.exists() and not output_dir.is_dir():
-        raise FileExistsError(f"{output_dir} is a file; choose another output folder")
-    if output_dir.exists() and any(output_dir.iterdir()) and not overwrite:
-        raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
-    output_dir.parent.mkdir(parents=True, exist_ok=True)
-    aside = output_dir.parent / f".{output_dir.name}-{os.getpid()}"
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir()
-    try:
-        _write(aside, views, width, height, seed, points, progress)
-        if output_dir.exists():
-            shutil.rmtree(output_dir)
-        aside.rename(output_dir)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+
+    def check() -> None:
+        if output_dir.exists() and not output_dir.is_dir():
+            raise FileExistsError(f"{output_dir} is a file; choose another output folder")
+        if output_dir.exists() and any(output_dir.iterdir()) and not overwrite:
+            raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
+
+    with complete_folder(output_dir, check) as new:
+        _write(new, views, width, height, seed, points, progress)
     return output_dir
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.stability.backends import BACKENDS, Backend
 from bitymi_ns.stability.cases import cases
 from bitymi_ns.stability.measure import PROBES, RIM, ROUNDING, Errors, Trust, against_extended, measure
@@ -97,6 +97,7 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
         The rows of the cases and the sweeps.
     """
     tell = progress or (lambda text: None)
+    check_writable(path)
     named = []
     for case in cases():
         tell(f"case {case.name}")
@@ -109,18 +110,9 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
         ]
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = path.with_suffix(".png")
-    _replace(picture, _plot(swept))
-    _replace(path, _page(backend, named, swept, picture.name).encode())
+    write_file(picture, _plot(swept))
+    write_file(path, _page(backend, named, swept, picture.name).encode())
     return named + [row for rows in swept.values() for row in rows]
-
-
-def _replace(path: Path, data: bytes) -> None:
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        aside.write_bytes(data)
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:

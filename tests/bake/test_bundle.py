@@ -182,7 +182,7 @@ def test_a_full_disk_leaves_nothing_behind(surfels, tmp_path, monkeypatch, step,
     if overwrite:
         make(surfels, target, "sg")
     monkeypatch.setattr(*step, raiser(OSError(errno.ENOSPC, "No space left on device")))
-    with pytest.raises(BundleError, match=r"disk is full.*MB"):
+    with pytest.raises(BundleError, match=r"needs about [1-9].* (bytes|kB)\): the disk is full"):
         make(surfels, target, overwrite=overwrite)
     assert names_beside(target) == (["b"] if overwrite else [])
     if overwrite:
@@ -203,7 +203,7 @@ def test_a_failed_swap_puts_the_old_bundle_back(surfels, tmp_path, monkeypatch):
     rename = type(target).rename
 
     def fail_for_the_new_one(self, to):
-        if ".new-" in self.name:
+        if self.name.endswith(".new"):
             raise OSError(errno.EIO, "Input/output error")
         return rename(self, to)
 
@@ -212,6 +212,16 @@ def test_a_failed_swap_puts_the_old_bundle_back(surfels, tmp_path, monkeypatch):
         make(surfels, target, overwrite=True)
     monkeypatch.undo()
     assert read_bundle(target).view_color == "sg" and names_beside(target) == ["b"]
+
+
+@pytest.mark.parametrize(
+    ("number", "why"), [(errno.EROFS, "the file system is read-only"), (errno.EDQUOT, "your quota"), (errno.EIO, "I/O")]
+)
+def test_what_cannot_be_written_is_explained_by_its_cause(surfels, tmp_path, monkeypatch, number, why):
+    monkeypatch.setattr(ply, "write_ply", raiser(OSError(number, "I/O")))
+    with pytest.raises(BundleError, match=why) as error:
+        make(surfels, tmp_path / "b")
+    assert ("needs about" in str(error.value)) == (number == errno.EDQUOT)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -129,6 +129,20 @@ def test_it_ends_with_the_best_texels_of_the_held_in_views(wrong: Baked, views: 
     torch.testing.assert_close(kept.texels, wrong.texels, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("patience", [2, 99])
+def test_its_progress_ends_with_it(wrong: Baked, views: list[View], patience: int) -> None:
+    told: list[tuple[int, int]] = []
+
+    def progress(step: str, done: int, total: int) -> None:
+        if step == "tuning texels":
+            told.append((done, total))
+
+    wild = replace(OPTIONS, rate=50.0, steps=40, patience=patience)
+    statistics = tune_atlas(wrong, views, BACKGROUND, wild, progress).statistics["finetune"]
+    assert (statistics["steps"] < 40) == (patience == 2) and statistics["steps_asked"] == 40
+    assert told[0] == (1, 40) and told[-1] == (statistics["steps"], statistics["steps"])
+
+
 def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: list[View]) -> None:
     few = replace(OPTIONS, steps=8)
     results = [tune_atlas(wrong, views, BACKGROUND, replace(few, cache_bytes=b)) for b in (0, 200_000, 1 << 30)]

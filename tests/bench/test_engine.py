@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import subprocess
 import time
 from pathlib import Path
@@ -12,6 +14,8 @@ import pytest
 from bitymi_ns.bench import BenchError, CommandFailed, Matrix, Row, Stage, engine, open_cells, run_chains
 from bitymi_ns.bench.cells import Cells, identity
 from bitymi_ns.bench.process import run_measured, tool
+from bitymi_ns.cli import main
+from bitymi_ns.files import Lock
 
 
 def lines(work: Path) -> list[dict]:
@@ -62,12 +66,12 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
     work, chain = tmp_path / "work", matrix.chains()[0]
     calls = iter(range(99))
 
-    def killed(command: list[str], log: Path, keep_open: list[int]) -> object:
+    def killed(command: list[str], log: Path, lock: Lock) -> object:
         if next(calls) == at:
             if "--output-dir" in command:  # half of its files are there
                 Path(command[command.index("--output-dir") + 1]).mkdir(parents=True, exist_ok=True)
             raise KeyboardInterrupt
-        return run_measured(command, log, keep_open)
+        return run_measured(command, log, lock)
 
     monkeypatch.setattr(engine, "run_measured", killed)
     with pytest.raises(KeyboardInterrupt):
@@ -96,7 +100,9 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     process.wait()
     assert len(lines(work)) == 2
     again = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert again.returncode == 1 and "another process is at work" in again.stderr  # its export still runs
+    named = re.search(r"fox, bitymi: process (\d+) is at work there: wait for it, or end it", again.stderr)
+    assert again.returncode == 1 and named is not None and int(named[1]) != process.pid
+    assert b"ns-export" in Path(f"/proc/{named[1]}/cmdline").read_bytes()  # its export still runs
     fakes.calls()
     fakes.slow.write_text("")
     while subprocess.run(words, capture_output=True, check=False).returncode != 0:
@@ -153,7 +159,7 @@ def test_two_benchmarks_do_not_work_on_one_run(fakes, matrix: Matrix, tmp_path: 
     work, chain = tmp_path / "work", matrix.chains()[0]
     with engine.locked(work, chain[0]):
         (failure,) = run_chains(work, [chain])
-    assert "another process is at work" in failure and fakes.calls() == []
+    assert f"process {os.getpid()} is at work there" in failure and fakes.calls() == []
 
 
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
@@ -189,6 +195,35 @@ def test_empty_matrix_and_missing_tools(tmp_path: Path, monkeypatch: pytest.Monk
         tool("ns-nothing")
     with pytest.raises(CommandFailed, match="cannot be started"):
         run_measured([str(tmp_path / "nothing")], tmp_path / "log")
+
+
+def test_no_file_is_named_that_is_not_there(
+    fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work = tmp_path / "work"
+    words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(work)]
+    fakes.fail("ns-train")
+    assert main(words) == 1
+    told = capsys.readouterr().err
+    assert "No cell was finished." in told and "cells.jsonl" not in told
+
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bitymi_ns.bench.cli.run_chains", interrupted)
+    assert main(words) == 130
+    assert "interrupted; no cell was finished. The same command goes on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--work", "--output"])
+def test_places_that_cannot_be_written_are_found_first(
+    fakes, matrix: Matrix, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(tmp_path / "work")]
+    assert main([*words, option, str(tmp_path / "file" / "x")]) == 1
+    assert f"x cannot be written: {tmp_path / 'file'} is not a folder" in capsys.readouterr().err
+    assert fakes.calls() == []
 
 
 def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> None:

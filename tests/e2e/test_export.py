@@ -7,6 +7,7 @@ import math
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.bake import check_files, tune
+from bitymi_ns.bake import BakeOptions, TuneOptions, check_files, tune
 from bitymi_ns.cli import main
 from bitymi_ns.host import export as host_export
+from bitymi_ns.host import target
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.export import ExportAtlas, default_export
@@ -216,6 +218,93 @@ def test_ctrl_c_before_a_bundle_is_replaced_says_which_one_is_there(
     with pytest.raises(SystemExit):
         run_export(trained, copied, overwrite=True)
     assert "is the earlier one" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "state"),
+    [
+        ("mkdir", ".elsewhere.new", "is the earlier one"),  # the new one is begun
+        ("rename", "elsewhere", "is the earlier one"),  # the earlier one is out of the way
+        ("rename", ".elsewhere.new", "is complete"),  # the new one is in its place
+    ],
+)
+def test_ctrl_c_while_a_bundle_is_replaced_says_which_one_is_there(
+    trained: BitymiTrainerConfig,
+    copied: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    call: str,
+    name: str,
+    state: str,
+) -> None:
+    before = (copied / "bundle.json").read_bytes()
+    do = getattr(Path, call)
+
+    def interrupted_after(self: Path, *arguments: Any, **options: Any) -> Any:
+        result = do(self, *arguments, **options)
+        if self.name == name:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(Path, call, interrupted_after)
+    with pytest.raises(SystemExit):
+        run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)
+    monkeypatch.undo()
+    assert state in " ".join(capsys.readouterr().out.split())
+    assert ((copied / "bundle.json").read_bytes() == before) == (state == "is the earlier one")
+    assert check_files(copied)[0] is not None and [p.name for p in copied.parent.iterdir()] == [copied.name]
+
+
+def test_ctrl_c_in_the_comparison_says_that_the_bundle_is_complete(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(host_export, "read_bundle", interrupted)
+    with pytest.raises(SystemExit):
+        run_export(trained, tmp_path / "b", finetune_steps=0)
+    assert "is complete" in " ".join(capsys.readouterr().out.split())
+    assert check_files(tmp_path / "b")[0] is not None
+
+
+def test_a_place_that_will_not_do_is_found_before_the_work(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host_export, "load_trained", None)  # is not called
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="b cannot be written: .*file is not a folder.*--output-dir"):
+        run_export(trained, tmp_path / "file" / "b")
+    with pytest.raises(InputError, match="cannot be written: the name is too long"):
+        run_export(trained, tmp_path / ("b" * 300))
+    monkeypatch.setattr(target, "free_bytes", lambda path: 34_500)
+    with pytest.raises(
+        InputError, match=r"too little room .*: 34.5 kB are free, .* up to \d.* MB \(a generous estimate"
+    ):
+        run_export(trained, tmp_path / "b")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_the_estimate_of_a_bundle_is_generous(trained: BitymiTrainerConfig, bundle: Path) -> None:
+    size = sum(path.stat().st_size for path in bundle.iterdir())
+    config = trained.get_base_dir() / "config.yml"
+    needed = [
+        target.space_needed(config, BakeOptions(format=name), exact) for name in ("bc7", "fp16") for exact in (0, 1)
+    ]
+    assert size < needed[0] < needed[1] < needed[3] and needed[0] < needed[2]
+
+
+def test_a_fine_tuning_that_ends_early_says_so(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wild = partial(TuneOptions, rate=50.0, patience=2)
+    monkeypatch.setattr(host_export, "TuneOptions", wild)
+    run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=40, compare=False)
+    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    steps = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]["steps"]
+    assert steps < 40
+    assert f"stopped early at step {steps} of 40: no gain on the set-aside training views for" in out
+    assert "tuning texels ━" in out and "100%" in out.split("tuning texels")[-1][:80]
 
 
 def test_a_missing_encoder_is_named(

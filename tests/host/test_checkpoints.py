@@ -100,7 +100,8 @@ def test_surfels_of_different_numbers(saved: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "detail"),
     [
-        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (OSError(errno.ENOSPC, "No space left on device"), "the disk is full: free some space"),
+        (OSError(errno.EROFS, "Read-only file system"), "the file system is read-only"),
         (RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 9 vs 8"), "took only a part of it"),
     ],
 )
@@ -116,8 +117,8 @@ def test_a_full_disk(
     whole = saved.read_bytes()
     if not earlier:
         saved.unlink()
-    then = "resume with --load-dir .*intact" if earlier else "train again"
-    with pytest.raises(InputError, match=f"(?s)could not be written: .*{detail}.*Free some disk space and {then}"):
+    then = "Resume with --load-dir .*intact" if earlier else "Train again"
+    with pytest.raises(InputError, match=f"(?s)could not be written: .*{detail}.*{then}"):
         checkpoints.save({}, checkpoints.path_of(saved.parent, 9), scratch=saved.parent)
     assert [p.name for p in saved.parent.iterdir()] == ([saved.name] if earlier else [])
     assert not earlier or saved.read_bytes() == whole

@@ -1,0 +1,381 @@
+"""Files and folders that appear whole or not at all, one writer at a time, and why something cannot be written.
+
+A file is written as `.NAME.unfinished`, a folder as `.NAME.new`, both beside their place; they are flushed, then
+renamed. While a folder is replaced, the earlier one is `.NAME.old`. Whoever writes holds a lock (`.NAME.lock` for a
+folder), which the kernel releases when the process ends, however it ends. So the names are fixed, and what a killed
+process left under them is found, and put back or removed, by the next one that writes there.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import socket
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from rich.filesize import decimal
+
+UNFINISHED = ".unfinished"
+Tell = Callable[[str], None]
+"""Gets a message for people about something that goes on without what it should have had."""
+
+
+class Busy(BlockingIOError):
+    """Another process is at work in the same place; `who` names it, as far as it is known, and says what to do."""
+
+    def __init__(self, who: str) -> None:
+        super().__init__(errno.EAGAIN, who)
+        self.who = who
+
+    def __str__(self) -> str:
+        return self.who
+
+
+_REASONS = {
+    errno.EROFS: "the file system is read-only: give a place on another one",
+    errno.EACCES: "you have no permission to write there: give another place, or change its permissions",
+    errno.EPERM: "the system does not permit writing there: give another place",
+    errno.ENOSPC: "the disk is full: free some space, or give a place on another disk",
+    errno.EDQUOT: "your quota of disk space is used up: free some space, or give a place on another disk",
+    errno.EFBIG: "the file would be larger than this system allows (see `ulimit -f`)",
+    errno.ENAMETOOLONG: "the name is too long: give a shorter one",
+    errno.EISDIR: "it is a folder, not a file: give another name",
+    errno.ELOOP: "a link in its path leads back to itself: give another place",
+    errno.EBUSY: "it is in use by the system, as a mount point is: give a folder in it",
+    errno.EXDEV: "it is a mount point: give a folder in it",
+}
+
+
+def reason(error: OSError, path: Path) -> str:
+    """Why `path` could not be written, and what to do about it; without a full stop."""
+    if isinstance(error, Busy):
+        return error.who
+    if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
+        there = _nearest(path.absolute())
+        if not there.is_dir():
+            return f"{there} is not a folder: give another place"
+        return f"nothing can be made in {there} ({error.strerror}): give another place"
+    return _REASONS.get(error.errno or 0) or error.strerror or str(error)
+
+
+@contextmanager
+def explained(path: Path, kind: type[Exception]) -> Iterator[None]:
+    """Turn the system's refusals to write `path` in the block into exceptions of this kind that say why."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:  # of our own making: it says what is wrong
+            raise
+        raise kind(f"{path} cannot be written: {reason(error, path)}") from error
+
+
+def free_bytes(path: Path) -> int:
+    """Free space for a file or folder that may not be there yet, nor its parents."""
+    return shutil.disk_usage(_nearest(path.absolute())).free
+
+
+def size_text(size: int) -> str:
+    """A number of bytes for people, in decimal units."""
+    return decimal(size)
+
+
+def _nearest(path: Path) -> Path:
+    """The path, or the nearest of its parents that exists."""
+    return next((p for p in (path, *path.parents) if os.path.lexists(p)), Path("/"))
+
+
+def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
+    """Open a file for writing, made where it is missing, and lock it until it is closed in all processes that have it.
+
+    Returns:
+        the file, and whether it is locked: some network file systems know no locks.
+
+    Raises:
+        BlockingIOError: another process has the lock.
+        OSError: it cannot be opened.
+    """
+    while True:
+        file = open(path, "r+b", opener=lambda name, flags: os.open(name, flags | os.O_CREAT, 0o666))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise
+        except OSError:
+            return file, False
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                return file, True
+        file.close()  # its last holder has removed or renamed it in the meantime
+
+
+class Lock:
+    """A file that one process at a time holds. It has the number of that process, for the message to the others; it is
+    removed when the lock is released, and a file that a killed process left is no hindrance."""
+
+    def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
+        """
+        Args:
+            path: the file; its folder must exist.
+            tell: told where the file system has no locks; the lock then keeps nobody out.
+
+        Raises:
+            Busy: another process holds it.
+            OSError: the file cannot be made.
+        """
+        self.path, self._owner = path, os.getpid()
+        try:
+            self._file, locked = _open_locked(path)
+        except BlockingIOError:
+            raise Busy(_holder(path)) from None
+        if not locked:
+            tell(f"{path.parent} is on a file system without locks: see that no other process writes there.")
+        self.name(self._owner)
+
+    def name(self, process: int) -> None:
+        """State that this process does the work, for the message to others; a full disk costs only that."""
+        with suppress(OSError):
+            self._file.seek(0)
+            self._file.truncate()
+            self._file.write(f"{process} {socket.gethostname()}\n".encode())
+            self._file.flush()
+
+    def fileno(self) -> int:
+        """The descriptor that holds the lock: a child that inherits it holds it, too."""
+        return self._file.fileno()
+
+    def release(self) -> None:
+        """Let others have it; a second call, or one in a forked child, changes nothing."""
+        if not self._file.closed and self._owner == os.getpid():
+            with suppress(OSError):
+                self.path.unlink()
+            with suppress(OSError):
+                self._file.close()
+
+    def __enter__(self) -> Lock:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
+
+def _holder(path: Path) -> str:
+    """Who holds a lock, and what to do."""
+    try:
+        process, host = path.read_text("utf8").split()
+    except (OSError, ValueError):  # it has been released just now, or has not been named yet
+        return "another process is at work there: wait for it, or end it"
+    where = "" if host == socket.gethostname() else f" on {host}"
+    return f"process {process}{where} is at work there: wait for it, or end it (kill {process})"
+
+
+_held: dict[tuple[str, int], Lock] = {}
+"""Locks by file and thread: who has one may take it again."""
+
+
+def hold(path: Path, tell: Tell = warnings.warn) -> None:
+    """Take the lock on this file, unless this thread has it already; see `Lock`."""
+    key = (os.path.realpath(path), threading.get_ident())
+    if key not in _held:
+        _held[key] = Lock(path, tell)
+
+
+def release(path: Path) -> None:
+    """Release the lock that `hold` took, if there is one."""
+    lock = _held.pop((os.path.realpath(path), threading.get_ident()), None)
+    if lock is not None:
+        lock.release()
+
+
+@contextmanager
+def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
+    """Hold the place of a file or folder, and put right what a killed process left of a folder there.
+
+    Makes missing parents, and removes them again where nothing has come into them. As this writes beside the target, it
+    also shows whether anything can be written there, before the work that is to be written.
+
+    Args:
+        target: what is to be written in the block; reservations of one thread may be nested.
+        tell: told where the file system has no locks.
+
+    Yields:
+        the target with links resolved.
+
+    Raises:
+        Busy: another process is writing it.
+        OSError: nothing can be written there; `reason` says why.
+    """
+    place = Path(os.path.realpath(target))
+    if os.path.ismount(place):
+        raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), str(place))
+    made = [parent for parent in place.parents if not os.path.lexists(parent)]
+    lock = place.with_name(f".{place.name}.lock")
+    outermost = (str(lock), threading.get_ident()) not in _held
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        hold(lock, tell)
+        try:
+            _settle(place)
+            yield place
+        finally:
+            if outermost:
+                release(lock)
+    finally:
+        for parent in made:
+            with suppress(OSError):
+                parent.rmdir()
+
+
+def check_writable(target: Path) -> None:
+    """See that a file or folder can be written there, before the work of making it; raises what `reserved` raises."""
+    if not _is_device(target):
+        with reserved(target):
+            pass
+
+
+def _is_device(path: Path) -> bool:
+    """Whether it is a device or a pipe, such as /dev/stdout."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def _beside(place: Path) -> tuple[Path, Path]:
+    return place.with_name(f".{place.name}.new"), place.with_name(f".{place.name}.old")
+
+
+def _settle(place: Path) -> None:
+    """Undo a replacement that has not come to its end: the place has the later folder if it was whole, else the earlier
+    one, and there is nothing beside it. To be called by the holder of the lock alone."""
+    new, old = _beside(place)
+    _remove(new)
+    if old.exists():
+        if place.exists():
+            old.rename(new)  # so that an .old is always whole, should this be the moment of a kill
+            _remove(new)
+        else:
+            old.rename(place)
+
+
+def _remove(folder: Path) -> None:
+    if folder.exists():
+        shutil.rmtree(folder)
+
+
+@contextmanager
+def staging(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
+    """An empty folder beside the target for what is on its way there; it is gone after the block. See `reserved`."""
+    with reserved(target, tell) as place:
+        new, _ = _beside(place)
+        try:
+            new.mkdir()
+            yield new
+        finally:
+            with suppress(OSError):  # the next writer tries again
+                _settle(place)
+
+
+@contextmanager
+def complete_folder(
+    target: str | Path, check: Callable[[], None] = lambda: None, tell: Tell = warnings.warn
+) -> Iterator[Path]:
+    """A temporary folder beside the target that takes the target's place when the block ends without an exception.
+
+    On any exception, KeyboardInterrupt included, the target is as it was. After a kill it is the earlier folder or the
+    later one, or both are beside it, and the next writer puts that right.
+
+    Args:
+        target: the folder; missing parents are made.
+        check: raises if what is in the place may not be replaced; called before the block and after it.
+        tell: told where the file system has no locks.
+
+    Yields:
+        the temporary folder.
+
+    Raises:
+        Busy: another process is writing it.
+        OSError: it cannot be written; `reason` says why.
+    """
+    with reserved(target, tell) as place:
+        check()
+        with staging(place, tell) as new:
+            yield new
+            for path in new.rglob("*"):
+                flush(path)
+            flush(new)
+            check()
+            _, old = _beside(place)
+            if place.exists():
+                place.rename(old)
+            new.rename(place)
+            flush(place.parent)
+
+
+@contextmanager
+def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]:
+    """A file to write to, which takes the place of `path` when the block ends without an exception; else that is as it
+    was.
+
+    Args:
+        path: the file; its folder must exist.
+        scratch: a folder of the same file system for the unfinished file; None = that of `path`.
+
+    Raises:
+        Busy: another process is writing it.
+        OSError: it cannot be written; `reason` says why.
+    """
+    unfinished = (scratch or path.parent) / f".{path.name}{UNFINISHED}"
+    try:
+        file, _ = _open_locked(unfinished)
+    except BlockingIOError:
+        raise Busy("another process is writing it: wait for it, or end it") from None
+    try:
+        file.truncate(0)
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    except BaseException:
+        with suppress(OSError):
+            unfinished.unlink()
+        raise
+    finally:
+        with suppress(OSError):  # what it still has in its buffer is of a write that failed
+            file.close()
+    flush(path.parent)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all; see `complete_file`. Devices and pipes are written to as they are."""
+    if _is_device(path):
+        path.write_bytes(data)
+        return
+    with complete_file(path) as file:
+        file.write(data)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the unfinished files of processes that have ended; what cannot be removed stays."""
+    for path in folder.glob(f".*{UNFINISHED}"):
+        with suppress(OSError):
+            file, locked = _open_locked(path)
+            with file:
+                if locked:
+                    path.unlink()
+
+
+def flush(path: Path) -> None:
+    """See that a file's bytes, or a folder's names, are on the disk: a full disk is reported here at the latest."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        if not path.is_dir():  # not every file system can flush a folder
+            raise
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,54 @@
+"""The folder of a training run: one process at a time trains into it."""
+
+from __future__ import annotations
+
+import atexit
+from pathlib import Path
+
+from bitymi_ns import files
+from bitymi_ns.host.errors import fail, warn
+
+LOCK = ".lock"
+"""In the run folder while a process trains into it."""
+
+
+def take(folder: Path) -> None:
+    """Make the folder where it is missing and hold it until `leave` or the end of the process; remove what killed runs
+    left unfinished there.
+
+    Raises:
+        InputError: another process trains into it, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files.hold(folder / LOCK, warn)
+    except files.Busy as error:
+        fail(
+            f"{folder} is in use: {error}. Or train into another folder: give another --timestamp, --experiment-name "
+            "or --output-dir.",
+            error,
+        )
+    except OSError as error:
+        fail(f"{folder} cannot be written: {files.reason(error, folder)} (--output-dir).", error)
+    atexit.register(leave, folder)
+    files.remove_unfinished(folder)
+
+
+def leave(folder: Path) -> None:
+    """Let other processes train into the folder."""
+    files.release(folder / LOCK)
+
+
+def check_space(folder: Path, needed: int) -> None:
+    """Stop before the first step when there is no room for a single checkpoint.
+
+    Args:
+        folder: the run's.
+        needed: bytes of a checkpoint of the scene as it is now.
+    """
+    free = files.free_bytes(folder)
+    if free < needed:
+        fail(
+            f"{folder} has {files.size_text(free)} free, and a checkpoint takes {files.size_text(needed)} already at "
+            "the start: free some space, or give an --output-dir on another disk."
+        )

@@ -1,0 +1,132 @@
+"""Kill a write at every step: run with the name of what is written and an empty folder.
+
+The write runs in forked children, the n-th of which ends without any cleaning up just before its n-th access to the
+folder; then the same write is done to the end. Fails where something is lost, mixed or left over after that.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bitymi_ns import files
+
+KILLED = 77
+
+
+def accesses(folder: Path, event: str, arguments: tuple[Any, ...]) -> bool:
+    """Whether Python is about to touch something in the folder, by the events that it audits."""
+    if event not in (
+        "open",
+        "os.mkdir",
+        "os.rename",
+        "os.remove",
+        "os.rmdir",
+        "os.truncate",
+        "os.listdir",
+        "os.scandir",
+    ):
+        return False
+    inside = any(isinstance(path, (str, Path)) and str(path).startswith(str(folder)) for path in arguments[:2])
+    relative = event in ("os.remove", "os.rmdir", "open") and len(arguments) > 1 and "/" not in str(arguments[0])
+    return inside or relative  # shutil.rmtree names files relative to a folder that it has open
+
+
+def killed_at(step: int, folder: Path, write: Callable[[], None]) -> bool:
+    """Write in a child that is killed before its access number `step`; False = it came to the end before that."""
+    child = os.fork()
+    if child == 0:
+        count = 0
+
+        def watch(event: str, arguments: tuple[Any, ...]) -> None:
+            nonlocal count
+            if accesses(folder, event, arguments):
+                count += 1
+                if count > step:
+                    os._exit(KILLED)
+
+        sys.addaudithook(watch)
+        write()
+        os._exit(0)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status in (0, KILLED), status
+    return status == KILLED
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files below a folder, hidden ones included."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def put(folder: Path, value: bytes, names: tuple[str, ...]) -> None:
+    """Write a folder of small files."""
+    with files.complete_folder(folder / "b") as new:
+        for name in names:
+            (new / name).write_bytes(value)
+
+
+def of_a_folder(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Two versions of a folder."""
+    return lambda: put(folder, b"old" * 999, ("x", "y")), lambda: put(folder, b"new" * 999, ("x", "z"))
+
+
+def of_a_file(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Two versions of a file."""
+    return lambda: files.write_file(folder / "b", b"old" * 999), lambda: files.write_file(folder / "b", b"new" * 999)
+
+
+def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Two versions of a bundle."""
+    import numpy as np
+    import torch
+
+    from bitymi_ns.bake.bundle import write_bundle
+
+    torch.set_num_threads(1)
+
+    def version(value: float) -> Callable[[], None]:
+        shapes = {"means": (3, 3), "quats": (3, 4), "log_scales": (3, 2), "opacity_logits": (3,), "beta_raw": (3,)}
+        shapes |= {"sh_dc": (3, 3), "sh_rest": (3, 15, 3)}
+        surfels = {name: torch.full(shape, value) for name, shape in shapes.items()}
+        more = {"extra_files": {"preview.png": b"png"}, "loose_files": {"config.yml": b"config"}}
+        tiles = np.zeros((3, 5), dtype=np.int32)
+        return lambda: write_bundle(folder / "b", surfels, tiles, None, overwrite=True, **more) and None
+
+    return version(1.0), version(2.0)
+
+
+def main(kind: str, folder: Path) -> None:
+    old, new = {"folder": of_a_folder, "file": of_a_file, "bundle": of_a_bundle}[kind](folder)
+    new()
+    newer = contents(folder)
+    old()
+    older = contents(folder)
+    assert older != newer
+    for first in (False, True):  # over an earlier version; where there is none
+        step = 0
+        while True:
+            for path in folder.iterdir() if first else ():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            killed = killed_at(step, folder, new)
+            found = {name: data for name, data in contents(folder).items() if name.split("/")[0] == "b"}
+            assert found in (newer, older, {}), (step, sorted(found))  # {}: nothing yet, or between two renames
+            with files.reserved(folder / "b"):  # what the next writer begins with
+                if kind == "file":
+                    files.remove_unfinished(folder)
+                settled = {k: v for k, v in contents(folder).items() if k != ".b.lock"}
+                assert settled in ((newer, {}) if first else (newer, older)), (step, sorted(settled))
+            if not killed:
+                break
+            old()
+            assert contents(folder) == older, (step, sorted(contents(folder)))
+            step += 1
+        assert step > (2 if kind == "file" else 5), step
+        print(f"{kind}: {step} kills, {'nothing' if first else 'an earlier one'} in the place")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))

@@ -1,0 +1,170 @@
+"""Writing whole or not at all: kills at every step, locks of living and dead processes, and reasons that are true."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns import files
+
+WAITS = """
+import sys
+from pathlib import Path
+from bitymi_ns import files
+
+path = Path(sys.argv[1])
+with files.{call}:
+    print("has it", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def another_process(call: str, path: Path) -> Iterator[subprocess.Popen]:
+    """A process that is within `with files.<call>`; it is killed in the end."""
+    code = WAITS.format(call=call)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "has it\n"
+        yield process
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "bundle"])
+def test_a_kill_at_any_step_leaves_the_old_or_the_new_and_nothing_else(kind: str, tmp_path: Path) -> None:
+    script = Path(__file__).with_name("kill_everywhere.py")
+    done = subprocess.run([sys.executable, script, kind, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("kills") == 2
+
+
+@pytest.mark.parametrize("call", ["complete_folder(path)", "reserved(path)"])
+def test_a_folder_has_one_writer_and_the_next_one_cleans_up(tmp_path: Path, call: str) -> None:
+    with another_process(call, tmp_path / "b") as process:
+        before = names(tmp_path)
+        with pytest.raises(files.Busy, match=f"process {process.pid} is at work there: wait for it, or end it"):
+            with files.complete_folder(tmp_path / "b"):
+                pass
+        assert names(tmp_path) == before and ".b.lock" in before
+    assert names(tmp_path) == before  # it was killed
+    with files.complete_folder(tmp_path / "b") as new:
+        (new / "x").write_text("y")
+    assert names(tmp_path) == ["b"] and names(tmp_path / "b") == ["x"]
+
+
+def test_an_unfinished_file_is_removed_when_its_process_has_ended(tmp_path: Path) -> None:
+    with another_process("complete_file(path)", tmp_path / "f"):
+        files.remove_unfinished(tmp_path)
+        assert names(tmp_path) == [".f.unfinished"]
+        with pytest.raises(files.Busy, match="another process is writing it"):
+            files.write_file(tmp_path / "f", b"")
+    files.remove_unfinished(tmp_path)
+    assert names(tmp_path) == []
+
+
+def test_a_lock_may_be_taken_again_by_its_thread_alone(tmp_path: Path) -> None:
+    with files.reserved(tmp_path / "b") as place, files.reserved(tmp_path / "b"):
+        assert names(tmp_path) == [".b.lock"]
+        with pytest.raises(files.Busy, match=f"process {os.getpid()}"):
+            files.Lock(place.with_name(".b.lock"))
+    assert names(tmp_path) == []
+
+
+def test_a_file_system_without_locks_costs_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*arguments: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(files.fcntl, "flock", no_locks)
+    told: list[str] = []
+    with files.complete_folder(tmp_path / "b", tell=told.append) as new:
+        (new / "x").write_text("y")
+    (warning,) = told
+    assert "without locks: see that no other process writes there" in warning
+    files.write_file(tmp_path / "f", b"x")
+    (tmp_path / ".g.unfinished").write_text("whose is it?")
+    files.remove_unfinished(tmp_path)
+    assert names(tmp_path) == [".g.unfinished", "b", "f"]
+
+
+def test_parents_that_were_made_for_nothing_go_again(tmp_path: Path) -> None:
+    files.check_writable(tmp_path / "a" / "b" / "c")
+    assert names(tmp_path) == []
+    with files.complete_folder(tmp_path / "a" / "b" / "c"):
+        pass
+    assert names(tmp_path / "a" / "b") == ["c"]
+
+
+def test_devices_are_written_to_as_they_are() -> None:
+    files.check_writable(Path("/dev/null"))
+    files.write_file(Path("/dev/null"), b"x")
+    assert not Path("/dev/null").is_file()
+
+
+def below_a_file(folder: Path) -> Path:
+    (folder / "file").write_text("")
+    return folder / "file" / "x" / "y"
+
+
+def a_loop(folder: Path) -> Path:
+    (folder / "loop").symlink_to(folder / "loop")
+    return folder / "loop" / "x"
+
+
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [
+        (below_a_file, "file is not a folder: give another place"),
+        (a_loop, "leads back to itself|is not a folder"),
+        (lambda folder: folder / ("x" * 300), "the name is too long: give a shorter one"),
+        (lambda folder: Path("/proc/nothing/b"), "nothing can be made in /proc .*: give another place"),
+        (lambda folder: Path("/sys/b"), "does not permit|no permission|read-only"),
+        (lambda folder: Path("/proc"), "mount point"),
+    ],
+)
+def test_what_cannot_be_written_is_explained(tmp_path: Path, place: Callable[[Path], Path], why: str) -> None:
+    target = place(tmp_path)
+    with pytest.raises(ValueError, match=f"cannot be written: .*({why})"), files.explained(target, ValueError):
+        files.check_writable(target)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("file systems cannot be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_read_only_and_a_full_disk(small_disk: Path) -> None:
+    files.write_file(small_disk / "f", b"old")
+    with pytest.raises(ValueError, match="the disk is full: free some space"):
+        with files.explained(small_disk / "f", ValueError):
+            files.write_file(small_disk / "f", bytes(2 << 20))
+    assert names(small_disk) == ["f"] and (small_disk / "f").read_bytes() == b"old"
+    assert 0 < files.free_bytes(small_disk / "a" / "b") < 1 << 20
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with pytest.raises(ValueError, match="the file system is read-only: give a place on another one"):
+        with files.explained(small_disk / "b", ValueError):
+            files.check_writable(small_disk / "b")

@@ -25,7 +25,7 @@ from bitymi_ns.ops import (
     trace,
     view_color,
 )
-from bitymi_ns.train.losses import photometric, psnr
+from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.views import View, as_float, over_background, training_order
 
 FEWEST_VIEWS = 4
@@ -181,9 +181,10 @@ class TexelViews(Sequence[TexelView]):
         return view
 
     def psnr(self, texels: Tensor) -> float:
-        """Mean dB over the views."""
-        values = [psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask) for view in self]
-        return sum(values) / len(values)
+        """Mean dB over the views of which any pixel counts."""
+        return mean_psnr(
+            [psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask) for view in self]
+        )
 
 
 def tune_atlas(

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
+
+UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
+"""Kinds of cameras whose photographs become those of a perspective camera on loading."""
+OFF_AXIS = 80
+"""Degrees between the axis and the middle of the picture that no perspective camera has."""
+LITTLE_LEFT = 0.25
+"""Share of a photograph; where undistorting leaves less, the numbers are doubtful."""
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
@@ -39,6 +51,90 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     K[0, 2], K[1, 2] = cameras.cx[0].item(), cameras.cy[0].item()
     camera = Camera(viewmat.float(), K.float(), int(cameras.width[0]), int(cameras.height[0]))
     return camera if device is None else camera.to(device)
+
+
+def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
+    """Stop, or warn, at cameras through which nothing can be seen, or next to nothing.
+
+    Args:
+        cameras: [N] of a capture, with the lens distortion of the photographs as they are stored.
+        names: of the N photographs, for messages.
+    """
+    distortion = cameras.distortion_params
+    kind = cameras.camera_type
+    kinds = torch.tensor([known.value for known in UNDISTORTED], device=kind.device)
+    distorted = torch.zeros(len(kind), dtype=torch.bool) if distortion is None else (distortion != 0).any(-1)
+    for what, wrong in (
+        ("its pose is not finite", ~cameras.camera_to_worlds.isfinite().flatten(1).all(1)),
+        (
+            "its focal lengths are not positive and finite",
+            ~((cameras.fx > 0) & (cameras.fy > 0) & (cameras.fx + cameras.fy < 1e12)),
+        ),
+        ("its principal point is not finite", ~(cameras.cx + cameras.cy).isfinite()),
+        ("its image size is not positive", (cameras.width < 1) | (cameras.height < 1)),
+        (
+            f"its principal point is so far from the picture that this lies more than {OFF_AXIS} degrees off its axis",
+            torch.hypot(
+                (cameras.cx - 0.5 * cameras.width) / cameras.fx, (cameras.cy - 0.5 * cameras.height) / cameras.fy
+            )
+            > math.tan(math.radians(OFF_AXIS)),
+        ),
+        (
+            "it is neither a perspective nor a fisheye camera, which are the kinds that can be trained on",
+            ~torch.isin(kind, kinds),
+        ),
+        (
+            "it is a fisheye camera without coefficients (k1 to k4), by which its photographs could be undistorted",
+            (kind != CameraType.PERSPECTIVE.value).flatten() & ~distorted,
+        ),
+        (
+            "its lens distortion is not finite",
+            distorted & False if distortion is None else ~distortion.isfinite().all(-1),
+        ),
+    ):
+        if bool(wrong.any()):
+            fail(
+                f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. Correct the capture."
+            )
+    if distortion is not None:
+        _check_distortion(cameras, names)
+
+
+def _check_distortion(cameras: Cameras, names: Sequence[object]) -> None:
+    """Photographs of perspective cameras are cropped to what is left of them when they have been undistorted."""
+    columns = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    rows = torch.cat([*(c.double() for c in columns), cameras.distortion_params.double()], -1)
+    rows[(cameras.camera_type != CameraType.PERSPECTIVE.value).flatten()] = 0.0
+    little = []
+    for row in rows.unique(dim=0):
+        if not bool(row[6:].any()):
+            continue
+        fx, fy, cx, cy, width, height, k1, k2, k3, k4, p1, p2 = row.tolist()
+        whose = [names[int(i)] for i in (rows == row).all(-1).nonzero()]
+        if k4 != 0.0:
+            fail(
+                f"the camera of {listed(whose)} cannot be used: its k4 is {k4:g}, but perspective cameras are "
+                "undistorted by k1, k2, k3, p1 and p2 alone. Undistort the photographs first (COLMAP's image_undistorter)."
+            )
+        K = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+        coefficients = np.array([k1, k2, p1, p2, k3])
+        _, (_, _, w, h) = cv2.getOptimalNewCameraMatrix(K, coefficients, (int(width), int(height)), 0)
+        size = f"{w} x {h} of {int(width)} x {int(height)} pixels"
+        if w < 2 or h < 2:
+            fail(
+                f"the lens distortion of {listed(whose)} is absurd: with {_named(k1, k2, k3, p1, p2)} undistorting "
+                f"would leave {size}. Correct the numbers, or calibrate again with a simpler camera (one coefficient)."
+            )
+        if w * h < LITTLE_LEFT * width * height:
+            little.append(f"{size} of {listed(whose)} ({_named(k1, k2, k3, p1, p2)})")
+    if little:
+        warn(f"Undistorting leaves only {'; '.join(little)}. The lens distortion may be wrong.")
+
+
+def _named(*values: float) -> str:
+    return ", ".join(
+        f"{name} = {value:g}" for name, value in zip(("k1", "k2", "k3", "p1", "p2"), values, strict=True) if value
+    )
 
 
 def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:

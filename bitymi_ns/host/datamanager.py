@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 import tyro
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
 
-from bitymi_ns.host.capture import (
-    check_cameras,
-    check_capture,
-    check_images,
-    declares_box,
-    reporting_input_errors,
-)
-from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
-from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host import duplicates
+from bitymi_ns.host.cameras import check_cameras
+from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
+from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.images import check_orientation, file_has_transparency
+from bitymi_ns.host.point_cloud import reporting_time
+from bitymi_ns.host.poses import check_places
+from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.views import training_order
 
 FEW_VIEWS = 10
@@ -65,8 +66,12 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         local_rank: int = 0,
         **kwargs: Any,
     ) -> None:
-        check_capture(config, images=test_mode != "inference")
-        with reporting_input_errors(config):
+        points = check_capture(config, images=test_mode != "inference")
+        with (
+            reporting_input_errors(config),
+            corrected_files(config.dataparser),
+            reporting_time("Reading", points),
+        ):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
         outputs = self.train_dataparser_outputs
@@ -98,9 +103,15 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         count = len(self.train_dataset)
         if test_mode == "inference":
             return
+        train, held_out = self.train_dataset.image_filenames, self.eval_dataset.image_filenames
         for dataset in (self.train_dataset, self.eval_dataset):
             check_cameras(dataset.cameras, dataset.image_filenames)
-        check_images([*self.train_dataset.image_filenames, *self.eval_dataset.image_filenames])
+        centers = [dataset.cameras.camera_to_worlds[..., 3] for dataset in (self.train_dataset, self.eval_dataset)]
+        check_places(torch.cat(centers).double().numpy(), [*train, *held_out])
+        check_images([*train, *held_out])
+        check_orientation(list(dict.fromkeys([*train, *held_out])))
+        self._duplicates = duplicates.same_files(train, held_out)
+        duplicates.warn_of(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
             fail(
                 f"only one training view in {self.config.data}. A scene cannot be learned from one image: take "
@@ -111,6 +122,33 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
                 f"Only {count} training views: all of them are used for multi-view scoring, and views "
                 "from elsewhere will look poor. Twenty or more photographs are advisable."
             )
+
+    def create_train_dataset(self) -> BitymiDataset:
+        if self.test_mode != "inference":
+            self.train_dataparser_outputs = without_blank_views(self.train_dataparser_outputs, "training")
+        return super().create_train_dataset()
+
+    def create_eval_dataset(self) -> BitymiDataset:
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        if self.test_mode != "inference":
+            outputs = without_blank_views(outputs, "held-out")
+        return BitymiDataset(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
+
+    def check_pictures(self) -> None:
+        """Stop, or warn, when the photographs themselves show nothing, or the same on both sides of the hold-out."""
+        train, held_out = self.train_dataset, self.eval_dataset
+        empty: dict[str, list[Path]] = {}
+        for i, path in enumerate(train.image_filenames):
+            empty.setdefault(train.note(i).empty, []).append(path)
+        shows = empty.pop("", [])
+        for what, paths in empty.items():
+            if not shows:
+                fail(f"there is nothing to learn from: {listed(paths)} {what}, and so do all training photographs.")
+            warn(f"{listed(paths)} {what}: nothing is learned from it.")
+        found = {j for _, j in self._duplicates}
+        prints = [[d.note(i).fingerprint for i in range(len(d))] for d in (train, held_out)]
+        pairs = [pair for pair in duplicates.same_contents(*prints) if pair[1] not in found]
+        duplicates.warn_of(pairs, train.image_filenames, held_out.image_filenames)
 
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
@@ -123,6 +161,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         # undistorted now, and their intrinsics changed with them
         if dataset.cameras.distortion_params is not None:
             dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
+            dataset.cameras.camera_type = torch.full_like(dataset.cameras.camera_type, CameraType.PERSPECTIVE.value)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         return images
 

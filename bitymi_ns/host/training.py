@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -15,11 +16,12 @@ from torch.nn import Parameter
 
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.train.coverage import views_without_surfels
 from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.trainer import LossWatch, training_step
@@ -79,7 +81,29 @@ class TrainingRun:
         self._output: Any = None
         self._loss = torch.zeros(())
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
+        if self.curve_steps:
+            _ = self.datamanager.cached_eval
+        self.datamanager.check_pictures()
+        if self.first_step == 0:
+            self._check_start()
         self.views = ReducedViews(_TrainViews(self.datamanager), model.device)
+
+    def _check_start(self) -> None:
+        """Stop, or warn, when views see nothing of what training starts from: no gradient would come from them."""
+        dataset = self.datamanager.train_dataset
+        cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
+        blind = [dataset.image_filenames[i] for i in views_without_surfels(self.model.scene, cameras)]
+        if len(blind) == len(dataset):
+            fail(
+                f"none of the {len(self.model.scene):,} points that training starts from lies in any training view: "
+                "nothing could be learned. Either the point cloud is in another frame than the poses, or the cameras "
+                "look the other way (nerfstudio's axes are x right, y up, z back)."
+            )
+        if blind:
+            warn(
+                f"{listed(blind)} sees none of the points that training starts from: the pose may be wrong, or the "
+                "point cloud has no points there."
+            )
 
     def callbacks(self) -> list[TrainingCallback]:
         return [
@@ -205,7 +229,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def _held_out(self, all_views: bool) -> tuple[float, float] | None:
-        """Mean PSNR and mean number of fragments over held-out views at full size."""
+        """Mean PSNR and mean number of fragments over held-out views at full size; None where no pixel counts."""
         count = len(self.datamanager.eval_dataset)
         if count == 0:
             return None
@@ -222,8 +246,9 @@ class TrainingRun:
             values.append(
                 (psnr(rgb, target, None if mask is None else mask.to(rgb.device)), float(len(output.fragments)))
             )
-        first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
-        return first, second
+        quality, fragments = zip(*values, strict=True)
+        mean = mean_psnr(quality)
+        return None if math.isnan(mean) else (mean, sum(fragments) / len(fragments))
 
 
 class _TrainViews(Sequence):

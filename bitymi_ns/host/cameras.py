@@ -19,7 +19,9 @@ UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624
 OFF_AXIS = 80
 """Degrees between the axis and the middle of the picture that no perspective camera has."""
 LITTLE_LEFT = 0.25
-"""Share of a photograph; where undistorting leaves less, the numbers are doubtful."""
+"""Share of a photograph's area; where undistorting leaves less, the numbers are doubtful."""
+NOTHING_LEFT = 0.05
+"""Where undistorting leaves less than this, they cannot be meant."""
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
@@ -102,33 +104,59 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
 
 def _check_distortion(cameras: Cameras, names: Sequence[object]) -> None:
     """Photographs of perspective cameras are cropped to what is left of them when they have been undistorted."""
+    perspective = (cameras.camera_type == CameraType.PERSPECTIVE.value).flatten()
+    if bool(perspective.any()) and cameras.distortion_params.shape[-1] != 6:
+        fail(
+            f"the cameras have {cameras.distortion_params.shape[-1]} distortion_params; perspective cameras need six: "
+            "k1, k2, k3, k4, p1, p2. Correct the capture."
+        )
     columns = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
     rows = torch.cat([*(c.double() for c in columns), cameras.distortion_params.double()], -1)
-    rows[(cameras.camera_type != CameraType.PERSPECTIVE.value).flatten()] = 0.0
-    little = []
+    rows[~perspective] = 0.0
+    doubtful = []
     for row in rows.unique(dim=0):
         if not bool(row[6:].any()):
             continue
-        fx, fy, cx, cy, width, height, k1, k2, k3, k4, p1, p2 = row.tolist()
-        whose = [names[int(i)] for i in (rows == row).all(-1).nonzero()]
+        *pinhole, k1, k2, k3, k4, p1, p2 = row.tolist()
+        whose = listed([names[int(i)] for i in (rows == row).all(-1).nonzero()])
         if k4 != 0.0:
             fail(
-                f"the camera of {listed(whose)} cannot be used: its k4 is {k4:g}, but perspective cameras are "
-                "undistorted by k1, k2, k3, p1 and p2 alone. Undistort the photographs first (COLMAP's image_undistorter)."
+                f"the camera of {whose} cannot be used: its k4 is {k4:g}, but perspective cameras are undistorted by "
+                "k1, k2, k3, p1 and p2 alone. Undistort the photographs first (COLMAP's image_undistorter)."
             )
-        K = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
-        coefficients = np.array([k1, k2, p1, p2, k3])
-        _, (_, _, w, h) = cv2.getOptimalNewCameraMatrix(K, coefficients, (int(width), int(height)), 0)
-        size = f"{w} x {h} of {int(width)} x {int(height)} pixels"
-        if w < 2 or h < 2:
+        share = _share_left(pinhole, (k1, k2, k3, p1, p2))
+        if share < NOTHING_LEFT:
             fail(
-                f"the lens distortion of {listed(whose)} is absurd: with {_named(k1, k2, k3, p1, p2)} undistorting "
-                f"would leave {size}. Correct the numbers, or calibrate again with a simpler camera (one coefficient)."
+                f"the lens distortion of {whose} is absurd: with {_named(k1, k2, k3, p1, p2)} undistorting would leave "
+                f"{100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler camera "
+                "(one coefficient)."
             )
-        if w * h < LITTLE_LEFT * width * height:
-            little.append(f"{size} of {listed(whose)} ({_named(k1, k2, k3, p1, p2)})")
-    if little:
-        warn(f"Undistorting leaves only {'; '.join(little)}. The lens distortion may be wrong.")
+        if share < LITTLE_LEFT:
+            doubtful.append(f"{100.0 * share:.2g} % of {whose} ({_named(k1, k2, k3, p1, p2)})")
+    if doubtful:
+        warn(f"Undistorting leaves only {'; '.join(doubtful)}. The lens distortion may be wrong.")
+
+
+def _share_left(pinhole: Sequence[float], coefficients: Sequence[float]) -> float:
+    """Share of a photograph's area that is left when it has been undistorted; 0 where the distortion folds it.
+
+    Args:
+        pinhole: fx, fy, cx, cy, width, height in pixels.
+        coefficients: k1, k2, k3, p1, p2.
+    """
+    fx, fy, cx, cy, width, height = pinhole
+    k1, k2, k3, p1, p2 = coefficients
+    # a point r from the axis is seen at r (1 + k1 r^2 + k2 r^4 + k3 r^6); beyond the first r where that no longer grows
+    # there is nothing to see
+    turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])  # squares of such r
+    first = min((t.real for t in turns if abs(t.imag) < 1e-9 and t.real > 0.0), default=math.inf)
+    nearest_edge = min(abs(edge) for edge in (cx / fx, (width - cx) / fx, cy / fy, (height - cy) / fy))
+    if first < math.inf and math.sqrt(first) * (1.0 + first * (k1 + first * (k2 + first * k3))) < nearest_edge:
+        return 0.0
+    K = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+    order = np.array([k1, k2, p1, p2, k3])
+    new, (_, _, w, h) = cv2.getOptimalNewCameraMatrix(K, order, (int(width), int(height)), 0)
+    return w / width * min(1.0, fx / new[0, 0]) * h / height * min(1.0, fy / new[1, 1])
 
 
 def _named(*values: float) -> str:

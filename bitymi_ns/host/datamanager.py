@@ -21,7 +21,7 @@ from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import check_orientation, file_has_transparency
 from bitymi_ns.host.point_cloud import reporting_time
-from bitymi_ns.host.poses import check_places
+from bitymi_ns.host.poses import check_places, warn_of_mirrored
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.views import training_order
 
@@ -106,8 +106,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         train, held_out = self.train_dataset.image_filenames, self.eval_dataset.image_filenames
         for dataset in (self.train_dataset, self.eval_dataset):
             check_cameras(dataset.cameras, dataset.image_filenames)
-        centers = [dataset.cameras.camera_to_worlds[..., 3] for dataset in (self.train_dataset, self.eval_dataset)]
-        check_places(torch.cat(centers).double().numpy(), [*train, *held_out])
+        poses = (
+            torch.cat([d.cameras.camera_to_worlds for d in (self.train_dataset, self.eval_dataset)]).double().numpy()
+        )
+        warn_of_mirrored(poses[:, :, :3], [*train, *held_out])
+        check_places(poses[:, :, 3], [*train, *held_out])
         check_images([*train, *held_out])
         check_orientation(list(dict.fromkeys([*train, *held_out])))
         self._duplicates = duplicates.same_files(train, held_out)
@@ -139,12 +142,13 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         train, held_out = self.train_dataset, self.eval_dataset
         empty: dict[str, list[Path]] = {}
         for i, path in enumerate(train.image_filenames):
-            empty.setdefault(train.note(i).empty, []).append(path)
-        shows = empty.pop("", [])
-        for what, paths in empty.items():
-            if not shows:
-                fail(f"there is nothing to learn from: {listed(paths)} {what}, and so do all training photographs.")
-            warn(f"{listed(paths)} {what}: nothing is learned from it.")
+            if train.note(i).empty:
+                empty.setdefault(train.note(i).empty, []).append(path)
+        if sum(map(len, empty.values())) == len(train):
+            what = "; ".join(f"{reason}: {listed(paths)}" for reason, paths in empty.items())
+            fail(f"there is nothing to learn from the {len(train)} training photographs: {what}.")
+        for reason, paths in empty.items():
+            warn(f"Of {len(train)} training photographs {len(paths)} show nothing, {reason}: {listed(paths)}.")
         found = {j for _, j in self._duplicates}
         prints = [[d.note(i).fingerprint for i in range(len(d))] for d in (train, held_out)]
         pairs = [pair for pair in duplicates.same_contents(*prints) if pair[1] not in found]

@@ -24,6 +24,11 @@ class BitymiDataset(InputDataset):
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
+        if c2w.ndim != 3:  # seen with instant-ngp's files: nerfstudio's Cameras lose the dimension of a single view
+            fail(
+                "nerfstudio's reader of this format fails on a split with a single photograph. Hold out more of them, "
+                "for example with `--eval-mode interval --eval-interval 4` after the name of the reader."
+            )
         parts = rotations(c2w[:, :3, :3].double().numpy(), dataparser_outputs.image_filenames, "the capture")
         c2w[:, :3, :3] = torch.from_numpy(parts)
         super().__init__(dataparser_outputs, scale_factor)

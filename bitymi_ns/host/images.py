@@ -143,7 +143,7 @@ class Note(NamedTuple):
     """What is remembered of a photograph once it has been read.
 
     Attributes:
-        empty: why there is nothing to learn from it, in words that follow its name; "" where there is.
+        empty: why there is nothing to learn from it; "" where there is.
         fingerprint: equal for photographs with the same pixels.
     """
 
@@ -158,9 +158,9 @@ def note(image: npt.NDArray[np.uint8]) -> Note:
     fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()
     empty = ""
     if _transparent(sample) and _transparent(image):
-        empty = "is transparent everywhere"
+        empty = "transparent everywhere"
     elif _plain(sample) and _plain(image):
-        empty = "shows one colour and nothing else"
+        empty = "of one colour throughout"
     return Note(empty, fingerprint)
 
 

@@ -64,23 +64,32 @@ def rotations(
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
         warn(
-            f"{where}: the rotation of {listed([names[i] for i in scaled.nonzero()[0]])} is scaled by {factor}. The "
-            "factor is divided out; positions stay as they are."
+            f"{where}: rotations are scaled by {factor} in the poses of "
+            f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
         )
     only_rounded = rounded & ~scaled
     if announce and only_rounded.any():
         warn(
-            f"{where}: the rotation of {listed([names[i] for i in only_rounded.nonzero()[0]])} is off by up to "
-            f"{error[only_rounded].max():.1g}; the nearest rotation is used."
-        )
-    mirrored = np.linalg.det(result) < 0.0
-    if announce and 0 < mirrored.sum() < len(mirrored):
-        few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
-        warn(
-            f"{where}: {listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames (the sign "
-            "of the pose's determinant differs). If the photograph is not mirrored, too, the pose is wrong."
+            f"{where}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
+            f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
         )
     return result
+
+
+def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
+    """Name frames that are mirrored where others are not. A capture may be mirrored as a whole.
+
+    Args:
+        rotations: [N, 3, 3], mirrored or not.
+        names: of the N frames.
+    """
+    mirrored = np.linalg.det(rotations) < 0.0
+    few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
+    if few.any():
+        warn(
+            f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames (the sign of the "
+            "pose's determinant differs). If the photograph is not mirrored, too, the pose is wrong."
+        )
 
 
 def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:

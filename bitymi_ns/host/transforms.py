@@ -61,6 +61,8 @@ def load(path: Path, own_format: bool, announce: bool = True) -> Any:
     """
     try:
         meta = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
     except (ValueError, OSError) as error:
         fail(f"{path} cannot be read: {error}. {HOW_TO_GET_ONE}", error)
     if own_format:

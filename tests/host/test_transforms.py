@@ -78,10 +78,8 @@ def set_value(key: str, value: Any) -> Any:
         (set_value("k1", [0.1]), r"k1 for all frames is \[0.1\], which is no number"),
         (set_value("cx", 5e5), "frame_00002.png cannot be used: its principal point is so far .* 80 degrees off"),
         (set_value("k4", 0.1), "frame_00002.png.* cannot be used: its k4 is 0.1.*image_undistorter"),
-        (
-            set_value("k1", -5.0),
-            "lens distortion of .*frame_00002.png.* is absurd: with k1 = -5 undistorting would leave",
-        ),
+        (set_value("k1", -5.0), "lens distortion of .*frame_00002.png.* is absurd: with k1 = -5 .* leave 0 %"),
+        (lambda meta: meta.update(k1=-5, k2=20), "absurd: with k1 = -5, k2 = 20 .* would leave 2.. %.*one coefficient"),
         (set_value("distortion_params", [0.1, 0.0]), "cameras have 2 distortion_params; perspective cameras need six"),
         (set_value("camera_model", "EQUIRECTANGULAR"), "neither a perspective nor a fisheye camera"),
         (set_value("camera_model", "OPENCV_FISHEYE"), "a fisheye camera without coefficients"),
@@ -136,7 +134,7 @@ def test_a_missing_photograph_of_nearly_that_name(capture: Path) -> None:
     paths[4].unlink()
     paths[4].symlink_to("nowhere.png")
     with expect(
-        r"2 of 12 .*frame_00004.png \(but there is frame_00004.PNG\)\s+.*frame_00005.png \(a link to nothing\)"
+        r"(?s)2 of 12 .*frame_00004.png \(but there is frame_00004.PNG\)\s+.*frame_00005.png \(a link to nothing\)"
     ):
         load(capture)
 
@@ -179,19 +177,16 @@ def test_fisheye_photographs_are_perspective_ones_once_undistorted(capture: Path
 
 
 def test_lens_distortion_that_leaves_little_is_doubted(capsys: pytest.CaptureFixture[str]) -> None:
-    several = cameras(
-        camera_to_worlds=torch.eye(4)[:3].repeat(2, 1, 1),
-        distortion_params=torch.tensor([0.0, 0, 0, 0, 0, 0]).repeat(2, 1),
-    )
-    check_cameras(several, ["a.png", "b.png"])
+    c2w, none = torch.eye(4)[:3].repeat(2, 1, 1), torch.zeros(2, 6)
+    real = torch.tensor([-0.25, 0.08, 0.0, 0.0, 1e-3, -1e-3]).repeat(2, 1)  # of a wide lens
+    for distortion in (none, real):
+        check_cameras(cameras(camera_to_worlds=c2w, distortion_params=distortion), ["a.png", "b.png"])
     assert said(capsys) == ""
-    several.distortion_params[1, 0] = LITTLE
-    check_cameras(several, ["a.png", "b.png"])
+    strong = none.clone()
+    strong[1, 0] = 20.0
+    check_cameras(cameras(camera_to_worlds=c2w, distortion_params=strong), ["a.png", "b.png"])
     message = said(capsys)
-    assert "Undistorting leaves only" in message and "b.png" in message and "a.png" not in message
-
-
-LITTLE = -1.5
+    assert "Undistorting leaves only" in message and "% of b.png (k1 = 20)" in message
 
 
 def test_large_clouds_are_announced_and_timed(

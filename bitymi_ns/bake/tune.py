@@ -26,7 +26,7 @@ from bitymi_ns.ops import (
     texel_image,
     view_color,
 )
-from bitymi_ns.train.losses import photometric, psnr
+from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import View, as_float, over_background, training_order
 
@@ -191,12 +191,12 @@ class TexelViews(Sequence[TexelView]):
         return view
 
     def psnr(self, texels: Tensor, progress: Progress = no_progress) -> float:
-        """Mean dB over the views."""
+        """Mean dB over the views of which any pixel counts."""
         values = []
         for view in self:
             values.append(psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask))
             progress("looking at the set-aside views", len(values), len(self))
-        return sum(values) / len(values)
+        return mean_psnr(values)
 
 
 def tune_atlas(

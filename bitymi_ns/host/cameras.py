@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
+
+UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
+"""Kinds of cameras whose photographs become those of a perspective camera on loading."""
+OFF_AXIS = 80
+"""Degrees between the axis and the middle of the picture that no perspective camera has."""
+LITTLE_LEFT = 0.25
+"""Share of a photograph's area; where undistorting leaves less, the numbers are doubtful."""
+NOTHING_LEFT = 0.05
+"""Where undistorting leaves less than this, they cannot be meant."""
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
@@ -39,6 +53,116 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     K[0, 2], K[1, 2] = cameras.cx[0].item(), cameras.cy[0].item()
     camera = Camera(viewmat.float(), K.float(), int(cameras.width[0]), int(cameras.height[0]))
     return camera if device is None else camera.to(device)
+
+
+def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
+    """Stop, or warn, at cameras through which nothing can be seen, or next to nothing.
+
+    Args:
+        cameras: [N] of a capture, with the lens distortion of the photographs as they are stored.
+        names: of the N photographs, for messages.
+    """
+    distortion = cameras.distortion_params
+    kind = cameras.camera_type
+    kinds = torch.tensor([known.value for known in UNDISTORTED], device=kind.device)
+    distorted = torch.zeros(len(kind), dtype=torch.bool) if distortion is None else (distortion != 0).any(-1)
+    for what, wrong in (
+        ("its pose is not finite", ~cameras.camera_to_worlds.isfinite().flatten(1).all(1)),
+        (
+            "its focal lengths are not positive and finite",
+            ~((cameras.fx > 0) & (cameras.fy > 0) & (cameras.fx + cameras.fy < 1e12)),
+        ),
+        ("its principal point is not finite", ~(cameras.cx + cameras.cy).isfinite()),
+        ("its image size is not positive", (cameras.width < 1) | (cameras.height < 1)),
+        (
+            f"its principal point is so far from the picture that this lies more than {OFF_AXIS} degrees off its axis",
+            torch.hypot(
+                (cameras.cx - 0.5 * cameras.width) / cameras.fx, (cameras.cy - 0.5 * cameras.height) / cameras.fy
+            )
+            > math.tan(math.radians(OFF_AXIS)),
+        ),
+        (
+            "it is neither a perspective nor a fisheye camera, which are the kinds that can be trained on",
+            ~torch.isin(kind, kinds),
+        ),
+        (
+            "it is a fisheye camera without coefficients (k1 to k4), by which its photographs could be undistorted",
+            (kind != CameraType.PERSPECTIVE.value).flatten() & ~distorted,
+        ),
+        (
+            "its lens distortion is not finite",
+            distorted & False if distortion is None else ~distortion.isfinite().all(-1),
+        ),
+    ):
+        if bool(wrong.any()):
+            fail(
+                f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. Correct the capture."
+            )
+    if distortion is not None:
+        _check_distortion(cameras, names)
+
+
+def _check_distortion(cameras: Cameras, names: Sequence[object]) -> None:
+    """Photographs of perspective cameras are cropped to what is left of them when they have been undistorted."""
+    perspective = (cameras.camera_type == CameraType.PERSPECTIVE.value).flatten()
+    if bool(perspective.any()) and cameras.distortion_params.shape[-1] != 6:
+        fail(
+            f"the cameras have {cameras.distortion_params.shape[-1]} distortion_params; perspective cameras need six: "
+            "k1, k2, k3, k4, p1, p2. Correct the capture."
+        )
+    columns = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    rows = torch.cat([*(c.double() for c in columns), cameras.distortion_params.double()], -1)
+    rows[~perspective] = 0.0
+    doubtful = []
+    for row in rows.unique(dim=0):
+        if not bool(row[6:].any()):
+            continue
+        *pinhole, k1, k2, k3, k4, p1, p2 = row.tolist()
+        whose = listed([names[int(i)] for i in (rows == row).all(-1).nonzero()])
+        if k4 != 0.0:
+            fail(
+                f"the camera of {whose} cannot be used: its k4 is {k4:g}, but perspective cameras are undistorted by "
+                "k1, k2, k3, p1 and p2 alone. Undistort the photographs first (COLMAP's image_undistorter)."
+            )
+        share = _share_left(pinhole, (k1, k2, k3, p1, p2))
+        if share < NOTHING_LEFT:
+            fail(
+                f"the lens distortion of {whose} is absurd: with {_named(k1, k2, k3, p1, p2)} undistorting would leave "
+                f"{100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler camera "
+                "(one coefficient)."
+            )
+        if share < LITTLE_LEFT:
+            doubtful.append(f"{100.0 * share:.2g} % of {whose} ({_named(k1, k2, k3, p1, p2)})")
+    if doubtful:
+        warn(f"Undistorting leaves only {'; '.join(doubtful)}. The lens distortion may be wrong.")
+
+
+def _share_left(pinhole: Sequence[float], coefficients: Sequence[float]) -> float:
+    """Share of a photograph's area that is left when it has been undistorted; 0 where the distortion folds it.
+
+    Args:
+        pinhole: fx, fy, cx, cy, width, height in pixels.
+        coefficients: k1, k2, k3, p1, p2.
+    """
+    fx, fy, cx, cy, width, height = pinhole
+    k1, k2, k3, p1, p2 = coefficients
+    # a point r from the axis is seen at r (1 + k1 r^2 + k2 r^4 + k3 r^6); beyond the first r where that no longer grows
+    # there is nothing to see
+    turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])  # squares of such r
+    first = min((t.real for t in turns if abs(t.imag) < 1e-9 and t.real > 0.0), default=math.inf)
+    nearest_edge = min(abs(edge) for edge in (cx / fx, (width - cx) / fx, cy / fy, (height - cy) / fy))
+    if first < math.inf and math.sqrt(first) * (1.0 + first * (k1 + first * (k2 + first * k3))) < nearest_edge:
+        return 0.0
+    K = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+    order = np.array([k1, k2, p1, p2, k3])
+    new, (_, _, w, h) = cv2.getOptimalNewCameraMatrix(K, order, (int(width), int(height)), 0)
+    return w / width * min(1.0, fx / new[0, 0]) * h / height * min(1.0, fy / new[1, 1])
+
+
+def _named(*values: float) -> str:
+    return ", ".join(
+        f"{name} = {value:g}" for name, value in zip(("k1", "k2", "k3", "p1", "p2"), values, strict=True) if value
+    )
 
 
 def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:

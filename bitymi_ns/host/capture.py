@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,128 +11,164 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
+from PIL import UnidentifiedImageError
 
-from bitymi_ns.host.errors import fail, warn
-from bitymi_ns.host.point_cloud import what_is_wrong_with
+from bitymi_ns.host import transforms
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
+from bitymi_ns.host.transforms import HOW_TO_GET_ONE
 
-HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
+PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic"}
 
 
-def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> None:
+def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> int:
     """Stop with a clear message when there is no usable capture where the configuration points.
 
     Args:
         config: the data manager's.
         images: the photographs are needed, too.
+
+    Returns:
+        How many points its cloud has, as far as that can be told before it is read; else 0.
     """
     dataparser = config.dataparser
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
         fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
     if isinstance(dataparser, NerfstudioDataParserConfig):
-        _check_transforms(data, dataparser, images)
-    elif isinstance(dataparser, BlenderDataParserConfig) and dataparser.ply_path is not None:
-        _check_cloud(data / dataparser.ply_path, "leave --ply-path out")
+        return _check_transforms(data, dataparser, images)
+    if isinstance(dataparser, ColmapDataParserConfig):
+        return _check_colmap(data, dataparser)
+    if isinstance(dataparser, BlenderDataParserConfig) and dataparser.ply_path is not None:
+        return _check_cloud(data / dataparser.ply_path, "leave --ply-path out")
+    return 0
 
 
-def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> None:
+def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> int:
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         if not data.is_dir():
             fail(f"{data} is neither a folder nor a transforms.json")
         if not any(data.iterdir()):
             fail(f"the capture folder {data} is empty. {HOW_TO_GET_ONE}")
-        fail(
-            f"{data} holds no transforms.json. {HOW_TO_GET_ONE} A capture in another format needs its parser's name "
-            "after the options, for example `... colmap --data <capture>` or `... blender-data --data <capture>`."
-        )
-    try:
-        meta = json.loads(path.read_text("utf8"))
-    except (ValueError, OSError) as error:
-        fail(f"{path} cannot be read: {error}. {HOW_TO_GET_ONE}", error)
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames:
-        fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE}")
-    if len(frames) == 1:
-        fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
-    for i, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
-            fail(f"{path}: frame {i} has no file_path or no transform_matrix")
+        fail(f"{data} holds no transforms.json. {_what_it_is(data)}")
+    meta = transforms.load(path, own_format=True, announce=False)
+    frames = meta["frames"]
     folder = path.parent
     if images and dataparser.downscale_factor is None:  # else copies of another size are read
-        check_images([folder / str(frame["file_path"]) for frame in frames])
-    _check_poses(path, frames, dataparser)
+        check_images([folder / frame["file_path"] for frame in frames])
+    places = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    if dataparser.auto_scale_poses and not np.ptp(places, axis=0).any():
+        fail(f"{path}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+    if not dataparser.load_3D_points:
+        return 0
     points = meta.get("ply_file_path")
-    if points is not None and dataparser.load_3D_points:
-        _check_cloud(folder / points, f"remove ply_file_path from {path}")
-    if points is None and dataparser.load_3D_points and (folder / "colmap/sparse/0").is_dir() and not _interactive():
+    if points is not None:
+        if not isinstance(points, str) or not points:
+            fail(f"{path}: ply_file_path is {points!r}, not the name of a file. Correct it or remove it.")
+        return _check_cloud(folder / points, f"remove ply_file_path from {path}")
+    if (folder / "colmap/sparse/0").is_dir() and not _interactive():
         # nerfstudio would ask whether to convert the COLMAP points and wait for an answer for ever
         warn(
             f"{path} has no ply_file_path: its COLMAP points are not used and training starts from "
             "random points. Run once in a terminal to convert them."
         )
         dataparser.load_3D_points = False
+    return 0
+
+
+def _what_it_is(data: Path) -> str:
+    """What to do with a folder that has no transforms.json, by what lies in it."""
+    models = _colmap_models(data)
+    if models:
+        return f"It has a COLMAP model: give `{_colmap_options(data, models[0])}` after the options of the method."
+    if (data / "transforms_train.json").is_file():
+        return f"It has a transforms_train.json: give `blender-data --data {data}` after the options of the method."
+    photos = {p.parent for pattern in ("*", "*/*") for p in data.glob(pattern) if p.suffix.lower() in PHOTOGRAPHS}
+    if photos:
+        return (
+            "It has photographs without poses. Find the poses with "
+            f"`ns-process-data images --data {min(photos)} --output-dir <capture>` and train on that."
+        )
+    return (
+        f"{HOW_TO_GET_ONE} A capture in another format needs its parser's name after the options, for example "
+        "`... colmap --data <capture>` or `... blender-data --data <capture>`."
+    )
+
+
+def _check_colmap(data: Path, dataparser: ColmapDataParserConfig) -> int:
+    model = data / dataparser.colmap_path
+    if not _is_colmap_model(model):
+        models = _colmap_models(data)
+        what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
+        if not models:
+            fail(
+                f"the COLMAP model {model} {what}, and there is none in other folders of {data}. Give its folder, "
+                "seen from the capture, with `--colmap-path` after `colmap`."
+            )
+        others = "" if len(models) == 1 else f" ({listed(models[1:])} would do, too)"
+        fail(f"the COLMAP model {model} {what}. Give `{_colmap_options(data, models[0])}`{others}.")
+    if not (data / dataparser.images_path).is_dir():
+        fail(
+            f"the folder of photographs {data / dataparser.images_path} does not exist. Give it, seen from the "
+            "capture, with `--images-path` after `colmap`."
+        )
+    counts = (point_count(model / name) for name in ("points3D.bin", "points3D.txt"))
+    return next((count for count in counts if count), 0) if dataparser.load_3D_points else 0
+
+
+def _is_colmap_model(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
+
+
+def _colmap_models(data: Path) -> list[Path]:
+    """Folders of COLMAP models at most three levels below the capture, seen from it."""
+    found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
+    return sorted(path.relative_to(data) for path in found if _is_colmap_model(path))
+
+
+def _colmap_options(data: Path, model: Path) -> str:
+    return f"colmap --data {data} --colmap-path {model}"
 
 
 def check_images(paths: Sequence[Path]) -> None:
     """Stop when images that the capture has poses for are not there."""
     names = list(dict.fromkeys(paths))
     missing = [path for path in names if not path.is_file()]
-    if missing:
-        some = "\n  ".join(str(path) for path in missing[:3])
-        fail(
-            f"{len(missing)} of {len(names)} images of the capture are missing:\n  {some}\n"
-            "Poses without images cannot be used: copy the images there or remove the frames."
-        )
+    if not missing:
+        return
+    some = "\n  ".join(f"{path}{_instead(path)}" for path in missing[:3])
+    fail(
+        f"{len(missing)} of {len(names)} images of the capture are missing:\n  {some}\n"
+        "Poses without images cannot be used: copy the images there, correct the names or remove the frames."
+    )
 
 
-def _check_poses(path: Path, frames: list[dict[str, Any]], dataparser: NerfstudioDataParserConfig) -> None:
-    """Stop at poses that nerfstudio would spread over all others, or stumble over."""
-    places = []
-    for frame in frames:
-        try:
-            pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
-        except (ValueError, TypeError):
-            pose = np.zeros(0)
-        if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
-            fail(
-                f"{path}: the transform_matrix of {frame['file_path']} is not a matrix of 4 x 4 finite numbers. "
-                "Correct it or remove the frame."
-            )
-        places.append(pose[:3, 3])
-    if dataparser.auto_scale_poses and not np.ptp(places, axis=0).any():
-        fail(f"{path}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+def _instead(path: Path) -> str:
+    """What lies in a missing file's place."""
+    if path.is_symlink():
+        return " (a link to nothing)"
+    if path.exists():
+        return " (not a file)"
+    same = {path.name.lower(), path.stem.lower()}
+    others = [p for p in path.parent.glob("*") if p.name.lower() == path.name.lower() or p.stem.lower() in same]
+    return f" (but there is {min(others).name})" if others else ""
 
 
-def _check_cloud(cloud: Path, way_out: str) -> None:
+def _check_cloud(cloud: Path, way_out: str) -> int:
+    """The number of its points."""
     wrong = what_is_wrong_with(cloud) if cloud.is_file() else "does not exist"
     if wrong is not None:
         fail(f"the point cloud {cloud} {wrong}. Put it there again, or {way_out} to start from random points.")
-
-
-def check_cameras(cameras: Cameras, names: Sequence[Path]) -> None:
-    """Stop at cameras through which nothing can be seen."""
-    for what, wrong in (
-        ("its pose is not finite", ~cameras.camera_to_worlds.isfinite().flatten(1).all(1)),
-        (
-            "its focal lengths are not positive and finite",
-            ~((cameras.fx > 0) & (cameras.fy > 0) & (cameras.fx + cameras.fy < 1e12)),
-        ),
-        ("its principal point is not finite", ~(cameras.cx + cameras.cy).isfinite()),
-        ("its image size is not positive", (cameras.width < 1) | (cameras.height < 1)),
-    ):
-        if bool(wrong.any()):
-            fail(
-                f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. Correct the capture."
-            )
+    return point_count(cloud)
 
 
 def _interactive() -> bool:
@@ -145,7 +182,7 @@ def declares_box(dataparser: DataParserConfig) -> bool:
         return True
     if isinstance(dataparser, InstantNGPDataParserConfig):
         path = dataparser.data if dataparser.data.suffix == ".json" else dataparser.data / "transforms.json"
-        return "aabb_scale" in json.loads(path.read_text("utf8"))
+        return "aabb_scale" in json.loads(path.read_bytes())
     return False
 
 
@@ -160,9 +197,21 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             "install the system's package of it; if a module, install it with pip.",
             error,
         )
-    except (AssertionError, OSError, LookupError, ValueError, TypeError, ArithmeticError, RuntimeError) as error:
+    except (
+        AssertionError,
+        OSError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        RuntimeError,
+        struct.error,
+    ) as error:
         data = config.data if config.data is not None else config.dataparser.data
-        detail = " ".join(str(error).split()) or type(error).__name__
+        detail = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         if isinstance(error, KeyError):
             detail = f"the entry {detail} is missing"
+        if isinstance(error, UnidentifiedImageError):
+            detail += ". Save the photographs as PNG or JPEG"
         fail(f"the capture {data} cannot be loaded: {detail}", error)

@@ -4,26 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 import tyro
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
 
-from bitymi_ns.host.capture import (
-    check_cameras,
-    check_capture,
-    check_images,
-    declares_box,
-    reporting_input_errors,
-)
-from bitymi_ns.host.dataset import BitymiDataset, file_has_transparency
-from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host import duplicates
+from bitymi_ns.host.cameras import check_cameras
+from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
+from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.images import check_orientation, file_has_transparency
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES, Photographs
+from bitymi_ns.host.point_cloud import reporting_time
+from bitymi_ns.host.poses import check_places, warn_of_mirrored
+from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import training_order
 
@@ -69,8 +70,12 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         **kwargs: Any,
     ) -> None:
         self._room = Room(PHOTOGRAPH_BYTES)
-        check_capture(config, images=test_mode != "inference")
-        with reporting_input_errors(config):
+        points = check_capture(config, images=test_mode != "inference")
+        with (
+            reporting_input_errors(config),
+            corrected_files(config.dataparser),
+            reporting_time("Reading", points),
+        ):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
         outputs = self.train_dataparser_outputs
@@ -102,9 +107,18 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         count = len(self.train_dataset)
         if test_mode == "inference":
             return
+        train, held_out = self.train_dataset.image_filenames, self.eval_dataset.image_filenames
         for dataset in (self.train_dataset, self.eval_dataset):
             check_cameras(dataset.cameras, dataset.image_filenames)
-        check_images([*self.train_dataset.image_filenames, *self.eval_dataset.image_filenames])
+        poses = (
+            torch.cat([d.cameras.camera_to_worlds for d in (self.train_dataset, self.eval_dataset)]).double().numpy()
+        )
+        warn_of_mirrored(poses[:, :, :3], [*train, *held_out])
+        check_places(poses[:, :, 3], [*train, *held_out])
+        check_images([*train, *held_out])
+        check_orientation(list(dict.fromkeys([*train, *held_out])))
+        self._duplicates = duplicates.same_files(train, held_out)
+        duplicates.warn_of(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
             fail(
                 f"only one training view in {self.config.data}. A scene cannot be learned from one image: take "
@@ -115,6 +129,34 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
                 f"Only {count} training views: all of them are used for multi-view scoring, and views "
                 "from elsewhere will look poor. Twenty or more photographs are advisable."
             )
+
+    def create_train_dataset(self) -> BitymiDataset:
+        if self.test_mode != "inference":
+            self.train_dataparser_outputs = without_blank_views(self.train_dataparser_outputs, "training")
+        return super().create_train_dataset()
+
+    def create_eval_dataset(self) -> BitymiDataset:
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        if self.test_mode != "inference":
+            outputs = without_blank_views(outputs, "held-out")
+        return BitymiDataset(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
+
+    def check_pictures(self) -> None:
+        """Stop, or warn, when the photographs themselves show nothing, or the same on both sides of the hold-out."""
+        train, held_out = self.train_dataset, self.eval_dataset
+        empty: dict[str, list[Path]] = {}
+        for i, path in enumerate(train.image_filenames):
+            if train.note(i).empty:
+                empty.setdefault(train.note(i).empty, []).append(path)
+        if sum(map(len, empty.values())) == len(train):
+            what = "; ".join(f"{reason}: {listed(paths)}" for reason, paths in empty.items())
+            fail(f"there is nothing to learn from the {len(train)} training photographs: {what}.")
+        for reason, paths in empty.items():
+            warn(f"Of {len(train)} training photographs {len(paths)} show nothing, {reason}: {listed(paths)}.")
+        found = {j for _, j in self._duplicates}
+        prints = [[d.note(i).fingerprint for i in range(len(d))] for d in (train, held_out)]
+        pairs = [pair for pair in duplicates.same_contents(*prints) if pair[1] not in found]
+        duplicates.warn_of(pairs, train.image_filenames, held_out.image_filenames)
 
     def _load_images(  # type: ignore[override]
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
@@ -127,9 +169,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         else:
             with reporting_input_errors(self.config):
                 images = super()._load_images(split, cache_images_device)
-            # undistorted now, and their intrinsics changed with them
-            if dataset.cameras.distortion_params is not None:
-                dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
+        # undistorted now, and their intrinsics changed with them
+        if dataset.cameras.distortion_params is not None:
+            dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
+            dataset.cameras.camera_type = torch.full_like(dataset.cameras.camera_type, CameraType.PERSPECTIVE.value)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         return images
 

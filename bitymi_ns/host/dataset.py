@@ -2,44 +2,54 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import dataclasses
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.images import Note, masks_without_pixels, note, read_image, read_mask, wrong_size
+from bitymi_ns.host.poses import rotations
 from bitymi_ns.train.views import over_background
 
 
 class BitymiDataset(InputDataset):
     """nerfstudio's dataset, except that images with alpha stay [H, W, 4]: the model composes them over a background."""
 
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        c2w = dataparser_outputs.cameras.camera_to_worlds
+        if c2w.ndim != 3:  # seen with instant-ngp's files: nerfstudio's Cameras lose the dimension of a single view
+            fail(
+                "nerfstudio's reader of this format fails on a split with a single photograph. Hold out more of them, "
+                "for example with `--eval-mode interval --eval-interval 4` after the name of the reader."
+            )
+        parts = rotations(c2w[:, :3, :3].double().numpy(), dataparser_outputs.image_filenames, "the capture")
+        c2w[:, :3, :3] = torch.from_numpy(parts)
+        super().__init__(dataparser_outputs, scale_factor)
+        self._notes: dict[int, Note] = {}
+
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         path = self._dataparser_outputs.image_filenames[image_idx]
-        try:
-            with Image.open(path) as file:
-                image = file.convert("RGBA" if has_transparency(file) else "RGB")
-        except FileNotFoundError as error:
-            fail(f"the image {path} is missing, but the capture has a pose for it", error)
-        except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-            fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
-        if self.scale_factor != 1.0:
-            size = (int(image.width * self.scale_factor), int(image.height * self.scale_factor))
-            image = image.resize(size, resample=Image.Resampling.BILINEAR)
+        image = self._scaled(read_image(path), Image.Resampling.BILINEAR)
         camera = self.cameras[image_idx].reshape(())
         declared = (int(camera.width), int(camera.height))
         if image.size != declared:
-            fail(
-                f"the image {path} has {image.width} x {image.height} pixels, but its camera is for "
-                f"{declared[0]} x {declared[1]}. Correct w and h (and fl_x, fl_y, cx, cy) in the capture, or resize "
-                "the image."
-            )
-        return np.array(image, dtype=np.uint8)
+            fail(wrong_size(path, image.size, declared))
+        pixels = np.array(image, dtype=np.uint8)
+        self._notes[image_idx] = note(pixels)
+        return pixels
+
+    def note(self, image_idx: int) -> Note:
+        """What there is to know of a photograph; it is read for that if it has not been yet."""
+        if image_idx not in self._notes:
+            self.get_numpy_image(image_idx)
+        return self._notes[image_idx]
 
     def get_image_float32(self, image_idx: int) -> Tensor:
         """[H, W, 3 or 4] in [0, 1]; alpha is not composed."""
@@ -57,27 +67,70 @@ class BitymiDataset(InputDataset):
         return data
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """The photograph, and its mask [H, W, 1] bool where the capture has masks."""
+        read = self.get_image_float32 if image_type == "float32" else self.get_image_uint8
+        data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
-        try:
-            data = super().get_data(image_idx, image_type)
-        except FileNotFoundError as error:
-            fail(f"the mask {masks[image_idx] if masks else error} is missing", error)
-        except AssertionError as error:
-            fail(f"the mask {masks[image_idx] if masks else ''} does not fit its image: {error}", error)
-        if "mask" in data:
-            data["mask"] = data["mask"].bool()
+        if masks is not None:
+            mask = self._scaled(read_mask(masks[image_idx]), Image.Resampling.NEAREST)
+            height, width = data["image"].shape[:2]
+            if mask.size != (width, height):
+                fail(
+                    f"the mask {masks[image_idx]} has {mask.width} x {mask.height} pixels, but its image {width} x "
+                    f"{height}. Make it of the same size."
+                )
+            data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
+            if self.mask_color:
+                data["image"] = _painted(data["image"], data["mask"], self.mask_color)
+        data.update(self.get_metadata(data))
         return data
 
+    def _scaled(self, image: Image.Image, resample: Image.Resampling) -> Image.Image:
+        if self.scale_factor == 1.0:
+            return image
+        size = (int(image.width * self.scale_factor), int(image.height * self.scale_factor))
+        return image.resize(size, resample=resample)
 
-def has_transparency(image: Image.Image) -> bool:
-    """Whether an image has an alpha channel or a transparent colour."""
-    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+
+def _painted(image: Tensor, mask: Tensor, color: tuple[float, float, float]) -> Tensor:
+    """The image with `color`, in [0, 1], where the mask is False; alpha is left alone."""
+    paint = torch.tensor(color) if image.is_floating_point() else torch.tensor(color).mul(255.0).round().to(image.dtype)
+    return torch.cat([torch.where(mask, image[..., :3], paint), image[..., 3:]], -1)
 
 
-def file_has_transparency(path: Path) -> bool:
-    """The same for a file, of which only the header is read; False when there is none to read."""
-    try:
-        with Image.open(path) as image:
-            return has_transparency(image)
-    except (OSError, SyntaxError, ValueError):
-        return False
+def without_blank_views(outputs: DataparserOutputs, which: str) -> DataparserOutputs:
+    """The views of which any pixel counts: a mask that excludes all of them leaves nothing to learn from or to compare.
+
+    Args:
+        outputs: what nerfstudio's reader found.
+        which: "training" or "held-out", for messages.
+
+    Raises:
+        InputError: no training view is left.
+    """
+    masks = outputs.mask_filenames
+    blank = set(masks_without_pixels(masks)) if masks else set()
+    if not blank:
+        return outputs
+    named = listed([masks[i] for i in sorted(blank)])
+    if which == "training" and len(blank) == len(masks):
+        fail(
+            f"the masks of all {len(masks)} {which} photographs exclude every pixel: {named}. Pixels count where the "
+            "mask is not black; if the masks are inverted, invert them."
+        )
+    warn(
+        f"The masks of {len(blank)} of {len(masks)} {which} photographs exclude every pixel: {named}. These views are "
+        "left out."
+    )
+    keep = [i for i in range(len(masks)) if i not in blank]
+    metadata = {
+        key: [value[i] for i in keep] if isinstance(value, list) and len(value) == len(masks) else value
+        for key, value in outputs.metadata.items()
+    }
+    return dataclasses.replace(
+        outputs,
+        image_filenames=[outputs.image_filenames[i] for i in keep],
+        mask_filenames=[masks[i] for i in keep],
+        cameras=outputs.cameras[torch.tensor(keep, dtype=torch.long)],
+        metadata=metadata,
+    )

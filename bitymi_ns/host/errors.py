@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NoReturn
 
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -30,3 +31,9 @@ def fail(message: str, cause: BaseException | None = None) -> NoReturn:
 def warn(message: str) -> None:
     """Tell the user about something that goes on without what it should have had."""
     CONSOLE.print(f"[bold yellow]{escape(message)}", soft_wrap=True)
+
+
+def listed(names: Sequence[object], most: int = 3) -> str:
+    """The first few names, and how many more there are."""
+    shown = ", ".join(str(name) for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

@@ -55,8 +55,6 @@ class Photographs(Sequence):
                 _set_camera(dataset, index, batch["image"], K)
                 if room.take(sum(value.nbytes for value in batch.values() if isinstance(value, torch.Tensor))):
                     self._kept[index] = batch
-        if dataset.cameras.distortion_params is not None:
-            dataset.cameras.distortion_params = torch.zeros_like(dataset.cameras.distortion_params)
 
     def __len__(self) -> int:
         return len(self._files)

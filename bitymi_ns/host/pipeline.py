@@ -8,7 +8,7 @@ from typing import Any
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
 
 
 class BitymiPipeline(VanillaPipeline):
@@ -22,9 +22,17 @@ class BitymiPipeline(VanillaPipeline):
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Averages over images; the deviation of a single image is 0, not NaN, which JSON does not know."""
+        """Averages over images, without NaN, which JSON does not know.
+
+        The deviation of a single image is 0. A metric that an image has none of, because no pixel of it counts, is
+        left out.
+        """
         metrics = super().get_average_image_metrics(*args, **kwargs)
-        return {k: 0.0 if k.endswith("_std") and math.isnan(v) else v for k, v in metrics.items()}
+        missing = [k for k, v in metrics.items() if math.isnan(v) and not k.endswith("_std")]
+        if missing:
+            warn(f"{', '.join(missing)} is left out: there is a held-out view of which no pixel counts.")
+        kept = {k: v for k, v in metrics.items() if k.removesuffix("_std") not in missing}
+        return {k: 0.0 if math.isnan(v) else v for k, v in kept.items()}
 
 
 @dataclass

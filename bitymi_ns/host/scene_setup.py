@@ -10,11 +10,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import bounds
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene
+
+FEW_POINTS = 50
+"""With fewer points than this, much of a scene may have none near it."""
 
 
 def new_scene(
@@ -39,17 +43,18 @@ def new_scene(
     if not bool(torch.isfinite(xyz).all(1).any()):
         box = _box_for_random_points(scene_box, len(xyz))
     try:
-        scene, report = build_scene(
-            xyz,
-            rgb,
-            metadata.get("camera_centers", torch.zeros(0, 3)),
-            config,
-            train,
-            bounded=metadata.get("has_alpha", False),
-            image_pixels=metadata.get("train_pixels", 0),
-            box=box,
-            declared=declared,
-        )
+        with reporting_time("Making surfels of", len(xyz)):
+            scene, report = build_scene(
+                xyz,
+                rgb,
+                metadata.get("camera_centers", torch.zeros(0, 3)),
+                config,
+                train,
+                bounded=metadata.get("has_alpha", False),
+                image_pixels=metadata.get("train_pixels", 0),
+                box=box,
+                declared=declared,
+            )
     except ValueError as error:
         fail(str(error), error)
     for sentence in bounds.start(
@@ -58,6 +63,12 @@ def new_scene(
         CONSOLE.print(sentence, soft_wrap=True)
     if report.random:
         CONSOLE.print(f"The capture has no points: training starts from {report.random:,} random ones.")
+    usable = report.given - report.not_finite - report.duplicates
+    if 0 < usable < FEW_POINTS:
+        warn(
+            f"The capture's point cloud has only {usable} different points to start from. If little appears, remove it "
+            "(ply_file_path in transforms.json) to start from random points."
+        )
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
         warn(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
@@ -14,13 +15,14 @@ from torch.nn import Parameter
 
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.curve import FILE, Stopwatch, TrainingCurve, points
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.memory import state_training
 from bitymi_ns.train import bounds
+from bitymi_ns.train.coverage import views_without_surfels
 from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
@@ -82,11 +84,33 @@ class TrainingRun:
         for sentence in bounds.short_run(self.schedule, len(self.datamanager.train_dataset)):
             CONSOLE.print(sentence, soft_wrap=True)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
+        if self.curve_steps:
+            _ = self.datamanager.cached_eval
+        self.datamanager.check_pictures()
+        if self.first_step == 0:
+            self._check_start()
         if model.device.type == "cpu":
             train = self.datamanager.train_dataset.cameras
             state_training(model.scene, OnDemand(len(train), lambda i: to_camera(train[i : i + 1])), self.strategy.most)
         views = OnDemand(len(self.datamanager.train_dataset), self._train_view)
         self.views = ReducedViews(views, model.device)
+
+    def _check_start(self) -> None:
+        """Stop, or warn, when views see nothing of what training starts from: no gradient would come from them."""
+        dataset = self.datamanager.train_dataset
+        cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
+        blind = [dataset.image_filenames[i] for i in views_without_surfels(self.model.scene, cameras)]
+        if len(blind) == len(dataset):
+            fail(
+                f"none of the {len(self.model.scene):,} points that training starts from lies in any training view: "
+                "nothing could be learned. Either the point cloud is in another frame than the poses, or the cameras "
+                "look the other way (nerfstudio's axes are x right, y up, z back)."
+            )
+        if blind:
+            warn(
+                f"{listed(blind)} sees none of the points that training starts from: the pose may be wrong, or the "
+                "point cloud has no points there."
+            )
 
     def callbacks(self) -> list[TrainingCallback]:
         return [
@@ -219,7 +243,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def _held_out(self, all_views: bool) -> tuple[float, float] | None:
-        """Mean PSNR and mean number of fragments over held-out views at full size."""
+        """Mean PSNR and mean number of fragments over held-out views at full size; None where no pixel counts."""
         count = len(self.datamanager.eval_dataset)
         if count == 0:
             return None
@@ -237,5 +261,6 @@ class TrainingRun:
                 (psnr(rgb, target, None if mask is None else mask.to(rgb.device)), float(len(output.fragments)))
             )
             del output  # with its fragments, before the next view makes its own
-        first, second = (sum(column) / len(values) for column in zip(*values, strict=True))
-        return first, second
+        quality, fragments = zip(*values, strict=True)
+        mean = mean_psnr(quality)
+        return None if math.isnan(mean) else (mean, sum(fragments) / len(fragments))

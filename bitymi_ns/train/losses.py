@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -118,7 +119,7 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal to noise ratio in dB, at most 100 (equal images).
+    """Peak signal to noise ratio in dB, at most 100 (equal images); NaN when no pixel counts.
 
     Args:
         image, target: [H, W, 3] in [0, 1].
@@ -127,4 +128,12 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     error = (image - target).square()
     if mask is not None:
         error = error[mask.reshape(error.shape[:2])]
-    return min(100.0, -10.0 * math.log10(max(float(error.sum()) / max(1, error.numel()), 1e-10)))
+    if error.numel() == 0:
+        return math.nan
+    return min(100.0, -10.0 * math.log10(max(float(error.sum()) / error.numel(), 1e-10)))
+
+
+def mean_psnr(values: Sequence[float]) -> float:
+    """Mean dB of the views of which any pixel counts; NaN when there is none."""
+    counted = [value for value in values if not math.isnan(value)]
+    return sum(counted) / len(counted) if counted else math.nan

@@ -19,7 +19,7 @@ from bitymi_ns.train.config import AdamConfig, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import objective, psnr
+from bitymi_ns.train.losses import mean_psnr, objective, psnr
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.views import (
@@ -287,7 +287,8 @@ class Trainer:
 
 @torch.no_grad()
 def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> tuple[float, float]:
-    """Mean PSNR in dB of the views at full size, and mean number of fragments a view; NaN without views."""
+    """Mean PSNR in dB of the views at full size of which any pixel counts, and mean number of fragments per view; NaN
+    without such views."""
     device = scene.surfels["means"].device
     # evaluation has one background, also when training draws a new one each step
     background = background_color("white" if config.background == "white" else "black", config.seed, 0, device)
@@ -298,7 +299,7 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> tuple[
         quality.append(psnr(output.rgb.clamp(0.0, 1.0), target, None if mask is None else mask.to(device)))
         fragments.append(len(output.fragments))
         del output  # with its fragments, before the next view makes its own
-    return (sum(quality) / len(quality), sum(fragments) / len(fragments)) if quality else (math.nan, math.nan)
+    return mean_psnr(quality), sum(fragments) / len(fragments) if fragments else math.nan
 
 
 def fit(

@@ -11,21 +11,9 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from bitymi_ns.host.datamanager import BitymiDataManager, BitymiDataManagerConfig
-from bitymi_ns.host.errors import InputError
-
-
-def load(data: Path, **dataparser: Any) -> BitymiDataManager:
-    options = {"eval_mode": "interval", "eval_interval": 8, "load_3D_points": True, **dataparser}
-    config = BitymiDataManagerConfig(data=data, dataparser=NerfstudioDataParserConfig(**options))
-    return config.setup(device="cpu", test_mode="val")
-
-
-def images_of(capture: Path) -> list[Path]:
-    return sorted(p for p in (capture / "images").iterdir() if p.is_file())
+from tests.host.captures import expect, images_of, load, load_with
 
 
 def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
@@ -74,8 +62,7 @@ def test_a_box_counts_only_where_the_capture_declares_one(capture: Path, edit: A
     for declared in (False, True):
         if declared:
             edit(capture, lambda meta: meta.update(aabb_scale=2))
-        config = BitymiDataManagerConfig(data=capture, dataparser=InstantNGPDataParserConfig(eval_mode="interval"))
-        manager = config.setup(device="cpu", test_mode="val")
+        manager = load_with(capture, InstantNGPDataParserConfig(eval_mode="interval"))
         assert manager.train_dataset.metadata["declares_box"] is declared
     assert manager.train_dataset.scene_box.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
 
@@ -99,10 +86,6 @@ def test_undistorted_cameras_are_marked_as_such(capture: Path, edit: Any) -> Non
     manager = load(capture)
     assert float(manager.undistorted_train_cameras().distortion_params.abs().max()) == 0.0
     assert manager.cached_train[0]["image"].shape[1] == int(manager.train_cameras.width[0])
-
-
-def expect(message: str) -> Any:
-    return pytest.raises(InputError, match=message)
 
 
 def test_a_missing_folder(tmp_path: Path) -> None:
@@ -141,7 +124,7 @@ def test_a_frame_without_pose(capture: Path, edit: Any) -> None:
 
 def test_intrinsics_missing(capture: Path, edit: Any) -> None:
     edit(capture, lambda meta: [meta.pop(key, None) for key in ("fl_x", "fl_y")])
-    with expect("cannot be loaded: .*(fx|fl_x)"):
+    with expect("gives no fl_x for images/frame_00001.png, .* and 9 more: .*Add it once at the top of the file"):
         load(capture)
 
 

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from bitymi_ns.host import metrics
 from bitymi_ns.host.curve import Stopwatch, TrainingCurve, points
+from bitymi_ns.host.pipeline import BitymiPipeline
 
 
 def pair() -> tuple[torch.Tensor, torch.Tensor]:
@@ -97,3 +99,13 @@ def test_a_full_disk_costs_a_point_and_not_the_run(tmp_path: Path, capsys: pytes
     curve.path = tmp_path / "missing" / "a.jsonl"
     curve.add({"step": 1})
     assert "could not be written" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_metric_that_a_view_has_none_of_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    averages = {"psnr": math.nan, "psnr_std": math.nan, "ssim": 0.9, "ssim_std": math.nan}
+    monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", lambda self: averages)
+    pipeline = BitymiPipeline.__new__(BitymiPipeline)
+    assert BitymiPipeline.get_average_image_metrics(pipeline) == {"ssim": 0.9, "ssim_std": 0.0}
+    assert "psnr is left out" in " ".join(capsys.readouterr().out.split())

@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig, TrainConfig
-from bitymi_ns.train.losses import error_weight, mean_where_right, objective, photometric, psnr
+from bitymi_ns.train.losses import error_weight, mean_psnr, mean_where_right, objective, photometric, psnr
 from bitymi_ns.train.trainer import fit
 
 
@@ -112,7 +112,14 @@ def test_psnr_of_a_known_error() -> None:
     b = a.clone()
     b[2:] = 0.0  # where it does not count
     assert psnr(b, a, mask) == 100.0
-    assert psnr(b, a, ~mask) < 10 and psnr(b, a, torch.zeros_like(mask)) == 100.0
+    assert psnr(b, a, ~mask) < 10
+
+
+def test_psnr_of_no_pixel_is_no_number() -> None:
+    a = torch.rand(4, 5, 3)
+    assert math.isnan(psnr(a, a, torch.zeros(4, 5, dtype=torch.bool)))
+    assert mean_psnr([20.0, math.nan, 30.0]) == 25.0
+    assert math.isnan(mean_psnr([math.nan])) and math.isnan(mean_psnr([]))
 
 
 def test_mean_where_right_is_a_mean_over_the_pixels_that_count(pair):

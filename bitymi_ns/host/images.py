@@ -1,0 +1,172 @@
+"""Photographs and masks as files: read by their bit depth, and what of them there is to learn from."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, UnidentifiedImageError
+
+from bitymi_ns.host.errors import fail, listed, warn
+
+ORIENTATION = 0x0112
+"""The EXIF tag that asks viewers to turn a photograph; 1 = as it is stored."""
+THREADS = 4
+FINGERPRINT = 64
+"""Pixels across, and down, that decide whether two photographs are the same."""
+
+
+def read_image(path: Path) -> Image.Image:
+    """The photograph with 8 bits per channel, RGB or, where it has transparency, RGBA.
+
+    PIL's own conversion clips what has more bits: a grey picture of 16 bits would come out white.
+    """
+    try:
+        with Image.open(path) as file:
+            return _eight_bits(file).convert("RGBA" if has_transparency(file) else "RGB")
+    except FileNotFoundError as error:
+        fail(f"the image {path} is missing, but the capture has a pose for it", error)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
+
+
+def read_mask(path: Path) -> Image.Image:
+    """The mask as one grey channel; pixels that are not black count, transparent ones do not."""
+    try:
+        with Image.open(path) as file:
+            grey = _not_black(file)
+            if has_transparency(file):
+                alpha = np.asarray(file.convert("RGBA"))[..., 3]
+                grey = grey & (alpha > 0)
+            return Image.fromarray(grey)
+    except FileNotFoundError as error:
+        fail(f"the mask {path} is missing", error)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        fail(f"the mask {path} cannot be read: {error}. Replace it, or remove the masks from the capture.", error)
+
+
+def _eight_bits(image: Image.Image) -> Image.Image:
+    """The image, of which deep grey modes are scaled to 8 bits."""
+    if not image.mode.startswith(("I", "F")):
+        return image
+    values = np.asarray(image, dtype=np.float64)
+    low, high = float(values.min()), float(values.max())
+    if image.mode.startswith("I;16") or image.format == "PNG":
+        whites = (65535.0,)
+    else:  # TIFF and the like, which do not say what white is
+        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
+    white = next((white for white in whites if high <= white), None)
+    if white is None or not low >= 0.0:  # also NaN
+        raise ValueError(
+            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
+            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
+        )
+    return Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
+
+
+def _not_black(image: Image.Image) -> npt.NDArray[np.bool_]:
+    if image.mode.startswith(("I", "F")):
+        return np.asarray(image) != 0
+    return np.asarray(image.convert("RGB")).any(-1)
+
+
+def has_transparency(image: Image.Image) -> bool:
+    """Whether an image has an alpha channel or a transparent colour."""
+    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+
+
+def file_has_transparency(path: Path) -> bool:
+    """The same for a file, of which only the header is read; False when there is none to read."""
+    try:
+        with Image.open(path) as image:
+            return has_transparency(image)
+    except (OSError, SyntaxError, ValueError):
+        return False
+
+
+def orientation(path: Path) -> int:
+    """How the file asks viewers to turn it, by its EXIF tag; 1 = not at all, also where there is none to read."""
+    try:
+        with Image.open(path) as image:
+            if image.format == "PNG" and "exif" not in image.info:
+                return 1  # else PIL would decode the whole image in search of it
+            value = image.getexif().get(ORIENTATION, 1)
+    except (OSError, SyntaxError, ValueError):
+        return 1
+    return value if value in range(1, 9) else 1
+
+
+def check_orientation(paths: Sequence[Path]) -> None:
+    """Say which photographs ask to be turned: they are used as they are stored."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        turned = [path for path, value in zip(paths, pool.map(orientation, paths), strict=True) if value != 1]
+    if turned:
+        warn(
+            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "
+            "as COLMAP and nerfstudio do. If the pose was made from the turned picture, write the turn into the pixels "
+            "(`mogrify -auto-orient <photos>`)."
+        )
+
+
+def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
+    """Why a photograph does not fit its camera, and what to do.
+
+    Args:
+        path: the photograph.
+        size: its width and height in pixels.
+        declared: those of its camera.
+    """
+    shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"
+    if size == declared[::-1] and orientation(path) >= 5:
+        return (
+            f"the image {path} is stored turned by a quarter: it has {shown}. Its EXIF tag asks viewers to turn it, "
+            "and the camera and pose are for the turned picture. Write the turn into the pixels with "
+            "`mogrify -auto-orient <photos>`, or swap w and h (and fl_x and fl_y, cx and cy) and turn the pose."
+        )
+    return (
+        f"the image {path} has {shown}. Correct w and h (and fl_x, fl_y, cx, cy) in the capture, or resize the image."
+    )
+
+
+def masks_without_pixels(paths: Sequence[Path]) -> list[int]:
+    """Which of the masks let no pixel count."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        return [i for i, box in enumerate(pool.map(lambda path: read_mask(path).getbbox(), paths)) if box is None]
+
+
+class Note(NamedTuple):
+    """What is remembered of a photograph once it has been read.
+
+    Attributes:
+        empty: why there is nothing to learn from it; "" where there is.
+        fingerprint: equal for photographs with the same pixels.
+    """
+
+    empty: str
+    fingerprint: bytes
+
+
+def note(image: npt.NDArray[np.uint8]) -> Note:
+    """The note on a photograph [H, W, 3 or 4]."""
+    height, width = image.shape[:2]
+    sample = image[:: max(1, height // FINGERPRINT), :: max(1, width // FINGERPRINT)]
+    fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()
+    empty = ""
+    if _transparent(sample) and _transparent(image):
+        empty = "transparent everywhere"
+    elif _plain(sample) and _plain(image):
+        empty = "of one colour throughout"
+    return Note(empty, fingerprint)
+
+
+def _transparent(image: npt.NDArray[np.uint8]) -> bool:
+    return image.shape[-1] == 4 and not image[..., 3].any()
+
+
+def _plain(image: npt.NDArray[np.uint8]) -> bool:
+    return bool((image == image[0, 0]).all())

@@ -1,0 +1,118 @@
+"""Whether the poses of a capture are poses: rotations (or mirrored ones) at places that belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from bitymi_ns.host.errors import fail, listed, warn
+
+EXACT = 1e-3
+"""Matrices this close to a rotation are taken as they are: float32, or four written digits."""
+ROUNDED = 2e-2
+"""Matrices this close to a rotation, up to a common factor, are meant to be one: two written digits."""
+FAR = 100.0
+"""So many times as far out as all the others: a camera that may be misplaced."""
+TOO_FAR = 1000.0
+"""So many times as far out, the others shrink to one place beside it."""
+
+
+def rotations(
+    matrices: npt.NDArray[np.float64], names: Sequence[object], where: str, announce: bool = True
+) -> npt.NDArray[np.float64]:
+    """The rotations that the 3 x 3 parts of poses stand for.
+
+    A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
+    (determinant -1) stay mirrored: captures may be mirrored as a whole.
+
+    Args:
+        matrices: [N, 3, 3], camera to world.
+        names: of the N frames, for messages.
+        where: the file or capture, for messages.
+        announce: say what was changed.
+
+    Returns:
+        [N, 3, 3]; the rows that need no change are equal to the given ones.
+
+    Raises:
+        InputError: a matrix is not finite, zero or sheared.
+    """
+    result = matrices.copy()
+    finite = np.isfinite(matrices).all((1, 2))
+    scale = np.sqrt(np.square(np.where(finite[:, None, None], matrices, 0.0)).sum((1, 2)) / 3.0)
+    usable = finite & (scale > 0.0)
+    unit = np.where(usable[:, None, None], matrices, 1.0) / np.where(usable, scale, 1.0)[:, None, None]
+    error = np.abs(unit.transpose(0, 2, 1) @ unit - np.eye(3)).max((1, 2))
+    for what, wrong in (
+        ("is not finite", ~finite),
+        ("is zero", finite & ~usable),
+        ("is sheared or stretched: its columns are not at right angles and equally long", usable & (error > ROUNDED)),
+    ):
+        if wrong.any():
+            fail(
+                f"{where}: the 3 x 3 part of the pose of {listed([names[i] for i in wrong.nonzero()[0]])} is no "
+                f"rotation, it {what}. Correct the pose or remove the frame."
+            )
+    scaled = np.abs(scale - 1.0) > EXACT
+    result[scaled] = unit[scaled]
+    rounded = error > EXACT
+    u, _, v = np.linalg.svd(unit[rounded])
+    result[rounded] = u @ v
+    if announce and scaled.any():
+        low, high = scale[scaled].min(), scale[scaled].max()
+        factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
+        warn(
+            f"{where}: rotations are scaled by {factor} in the poses of "
+            f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
+        )
+    only_rounded = rounded & ~scaled
+    if announce and only_rounded.any():
+        warn(
+            f"{where}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
+            f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
+        )
+    return result
+
+
+def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
+    """Name frames that are mirrored where others are not. A capture may be mirrored as a whole.
+
+    Args:
+        rotations: [N, 3, 3], mirrored or not.
+        names: of the N frames.
+    """
+    mirrored = np.linalg.det(rotations) < 0.0
+    few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
+    if few.any():
+        warn(
+            f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames (the sign of the "
+            "pose's determinant differs). If the photograph is not mirrored, too, the pose is wrong."
+        )
+
+
+def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
+    """Stop, or warn, at single cameras that are far from all the others.
+
+    Args:
+        centers: [N, 3] camera positions, finite.
+        names: of the N frames, for messages.
+    """
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    order = np.argsort(distances)
+    sorted_distances = distances[order]
+    first = len(order) - max(1, len(order) // 10)  # more than a tenth is a group of its own
+    for k in range(max(1, first), len(order)):
+        near, far = sorted_distances[k - 1], sorted_distances[k]
+        if near <= 0.0 or far < FAR * near:
+            continue
+        message = (
+            f"the camera of {listed([names[i] for i in order[k:]])} is {far / near:,.0f} times as far from the middle "
+            "of the capture as the others."
+        )
+        if far < TOO_FAR * near:
+            warn(f"{message[0].upper()}{message[1:]} If that is a mistake, correct the pose or remove the frame.")
+        else:
+            fail(f"{message} Beside it they are all at one place. Correct the pose or remove the frame.")
+        return

@@ -1,0 +1,214 @@
+"""transforms.json and its relatives: read, checked, and made into what nerfstudio's readers expect."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.poses import rotations
+
+HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
+SIZES = ("w", "h")
+INTRINSICS = (*SIZES, "fl_x", "fl_y", "cx", "cy")
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = (*COEFFICIENTS, "distortion_params")
+
+
+@contextmanager
+def corrected_files(config: DataParserConfig) -> Iterator[None]:
+    """While it lasts, nerfstudio's reader of this kind of capture gets its JSON files as `load` gives them.
+
+    The poses have to be right before nerfstudio orients, centres and scales the capture by them.
+    """
+    module = sys.modules[config._target.__module__]
+    original = getattr(module, "load_from_json", None)
+    if original is None:  # a reader of other files
+        yield
+        return
+    own_format = isinstance(config, NerfstudioDataParserConfig)
+    once = functools.cache(lambda path: load(path, own_format))  # each split reads the file; what is wrong is said once
+    module.load_from_json = lambda path: copy.deepcopy(once(Path(path)))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        module.load_from_json = original  # type: ignore[attr-defined]
+
+
+def load(path: Path, own_format: bool, announce: bool = True) -> Any:
+    """What a JSON file of a capture says, with poses that are rotations.
+
+    Args:
+        path: the file, in any Unicode encoding, with or without byte order mark.
+        own_format: it is a transforms.json in nerfstudio's own format, of which more is known.
+        announce: say what was corrected.
+
+    Raises:
+        InputError: the file cannot be used; the message names the frame.
+    """
+    try:
+        meta = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
+    except (ValueError, OSError) as error:
+        fail(f"{path} cannot be read: {error}. {HOW_TO_GET_ONE}", error)
+    if own_format:
+        _check_frames(path, meta)
+        _check_camera(path, meta)
+        _distribute(path, meta, announce)
+        _check_transform(path, meta)
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if isinstance(frames, list) and all(isinstance(f, dict) and "transform_matrix" in f for f in frames):
+        _correct_poses(path, frames, announce)
+    return meta
+
+
+def _check_frames(path: Path, meta: Any) -> None:
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not frames:
+        fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE}")
+    if len(frames) == 1:
+        fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
+            fail(f"{path}: frame {i} has no file_path or no transform_matrix")
+        for key in ("file_path", "mask_path", "depth_file_path"):
+            if key in frame:
+                frame[key] = _file_name(path, i, key, frame[key])
+    without = [frame["file_path"] for frame in frames if "mask_path" not in frame]
+    if 0 < len(without) < len(frames):
+        fail(
+            f"{path}: {listed(without)} has no mask_path, but other frames have one. Give every frame a mask (a white "
+            "picture lets all pixels count), or none."
+        )
+
+
+def _file_name(path: Path, i: int, key: str, name: Any) -> str:
+    if not isinstance(name, str) or not name:
+        fail(f"{path}: the {key} of frame {i} is {name!r}, not the name of a file")
+    portable = name.replace("\\", "/")
+    return portable if os.sep == "/" and not (path.parent / name).exists() else name
+
+
+def _check_camera(path: Path, meta: dict[str, Any]) -> None:
+    """Numbers are numbers, and every frame has all that it needs."""
+    frames = meta["frames"]
+    for holder in (meta, *frames):
+        whose = f"of {holder['file_path']}" if "file_path" in holder else "for all frames"
+        for key in (*INTRINSICS, *COEFFICIENTS):
+            if key in holder:
+                holder[key] = _number(path, key, holder[key], whose)
+    for key in INTRINSICS:
+        lacking = [frame["file_path"] for frame in frames if key not in meta and key not in frame]
+        if lacking:
+            way_out = f"Add it once at the top of the file{'' if len(lacking) == len(frames) else ', or to each frame'}"
+            if "camera_angle_x" in meta:
+                way_out = (
+                    "It has camera_angle_x, as files for instant-ngp and Blender's have: give the name of their "
+                    "reader, `... instant-ngp-data --data <capture>` or `... blender-data --data <capture>`"
+                )
+            fail(f"{path} gives no {key} for {listed(lacking)}: it is neither in the frame nor at the top. {way_out}.")
+    model = meta.get("camera_model", "OPENCV")
+    if model not in CAMERA_MODEL_TO_TYPE:
+        fail(
+            f"{path}: the camera_model {model!r} is unknown. nerfstudio knows {', '.join(CAMERA_MODEL_TO_TYPE)}; "
+            "for undistorted photographs write PINHOLE."
+        )
+
+
+def _number(path: Path, key: str, value: Any, whose: str) -> float | int:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        fail(f"{path}: {key} {whose} is {value!r}, which is no number")
+    if key not in SIZES:
+        return number  # what is not finite is refused with the cameras
+    if not number.is_integer():
+        fail(f"{path}: {key} {whose} is {value!r}, which is no number of pixels")
+    return int(number)
+
+
+def _distribute(path: Path, meta: dict[str, Any], announce: bool) -> None:
+    """What frames say of their own camera goes before what the file says for all, which nerfstudio would take."""
+    frames = meta["frames"]
+    differing = []
+    for group in (*((key,) for key in INTRINSICS), DISTORTION):
+        common = {key: meta[key] for key in group if key in meta}
+        own = [{key: frame[key] for key in group if key in frame} for frame in frames]
+        if not common or not any(own):
+            continue
+        if any(values not in ({}, common) for values in own):
+            differing.extend(common)
+        for frame, values in zip(frames, own, strict=True):
+            if not values:
+                frame.update(common)
+        for key in common:
+            del meta[key]
+    if announce and differing:
+        warn(f"{path} gives {', '.join(differing)} for all frames and for single ones: those of the frame are used.")
+
+
+def _check_transform(path: Path, meta: dict[str, Any]) -> None:
+    """The transform that was applied to the capture as a whole, [3, 4]."""
+    if "applied_transform" in meta:
+        transform = _matrix(meta["applied_transform"])
+        if transform is None:
+            fail(
+                f"{path}: applied_transform is not a matrix of 3 x 4 finite numbers. Correct it, or remove it: then "
+                "exports are in the frame of this file."
+            )
+        meta["applied_transform"] = transform[:3].tolist()
+    if "applied_scale" in meta:
+        scale = _number(path, "applied_scale", meta["applied_scale"], "for all frames")
+        if not 0.0 < scale < math.inf:
+            fail(f"{path}: applied_scale is {scale}, which is no positive number. Correct it or remove it.")
+
+
+def _correct_poses(path: Path, frames: list[dict[str, Any]], announce: bool) -> None:
+    """Stop at poses that nerfstudio would spread over all others, or stumble over; correct what is meant well."""
+    names = [frame.get("file_path", f"frame {i}") for i, frame in enumerate(frames)]
+    poses = []
+    for frame, name in zip(frames, names, strict=True):
+        pose = _matrix(frame["transform_matrix"])
+        if pose is None:
+            fail(
+                f"{path}: the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers. "
+                "Correct it or remove the frame."
+            )
+        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+            row = " ".join(f"{x:g}" for x in pose[3])
+            fail(
+                f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. A matrix whose "
+                "position stands in its last row has to be transposed."
+            )
+        poses.append(pose)
+    if not poses:
+        return
+    whole = np.stack(poses)
+    whole[:, :3, :3] = rotations(whole[:, :3, :3], names, str(path), announce)
+    for frame, pose in zip(frames, whole, strict=True):
+        frame["transform_matrix"] = pose.tolist()
+
+
+def _matrix(value: Any) -> np.ndarray | None:
+    """[4, 4] from 3 x 4 or 4 x 4 finite numbers; None from anything else."""
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        return None
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        return None
+    return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])

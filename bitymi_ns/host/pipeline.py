@@ -21,13 +21,15 @@ class BitymiPipeline(VanillaPipeline):
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
 
-    def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
+    def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Averages over images, without NaN, which JSON does not know.
 
         The deviation of a single image is 0. A metric that an image has none of, because no pixel of it counts, is
         left out.
         """
-        metrics = super().get_average_image_metrics(*args, **kwargs)
+        if len(data_loader) == 0:
+            fail("there is no held-out view to evaluate: none was held out, or their masks exclude every pixel")
+        metrics = super().get_average_image_metrics(data_loader, *args, **kwargs)
         missing = [k for k, v in metrics.items() if math.isnan(v) and not k.endswith("_std")]
         if missing:
             warn(f"{', '.join(missing)} is left out: there is a held-out view of which no pixel counts.")

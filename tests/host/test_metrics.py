@@ -14,6 +14,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from bitymi_ns.host import metrics
 from bitymi_ns.host.curve import Stopwatch, TrainingCurve, points
+from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.pipeline import BitymiPipeline
 
 
@@ -105,7 +106,9 @@ def test_a_metric_that_a_view_has_none_of_is_left_out(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     averages = {"psnr": math.nan, "psnr_std": math.nan, "ssim": 0.9, "ssim_std": math.nan}
-    monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", lambda self: averages)
+    monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", lambda self, views: averages)
     pipeline = BitymiPipeline.__new__(BitymiPipeline)
-    assert BitymiPipeline.get_average_image_metrics(pipeline) == {"ssim": 0.9, "ssim_std": 0.0}
+    assert BitymiPipeline.get_average_image_metrics(pipeline, ["a view"]) == {"ssim": 0.9, "ssim_std": 0.0}
     assert "psnr is left out" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(InputError, match="no held-out view to evaluate"):
+        BitymiPipeline.get_average_image_metrics(pipeline, [])

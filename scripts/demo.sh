@@ -31,6 +31,9 @@ options=()
 [ -z "${STEPS:-}" ] || options=(--max-num-iterations "$STEPS")
 asked="$data ${STEPS:-}" # what the results in $out belong to
 
+# nerfstudio 1.1.5 imports names that newer versions of torch warn about, before any method can have a say in it
+export PYTHONWARNINGS=${PYTHONWARNINGS:-ignore::FutureWarning:nerfstudio.field_components.activations}
+
 say() { printf '\n== %s (%d s so far)\n' "$*" "$SECONDS"; }
 
 if [ ! -f "$data/transforms.json" ]; then

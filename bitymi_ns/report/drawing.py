@@ -57,6 +57,8 @@ class Sheet:
     y: str
     scenes: tuple[str, ...]
     draw: Callable[[Axes, str, Theme], None]
+    points: int
+    """Points of the fullest panel or, of curves, of the longest line."""
     legend: tuple[tuple[str, dict], ...]
     """Entries: text and Line2D properties; an int as `color` is a number of the theme's line colours."""
 

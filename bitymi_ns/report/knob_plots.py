@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from matplotlib.axes import Axes
 
 from bitymi_ns.report.drawing import Sheet, Theme, line_color, log_when_wide
@@ -80,7 +82,8 @@ def _sheet(knob: str, points: list[KnobPoint]) -> Sheet:
     legend.append(("default", {"marker": "o", "ms": 9, "linestyle": "", "hollow": True}))
     scenes = tuple(dict.fromkeys(map(_panel_name, points)))
     title = f"{TITLES.get(knob, knob)}: error in 8-bit steps against {'size' if by_bytes else 'time'}"
-    return Sheet(f"knob_{knob}", title, KNOBS, x, "error (8-bit steps)", scenes, panel, tuple(legend))
+    most = max(Counter(map(_panel_name, points)).values())
+    return Sheet(f"knob_{knob}", title, KNOBS, x, "error (8-bit steps)", scenes, panel, most, tuple(legend))
 
 
 def knob_tables(points: list[KnobPoint]) -> list[Table]:

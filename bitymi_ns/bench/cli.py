@@ -90,7 +90,7 @@ class BenchRun:
             rows, bundles = read_plan(self.plan)
         extra = tuple(shlex.split(self.extra))
         if not rows:
-            raise BenchError("no row: give --methods or --plan")
+            raise BenchError("nothing to run: give --methods or --plan")
         rows = [Row(row.name, row.method, (*row.options, *extra)) for row in rows]
         bundles = format_bundles(self.formats) if bundles is None else bundles
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures, self.knobs)
@@ -110,7 +110,7 @@ class BenchRun:
                     options = job_options(self.job_options)
                     failures = spread(work, chains, self.cluster, display, self.jobs, self.gpus, options)
         except KeyboardInterrupt:
-            say(f"interrupted; {len(open_cells(work))} finished cells are in {work}, and the same command goes on")
+            say(f"interrupted; {len(open_cells(work))} finished cells are in {work}; the same command goes on")
             return INTERRUPTED
         for failure in failures:
             say(failure)
@@ -120,5 +120,5 @@ class BenchRun:
         if self.output is not None:
             self.output.parent.mkdir(parents=True, exist_ok=True)
             self.output.write_text(text, "utf8")
-        print(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}", file=sys.stderr)
+        print(f"Results are in {cells.path}. For a page of them: bitymi report {cells.path}", file=sys.stderr)
         return FAILED if failures else 0

@@ -177,7 +177,7 @@ class BitymiAdamConfig(OptimizerConfig):
 
 
 def optimizers(options: AdamConfig) -> dict[str, Any]:
-    """nerfstudio's optimiser dictionary: one Adam a parameter group, no scheduler (the model sets the rates)."""
+    """nerfstudio's optimiser dictionary: one Adam per parameter group, no scheduler (the model sets the rates)."""
 
     def adam(group: str) -> BitymiAdamConfig:
         betas = options.field_betas if group.startswith("field") else options.betas

@@ -1,4 +1,4 @@
-"""How a plot is drawn: one panel a scene, in light and dark, as PNG bytes."""
+"""How a plot is drawn: one panel per scene, in light and dark, as PNG bytes."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _style(axes: Axes, theme: Theme) -> None:
 
 
 def _png(sheet: Sheet, theme: Theme) -> bytes:
-    """Draw a sheet: at most three panels a row, one legend below."""
+    """Draw a sheet: at most three panels per row, one legend below."""
     columns = min(3, len(sheet.scenes))
     rows = math.ceil(len(sheet.scenes) / columns)
     width = 6.4 if columns == 1 else 3.5 * columns

@@ -127,7 +127,7 @@ def make_gallery(images: list[Path]) -> tuple[list[Group], list[str]]:
 
 
 def make_worst(views: list[WorstView]) -> tuple[list[Group], list[str]]:
-    """Encode the pictures of the worst views, a group a view; and a note for each that could not be read."""
+    """Encode the pictures of the worst views, one group per view; and a note for each that could not be read."""
     groups, notes = [], []
     for view in views[:MAX_WORST]:
         pictures = []

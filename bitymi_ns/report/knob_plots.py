@@ -33,14 +33,14 @@ def _by_bytes(points: list[KnobPoint]) -> bool:
 
 
 def knob_sheets(points: list[KnobPoint]) -> list[Sheet]:
-    """One sheet a knob: mean and largest error against CPU milliseconds a view, or megabytes where the knob changes
-    them; a panel a run."""
+    """One sheet per knob: mean and largest error against CPU milliseconds per view, or megabytes where the knob changes
+    them; one panel per run."""
     return [_sheet(knob, [p for p in points if p.knob == knob]) for knob in dict.fromkeys(p.knob for p in points)]
 
 
 def _sheet(knob: str, points: list[KnobPoint]) -> Sheet:
     by_bytes = _by_bytes(points)
-    key, scale, x = ("bytes", 1e-6, "atlas MB") if by_bytes else ("cpu_ms", 1.0, "CPU milliseconds a view")
+    key, scale, x = ("bytes", 1e-6, "atlas MB") if by_bytes else ("cpu_ms", 1.0, "CPU milliseconds per view")
     renderers = sorted({p.renderer for p in points if not p.exact})
     colors = {renderer: i for i, renderer in enumerate(renderers)}
 
@@ -87,7 +87,7 @@ def _sheet(knob: str, points: list[KnobPoint]) -> Sheet:
 
 
 def knob_tables(points: list[KnobPoint]) -> list[Table]:
-    """One table a knob; the error is against its exact setting."""
+    """One table per knob; the error is against its exact setting."""
     tables = []
     header = ("Setting", "mean steps", "max steps", "dB to exact", "PSNR", "ms", "CPU ms", "MB")
     columns = (

@@ -132,7 +132,7 @@ PAPER_NOTE = (
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
 KNOB_NOTE = (
     "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views; "
-    "the thin line is one step. Milliseconds are of the renderer named, a view at full size."
+    "the thin line is one step. Milliseconds are per view at full size, of the renderer named."
 )
 
 

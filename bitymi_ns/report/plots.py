@@ -14,7 +14,7 @@ from bitymi_ns.report.pareto import front
 from bitymi_ns.report.records import Curve, Evaluation, Records, neural_parent
 
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
-"""Marks of baked evaluations, one a format."""
+"""Marks of baked evaluations, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
 """Sections of the page."""
 CURVES = ("psnr_seconds", "psnr_cpu_seconds", "surfels_steps")
@@ -64,7 +64,7 @@ def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
     key, what = ("bundle_bytes", "bundle") if whole else ("atlas_bytes", "atlas")
     return (
         Cost("train_seconds", "training seconds", "training seconds", TRAINING, _positive("train_seconds"), False),
-        Cost("render_ms", "render milliseconds", "milliseconds a view", RENDERING, _positive("render_ms"), True),
+        Cost("render_ms", "render milliseconds", "milliseconds per view", RENDERING, _positive("render_ms"), True),
         Cost("bytes", f"{what} size", f"{what} MB", SIZE, _positive(key, 1e-6), False),
     )
 

@@ -109,7 +109,7 @@ class BenchKnobs:
     load_config: Path
     """config.yml of a trained run."""
     output: Path = Path("knobs.jsonl")
-    """File of JSON lines to write, one a knob and setting."""
+    """File of JSON lines to write, one per knob and setting."""
     knobs: tuple[str, ...] = ()
     """Only these: weight_bound, transmittance, r_max, tolerance, format, resolution; none = all."""
     views: int = 4

@@ -31,6 +31,9 @@ options=()
 [ -z "${STEPS:-}" ] || options=(--max-num-iterations "$STEPS")
 asked="$data ${STEPS:-}" # what the results in $out belong to
 
+# nerfstudio 1.1.5 imports names that newer versions of torch warn about, before any method can have a say in it
+export PYTHONWARNINGS=${PYTHONWARNINGS:-ignore::FutureWarning:nerfstudio.field_components.activations}
+
 say() { printf '\n== %s (%d s so far)\n' "$*" "$SECONDS"; }
 
 if [ ! -f "$data/transforms.json" ]; then
@@ -56,18 +59,19 @@ fi
 if [ ! -f "$out/bundle/bundle.json" ]; then
   say "Baking into $out/bundle"
   ns-export bitymi-atlas --load-config "$run/config.yml" --output-dir "$out/bundle"
-  rm -rf "$out/eval-baked.json" "$out/renders"
+  rm -rf "$out/eval-baked.json" "$out/renders/baked"
 fi
 
 if [ ! -f "$out/eval-neural.json" ]; then
   say "Evaluating the trained model"
-  ns-eval --load-config "$run/config.yml" --output-path "$out/eval-neural.json"
+  ns-eval --load-config "$run/config.yml" --output-path "$out/eval-neural.json" \
+    --render-output-path "$out/renders/neural"
 fi
 
 if [ ! -f "$out/eval-baked.json" ]; then
   say "Evaluating the bundle"
   ns-eval --load-config "$out/bundle/config.yml" --output-path "$out/eval-baked.json" \
-    --render-output-path "$out/renders"
+    --render-output-path "$out/renders/baked"
 fi
 
 say "Writing the report"
@@ -78,6 +82,6 @@ cat <<END
 Done in $SECONDS s.
   report    $out/report/index.html
   bundle    $out/bundle             (ns-viewer --load-config $out/bundle/config.yml)
-  renders   $out/renders            held-out views, rendered from the bundle
+  renders   $out/renders            held-out views, of the trained model and of the bundle
   model     $run
 END

@@ -14,7 +14,7 @@ class BakeOptions:
     """How the trained field becomes an atlas."""
 
     format: Format = "bc7"
-    """Texel format: bc7 = 1 byte a texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
+    """Texel format: bc7 = 1 byte per texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
     bc7_profile: Profile = "veryfast"
     """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
     r_min: int = 4

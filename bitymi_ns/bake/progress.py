@@ -19,7 +19,7 @@ def no_progress(step: str, done: int, total: int) -> None:
 
 @contextmanager
 def rich_progress() -> Iterator[Progress]:
-    """A callback that draws one bar a step on the terminal; `with rich_progress() as progress: bake(..., progress)`."""
+    """A callback that draws one bar per step; `with rich_progress() as progress: bake(..., progress)`."""
     from rich.progress import Progress as Bars  # kept out of the import of the package: only the terminal needs it
 
     with Bars() as bars:

@@ -150,7 +150,7 @@ def encode(
     Args:
         texels: [layers, height, width, 3] float32 residual colours.
         packing: where the tiles lie: errors are measured there only.
-        format: bc7 (1 byte a texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
+        format: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
         value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
         profile: effort of the BC7 encoder, from ultrafast to slow.
         threads: encoder threads; not given: one a processor. The result does not depend on it.

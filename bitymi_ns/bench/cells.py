@@ -80,7 +80,7 @@ class Cells:
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 where = f"line {number}" if first else "a line that was added"
                 raise BenchError(
-                    f"{self.path}, {where}, is no finished cell ({error}): remove that line, or give another --work"
+                    f"{self.path}, {where}, is not a finished cell ({error}): remove that line, or give another --work"
                 ) from error
         self._read_until += len(whole)
 

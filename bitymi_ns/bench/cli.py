@@ -91,7 +91,7 @@ class BenchRun:
             rows, bundles = read_plan(self.plan)
         extra = tuple(shlex.split(self.extra))
         if not rows:
-            raise BenchError("no row: give --methods or --plan")
+            raise BenchError("nothing to run: give --methods or --plan")
         rows = [Row(row.name, row.method, (*row.options, *extra)) for row in rows]
         bundles = format_bundles(self.formats) if bundles is None else bundles
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures, self.knobs)

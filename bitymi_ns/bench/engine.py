@@ -108,7 +108,7 @@ def run_chain(work: Path, chain: Chain, watcher: Watcher | None = None) -> list[
         watcher: told about each.
 
     Returns:
-        A message a cell that failed.
+        One message for every cell that failed.
     """
     watcher = watcher or Silent()
     cells = open_cells(work)
@@ -140,11 +140,11 @@ def run_chain(work: Path, chain: Chain, watcher: Watcher | None = None) -> list[
 
 
 def run_chains(work: Path, chains: Sequence[Chain], watcher: Watcher | None = None) -> list[str]:
-    """Do run after run on this machine; returns a message a cell that failed.
+    """Do run after run on this machine; returns one message for every cell that failed.
 
     Raises:
         BenchError: there is nothing to run.
     """
     if not any(chains):
-        raise BenchError("the matrix is empty: no scene, or no row")
+        raise BenchError("nothing to run: there is no scene, or no method")
     return [failure for chain in chains for failure in run_chain(work, chain, watcher)]

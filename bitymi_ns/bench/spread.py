@@ -94,7 +94,7 @@ def spread(
         options: of a job (timeout_min, slurm_partition, ...).
 
     Returns:
-        A message a run or a cell that failed.
+        One message for every run or cell that failed.
 
     Raises:
         BenchError: submitit is not there or does not take the jobs.

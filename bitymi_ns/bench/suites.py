@@ -68,7 +68,7 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
             scenes.append(SceneSpec(folder.name, folder, hold_out=HOLD_OUT))
         else:
             raise BenchError(
-                f"{folder} is no capture: it has neither transforms.json (ns-process-data writes it) nor "
+                f"{folder} is not a capture: it has neither transforms.json (ns-process-data writes it) nor "
                 "transforms_train.json"
             )
     names = [scene.name for scene in scenes]
@@ -157,7 +157,7 @@ def _row(plan: str, title: str, entry: Any) -> Row:
 
 def _bundle(plan: str, title: str, options: Any) -> Bundle:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", title):
-        raise BenchError(f"plan {plan}, bundle {title!r}: names of bundles are of letters, digits and . _ + -")
+        raise BenchError(f"plan {plan}, bundle {title!r}: a bundle's name may hold letters, digits and . _ + - only")
     return Bundle(title, _options(f"plan {plan}, bundle {title}", options))
 
 

@@ -103,7 +103,7 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
             f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
         )
         fail(
-            f"the checkpoint {path} is damaged (cut off or altered) or of another program: "
+            f"the checkpoint {path} is damaged (cut off or altered), or another program wrote it: "
             f"{_first_line(error)}. {way_out}.",
             error,
         )
@@ -134,7 +134,9 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
     rows = {name: len(value) for name, value in parameters.items() if name.startswith("_model." + SURFELS)}
     if len(set(rows.values())) > 1:
         counts = ", ".join(f"{count} {name.rpartition('.')[2]}" for name, count in rows.items())
-        fail(f"the checkpoint {path} was altered: its surfels are not of one number ({counts}). Train again.")
+        fail(
+            f"the checkpoint {path} was altered: its parameters differ in their number of surfels ({counts}). Train again."
+        )
 
 
 def _first_line(error: BaseException) -> str:

@@ -9,12 +9,13 @@ from typing import Any, Literal
 import torch
 import tyro
 import yaml
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host import checkpoints, run_folder
@@ -26,7 +27,9 @@ from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
 from bitymi_ns.host.preset import Preset, load_preset
+from bitymi_ns.host.quiet import quiet_host
 from bitymi_ns.host.trainer import BitymiTrainer
+from bitymi_ns.host.viewer import LOOPBACK, adopt_viewer
 from bitymi_ns.train.config import AdamConfig
 
 
@@ -72,17 +75,32 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
 
+    def print_to_terminal(self) -> None:
+        """Nothing: nerfstudio would print every option here, before anything is checked. All of them are in config.yml,
+        and `save_config` says what matters."""
+
     def save_config(self) -> None:
-        """Write config.yml. This is the first that a run writes, so a folder that cannot be used shows here. What
-        can be checked before anything is written is checked now."""
+        """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
+        folder that cannot be used shows here. What can be checked before anything is written is checked now."""
         check_capture(self.pipeline.datamanager)
         folder = self.get_base_dir()
         run_folder.take(folder)
-        CONSOLE.log(f"Saving config to: {folder / 'config.yml'}")
         try:
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         except OSError as error:
             fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
+        CONSOLE.print(escape(self.summary()), soft_wrap=True)
+
+    def summary(self) -> str:
+        """Method, capture, length, device and output folder of the run, a line each."""
+        resumed = self.load_dir or self.load_checkpoint
+        lines = {
+            "method": self.method_name,
+            "capture": self.pipeline.datamanager.data,
+            "length": self.length() if resumed is None else f"goes on from {resumed}",
+            "output": f"{self.get_base_dir()} (every option is in its config.yml)",
+        }
+        return "\n".join(f"{name:8} {value}" for name, value in lines.items())
 
     def resolve_length(self, trained_for: int | None = None) -> None:
         """Fill in the length of the run where it was not given.
@@ -98,14 +116,13 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.steps_per_save is None:
             self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
 
-    def announcement(self) -> str:
-        """What to tell the user about the length of the run."""
-        text = f"Training for {self.max_num_iterations:,} steps on {self.machine.device_type}."
+    def length(self) -> str:
+        """The number of steps and the device, with the reason where the run is shorter than on a GPU."""
+        text = f"{self.max_num_iterations:,} steps on {self.machine.device_type}"
         short = self.max_num_iterations == self.default_iterations_cpu != self.default_iterations
         if self.machine.device_type == "cpu" and short:
             why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"
-            text += f" This is the short schedule ({why}); for the full one: --max-num-iterations "
-            text += str(self.default_iterations)
+            text += f", the short schedule ({why}); for the full one: --max-num-iterations {self.default_iterations}"
         return text
 
     def _make_paths_absolute(self) -> None:
@@ -127,11 +144,13 @@ class BitymiTrainerConfig(TrainerConfig):
         nerfstudio's tools ask here before they build the model, so this is also where a bundle or a run that was moved
         is found, or one that is used from another folder than it was trained in.
         """
-        model = self.pipeline.model
+        model, evaluated = self.pipeline.model, folder_being_evaluated()
+        if evaluated is not None:
+            adopt_viewer(self)
         if isinstance(model, BakedModelConfig):
             model.bundle = find_bundle(model.bundle)
             return stub_checkpoint_dir(model.bundle)
-        folder, evaluated = super().get_checkpoint_dir(), folder_being_evaluated()
+        folder = super().get_checkpoint_dir()
         if evaluated is not None:
             if (evaluated / self.relative_model_dir).is_dir():
                 folder = evaluated / self.relative_model_dir
@@ -158,7 +177,7 @@ class BitymiAdamConfig(OptimizerConfig):
 
 
 def optimizers(options: AdamConfig) -> dict[str, Any]:
-    """nerfstudio's optimiser dictionary: one Adam a parameter group, no scheduler (the model sets the rates)."""
+    """nerfstudio's optimiser dictionary: one Adam per parameter group, no scheduler (the model sets the rates)."""
 
     def adam(group: str) -> BitymiAdamConfig:
         betas = options.field_betas if group.startswith("field") else options.betas
@@ -197,7 +216,9 @@ def trainer_config(preset: Preset) -> BitymiTrainerConfig:
             ),
         ),
         optimizers=optimizers(preset.optimizer),
-        viewer=ViewerConfig(quit_on_train_completion=trainer.quit_on_train_completion),
+        # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
+        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=trainer.quit_on_train_completion),
         vis=trainer.vis,  # type: ignore[arg-type]
     )
 

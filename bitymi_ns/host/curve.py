@@ -1,4 +1,4 @@
-"""The training curve: quality against time, one JSON object a line, written while a run goes on."""
+"""The training curve: quality against time, one JSON object per line, written while a run goes on."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class HeldOut:
         return statistics.fmean(values)
 
     def render(self, setting: Setting, repeats: int) -> tuple[list[Tensor], float, float]:
-        """Images [H, W, 3] in [0, 1], milliseconds and CPU milliseconds a view (medians of repeats, mean of views)."""
+        """Images [H, W, 3] in [0, 1], wall and CPU milliseconds per view (medians of repeats, mean of views)."""
         images, wall, cpu = [], [], []
         for camera in self.cameras:
             images.append(setting.render(camera).clamp(0.0, 1.0).cpu())

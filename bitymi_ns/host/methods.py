@@ -1,4 +1,4 @@
-"""Entry points of nerfstudio's method registry (pyproject.toml), one name a method.
+"""Entry points of nerfstudio's method registry (pyproject.toml), one name per method.
 
 nerfstudio loads these names without any error handling, from every ns-* command: an exception here would take all of
 its methods down. So nothing here raises; a method that cannot be set up is registered under its name and says why when

@@ -20,7 +20,7 @@ LPIPS_TIMEOUT = 30.0
 """Seconds to wait for the server that has the weights of LPIPS."""
 
 _lpips: list[Any] = []
-"""Empty, or holding the network, or None when it cannot be had: tried once a process."""
+"""Empty, or holding the network, or None when it cannot be had: tried once per process."""
 _flip_missing: list[bool] = []
 
 
@@ -67,7 +67,7 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
 
 
 def lpips(image: Tensor, reference: Tensor) -> float | None:
-    """LPIPS with AlexNet; None when the weights cannot be had (one warning a process says why)."""
+    """LPIPS with AlexNet; None when the weights cannot be had (one warning per process says why)."""
     if not _lpips:
         _lpips.append(_build_lpips())
     network = _lpips[0]

@@ -7,8 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
@@ -22,11 +20,10 @@ from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.host.target import see_writable
 from bitymi_ns.ops import composite
+from bitymi_ns.report.views import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.train.views import as_float, over_background
 
-ERROR_SCALE = 0.25
-"""Error at which the error map ends: mean absolute difference of the three colours."""
 OVERDRAW_SCALE = 64
 """Blended surfels at which the overdraw map ends: the same in every picture, so that runs compare."""
 RESIDUAL_GAIN = 4.0
@@ -36,7 +33,7 @@ FILE = "pictures.json"
 KINDS = {
     "photo": "photograph",
     "final": "render",
-    "error": f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)",
+    "error": ERROR_CAPTION,
     "view_color": "view colour alone (f_view)",
     "residual_positive": f"positive residual, x{RESIDUAL_GAIN:g}",
     "residual_negative": f"negative residual, x{RESIDUAL_GAIN:g}",
@@ -45,10 +42,9 @@ KINDS = {
 """Pictures of a view in order, with their captions."""
 
 
-def heat(values: Tensor, scale: float, name: str) -> Tensor:
-    """[H, W] or [H, W, 1] values as colours [H, W, 3] of a colour map that ends at `scale`."""
-    unit = (values.reshape(*values.shape[:2]).float() / scale).clamp(0.0, 1.0).cpu().numpy()
-    return torch.from_numpy(matplotlib.colormaps[name](unit)[..., :3].astype(np.float32))
+def heat_map(values: Tensor, scale: float) -> Tensor:
+    """[H, W] or [H, W, 1] values as colours [H, W, 3]: black at 0, yellow at `scale` and above."""
+    return torch.from_numpy(heat(values.reshape(*values.shape[:2]).float().cpu().numpy(), scale))
 
 
 @torch.no_grad()
@@ -84,13 +80,13 @@ def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> d
     pictures = {
         "photo": photo,
         "final": final,
-        "error": heat((final - photo).abs().mean(-1), ERROR_SCALE, "inferno"),
+        "error": heat_map((final - photo).abs().mean(-1), ERROR_SCALE),
     }
     if scene.field is not None:
         pictures["view_color"] = scene.render(camera, background, "off").rgb
         positive, negative = residual_parts(scene, output)
         pictures |= {"residual_positive": RESIDUAL_GAIN * positive, "residual_negative": RESIDUAL_GAIN * negative}
-    pictures["overdraw"] = heat(output.overdraw, OVERDRAW_SCALE, "inferno")
+    pictures["overdraw"] = heat_map(output.overdraw, OVERDRAW_SCALE)
     return pictures
 
 

@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from bitymi_ns import files
 from bitymi_ns.host import checkpoints, run_folder
 from bitymi_ns.host.errors import fail
+from bitymi_ns.host.quiet import quiet_host, step_bar
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the convention of shells."""
@@ -28,17 +29,25 @@ class _StopAfterStep(Exception):
 class BitymiTrainer(Trainer):
     """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        with quiet_host():
+            super().__init__(*args, **kwargs)
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         self._stop_requested = False
         try:
-            super().setup(test_mode)
+            with quiet_host():
+                super().setup(test_mode)
         except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
+        for line in getattr(self.viewer_state, "viewer_info", []):
+            CONSOLE.print(line, soft_wrap=True)
         # after all other callbacks of a step: the state is then complete and can be saved
-        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._stop_if_asked))
+        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
 
-    def _stop_if_asked(self, step: int) -> None:
+    def _end_of_step(self, step: int) -> None:
+        self._show_step(step)
         if self._stop_requested:
             raise _StopAfterStep
 
@@ -83,11 +92,13 @@ class BitymiTrainer(Trainer):
             return
         # of every parameter a checkpoint holds the value and Adam's two moments
         run_folder.check_space(self.base_dir, 3 * sum(p.nbytes for p in self.pipeline.parameters() if p.requires_grad))
-        CONSOLE.print(f"[bold yellow]{self.config.announcement()}", soft_wrap=True)
+        if self._start_step > 0:
+            CONSOLE.print(f"{self.config.length()}, {total - self._start_step:,} of them left", soft_wrap=True)
         restore_handler = self._catch_interrupt()
         self.config.max_num_iterations = total - self._start_step
         try:
-            super().train()
+            with step_bar(self._start_step, total) as self._show_step:
+                super().train()
         except _StopAfterStep:
             self.save_checkpoint(self.step)
             self._report_interruption()

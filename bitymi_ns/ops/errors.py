@@ -19,7 +19,7 @@ class TooManyFragments(RuntimeError):
             size: bytes a fragment in the list.
         """
         super().__init__(
-            f"the view has {count:,} fragments, {count / (width * height):.0f} a pixel; their list needs "
+            f"the view has {count:,} fragments, {count / (width * height):.0f} per pixel; their list needs "
             f"{count * size / 2**30:.2f} GiB, and there is room for {most:,}: render a smaller image or use fewer "
             "surfels"
         )

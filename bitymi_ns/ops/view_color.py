@@ -69,9 +69,9 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
     if kind == "sh" and terms not in (1, 4, 9, 16):
         raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
     if kind == "sv" and terms < 1:
-        raise ValueError("Spherical Voronoi colours need at least one site a surfel")
+        raise ValueError("Spherical Voronoi colours need at least one site per surfel")
     if terms > MAX_TERMS:
-        raise ValueError(f"at most {MAX_TERMS} sites or lobes a surfel, not {terms}")
+        raise ValueError(f"at most {MAX_TERMS} sites or lobes per surfel, not {terms}")
     return terms
 
 

@@ -17,6 +17,7 @@ from bitymi_ns.report.paper import paper_tables, wanted
 from bitymi_ns.report.plots import draw_plots, is_plot_name
 from bitymi_ns.report.records import Records, ReportError, over_seeds
 from bitymi_ns.report.tables import everything_table, quality_tables, summary, training_table
+from bitymi_ns.report.views import compare_views
 
 
 def _counted(number: int, noun: str) -> str:
@@ -31,7 +32,8 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
         title: heading of the page.
         published: show the paper's tables even when the input has no scene of its data sets.
     """
-    gallery, notes = make_gallery(records.images)
+    views, others, view_notes = compare_views(records.images)
+    gallery, notes = make_gallery(others)
     worst, more_notes = make_worst(records.worst)
     counts = [
         _counted(number, noun)
@@ -56,9 +58,10 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
         plots=draw_plots(records),
         knobs=knob_tables(records.knobs),
         paper=paper_tables(records, merged) if published or wanted(records) else [],
+        views=views,
         worst=worst,
         gallery=gallery,
-        notes=[*records.notes, *notes, *more_notes],
+        notes=[*records.notes, *view_notes, *notes, *more_notes],
     )
 
 

@@ -131,7 +131,7 @@ def read_cells(numbered: Sequence[tuple[int, Any]], path: Path, records: Records
     latest: dict[str, tuple[int, dict[str, Any]]] = {}
     for number, value in numbered:
         if not is_cell(value):
-            raise ReportError(f"{path}, line {number}, is no cell of a benchmark: it has no key and value objects.")
+            raise ReportError(f"{path}, line {number}, is not a cell of a benchmark: it has no key and value objects.")
         name = _identity(value["key"], *_NAMES)
         latest.pop(name, None)
         latest[name] = (number, value)

@@ -1,4 +1,4 @@
-"""How a plot is drawn: one panel a scene, in light and dark, as PNG bytes."""
+"""How a plot is drawn: one panel per scene, in light and dark, as PNG bytes."""
 
 from __future__ import annotations
 
@@ -57,6 +57,8 @@ class Sheet:
     y: str
     scenes: tuple[str, ...]
     draw: Callable[[Axes, str, Theme], None]
+    points: int
+    """Points of the fullest panel or, of curves, of the longest line."""
     legend: tuple[tuple[str, dict], ...]
     """Entries: text and Line2D properties; an int as `color` is a number of the theme's line colours."""
 
@@ -92,7 +94,7 @@ def _style(axes: Axes, theme: Theme) -> None:
 
 
 def _png(sheet: Sheet, theme: Theme) -> bytes:
-    """Draw a sheet: at most three panels a row, one legend below."""
+    """Draw a sheet: at most three panels per row, one legend below."""
     columns = min(3, len(sheet.scenes))
     rows = math.ceil(len(sheet.scenes) / columns)
     width = 6.4 if columns == 1 else 3.5 * columns

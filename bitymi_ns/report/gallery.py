@@ -43,17 +43,21 @@ class Group:
     left_out: int
 
 
-def encode(path: Path, caption: str) -> Picture:
-    """Read an image, scale it down if it is wide, and encode it.
+def open_image(path: Path) -> Image.Image:
+    """Read an image as RGB, or as RGBA where it has transparency.
 
     Raises:
         OSError: the file is not an image that can be read.
     """
     try:
         with Image.open(path) as opened:
-            image = opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
+            return opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
     except (SyntaxError, ValueError, Image.DecompressionBombError) as error:  # what Pillow raises on broken PNG chunks
         raise OSError(str(error)) from error
+
+
+def encode(image: Image.Image, caption: str) -> Picture:
+    """Scale an image down if it is wide, and encode it."""
     if image.width > MAX_WIDTH:
         image = image.resize((MAX_WIDTH, max(1, round(image.height * MAX_WIDTH / image.width))), Image.LANCZOS)
     buffer, mime = io.BytesIO(), "image/png"
@@ -82,7 +86,7 @@ def _chosen(paths: list[Path]) -> list[Path]:
     return single[:VIEWS_PER_FOLDER] + sorted((p for p in numbers if numbers[p] in kept), key=lambda p: (numbers[p], p))
 
 
-def _titles(folders: list[Path]) -> dict[Path, str]:
+def titles(folders: list[Path]) -> dict[Path, str]:
     """Folder paths without what all of them share."""
     if len(folders) < 2:
         return {folder: folder.name for folder in folders}
@@ -103,7 +107,7 @@ def make_gallery(images: list[Path]) -> tuple[list[Group], list[str]]:
     folders: dict[Path, list[Path]] = {}
     for path in sorted(p.resolve() for p in images):
         folders.setdefault(path.parent, []).append(path)
-    titles = _titles(list(folders))
+    names = titles(list(folders))
     groups, notes, total = [], [], 0
     for folder, paths in folders.items():
         pictures = []
@@ -113,23 +117,23 @@ def make_gallery(images: list[Path]) -> tuple[list[Group], list[str]]:
             continue
         for path in chosen:
             try:
-                pictures.append(encode(path, _caption(path)))
+                pictures.append(encode(open_image(path), _caption(path)))
             except OSError as error:
                 notes.append(f"{path} is not an image that can be read: {error}.")
         if pictures:
-            groups.append(Group(titles[folder], tuple(pictures), len(paths) - len(chosen)))
+            groups.append(Group(names[folder], tuple(pictures), len(paths) - len(chosen)))
             total += len(pictures)
     return groups, notes
 
 
 def make_worst(views: list[WorstView]) -> tuple[list[Group], list[str]]:
-    """Encode the pictures of the worst views, a group a view; and a note for each that could not be read."""
+    """Encode the pictures of the worst views, one group per view; and a note for each that could not be read."""
     groups, notes = [], []
     for view in views[:MAX_WORST]:
         pictures = []
         for caption, path in view.pictures:
             try:
-                pictures.append(encode(path, caption))
+                pictures.append(encode(open_image(path), caption))
             except OSError as error:
                 notes.append(f"{path} is not an image that can be read: {error}.")
         if pictures:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from matplotlib.axes import Axes
 
 from bitymi_ns.report.drawing import Sheet, Theme, line_color, log_when_wide
@@ -31,14 +33,14 @@ def _by_bytes(points: list[KnobPoint]) -> bool:
 
 
 def knob_sheets(points: list[KnobPoint]) -> list[Sheet]:
-    """One sheet a knob: mean and largest error against CPU milliseconds a view, or megabytes where the knob changes
-    them; a panel a run."""
+    """One sheet per knob: mean and largest error against CPU milliseconds per view, or megabytes where the knob changes
+    them; one panel per run."""
     return [_sheet(knob, [p for p in points if p.knob == knob]) for knob in dict.fromkeys(p.knob for p in points)]
 
 
 def _sheet(knob: str, points: list[KnobPoint]) -> Sheet:
     by_bytes = _by_bytes(points)
-    key, scale, x = ("bytes", 1e-6, "atlas MB") if by_bytes else ("cpu_ms", 1.0, "CPU milliseconds a view")
+    key, scale, x = ("bytes", 1e-6, "atlas MB") if by_bytes else ("cpu_ms", 1.0, "CPU milliseconds per view")
     renderers = sorted({p.renderer for p in points if not p.exact})
     colors = {renderer: i for i, renderer in enumerate(renderers)}
 
@@ -80,11 +82,12 @@ def _sheet(knob: str, points: list[KnobPoint]) -> Sheet:
     legend.append(("default", {"marker": "o", "ms": 9, "linestyle": "", "hollow": True}))
     scenes = tuple(dict.fromkeys(map(_panel_name, points)))
     title = f"{TITLES.get(knob, knob)}: error in 8-bit steps against {'size' if by_bytes else 'time'}"
-    return Sheet(f"knob_{knob}", title, KNOBS, x, "error (8-bit steps)", scenes, panel, tuple(legend))
+    most = max(Counter(map(_panel_name, points)).values())
+    return Sheet(f"knob_{knob}", title, KNOBS, x, "error (8-bit steps)", scenes, panel, most, tuple(legend))
 
 
 def knob_tables(points: list[KnobPoint]) -> list[Table]:
-    """One table a knob; the error is against its exact setting."""
+    """One table per knob; the error is against its exact setting."""
     tables = []
     header = ("Setting", "mean steps", "max steps", "dB to exact", "PSNR", "ms", "CPU ms", "MB")
     columns = (

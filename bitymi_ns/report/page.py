@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from html import escape
 
 from bitymi_ns.report.drawing import Plot
-from bitymi_ns.report.gallery import Group
+from bitymi_ns.report.gallery import Group, Picture
 from bitymi_ns.report.knob_plots import KNOBS
+from bitymi_ns.report.plots import CURVES
 from bitymi_ns.report.tables import NOTES, Table, to_html, to_markdown
+from bitymi_ns.report.views import ERROR_CAPTION, ComparedSet
 
 GENERATOR = '<meta name="generator" content="bitymi report">'
 """Marks a page as ours, so that it may be replaced."""
@@ -35,10 +37,13 @@ table.dense { font-size: .8rem; } table.dense th, table.dense td { padding: .25r
 td b { color: var(--best); }
 .plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 30rem), 1fr)); gap: 1.5rem; }
 .plots.full { grid-template-columns: 1fr; }
+.views { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(46%, 17rem), 1fr)); gap: .75rem; }
+.views figure + figure { margin-top: .75rem; }
+@media (max-width: 45rem) { .views { grid-template-columns: 1fr 1fr; } .views > :first-child { grid-column: 1 / -1; } }
 .pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 17rem), 1fr)); gap: .75rem; }
 .pictures.broad { grid-template-columns: repeat(auto-fill, minmax(min(100%, 30rem), 1fr)); }
 figure { margin: 0; } img { display: block; width: 100%; height: auto; border-radius: 4px; }
-.pictures img { background: repeating-conic-gradient(#bbb 0 25%, #ddd 0 50%) 0 0 / 16px 16px; }
+.pictures img, .views img { background: repeating-conic-gradient(#bbb 0 25%, #ddd 0 50%) 0 0 / 16px 16px; }
 figcaption { color: var(--soft); font-size: .85rem; margin-top: .25rem; }
 summary { cursor: pointer; color: var(--soft); } details { margin: 2rem 0 0; }
 """
@@ -56,8 +61,9 @@ class Content:
         plots: drawn plots.
         knobs: tables of the quality knobs.
         paper: the paper's tables, with ours.
+        views: held-out views, photograph, renders and errors; they come first.
         worst: the worst views with their errors and decomposition.
-        gallery: rendered images.
+        gallery: other images.
         notes: what was skipped and why.
     """
 
@@ -70,6 +76,7 @@ class Content:
     plots: list[Plot]
     knobs: list[Table]
     paper: list[Table]
+    views: list[ComparedSet]
     worst: list[Group]
     gallery: list[Group]
     notes: list[str]
@@ -88,21 +95,36 @@ def _plot(plot: Plot) -> str:
     )
 
 
-def _pictures(group: Group) -> str:
-    figures = "\n".join(
+def _figure(p: Picture) -> str:
+    return (
         f'<figure><img loading="lazy" width="{p.width}" height="{p.height}" src="{_uri(p.mime, p.data)}" '
         f'alt="{escape(p.caption)}"><figcaption>{escape(p.caption)}</figcaption></figure>'
-        for p in group.pictures
     )
-    broad = " broad" if any(p.width > 2.2 * p.height for p in group.pictures) else ""  # photograph beside rendering
+
+
+def _pictures(group: Group) -> str:
+    figures = "\n".join(map(_figure, group.pictures))
+    broad = " broad" if any(p.width > 2.2 * p.height for p in group.pictures) else ""
     more = f' <span class="soft">and {group.left_out} more</span>' if group.left_out else ""
     return f'<h3>{escape(group.title)}{more}</h3>\n<div class="pictures{broad}">\n{figures}\n</div>'
+
+
+def _views(compared: ComparedSet, named: bool) -> list[str]:
+    """A row per view: the photograph, then the renders with their errors below; with one folder the error beside."""
+    name = f"{compared.title}: " if named else ""
+    parts = []
+    for view in compared.views:
+        columns = view.columns if len(view.columns) > 2 else [(p,) for column in view.columns for p in column]
+        stacks = "\n".join(f"<div>{''.join(map(_figure, column))}</div>" for column in columns)
+        parts.append(f'<h3>{escape(name + view.title)}</h3>\n<div class="views">\n{stacks}\n</div>')
+    return parts
 
 
 def _list(lines: list[str]) -> str:
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
+VIEWS_NOTE = f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}."
 PAPER_NOTE = (
     "Figures in the published rows are those that the paper prints: of other hardware, other implementations and, for "
     "most methods, other publications. They stand beside ours for orientation; speeds cannot be compared."
@@ -110,7 +132,7 @@ PAPER_NOTE = (
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
 KNOB_NOTE = (
     "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views; "
-    "the thin line is one step. Milliseconds are of the renderer named, a view at full size."
+    "the thin line is one step. Milliseconds are per view at full size, of the renderer named."
 )
 
 
@@ -132,14 +154,18 @@ def to_page(content: Content) -> str:
     parts = [f"<h1>{escape(content.title)}</h1>", f'<p class="soft">{escape(content.intro)}</p>']
     if content.summary:
         parts.append(_list(content.summary))
+    if content.views:
+        parts += ["<h2>Held-out views</h2>", f'<p class="soft">{escape(VIEWS_NOTE)}</p>']
+    for compared in content.views:
+        parts += _views(compared, named=len(content.views) > 1)
     if content.quality:
         parts += ["<h2>Quality and speed</h2>", *_tables(content.quality), f'<p class="soft">{escape(NOTES)}</p>']
     if content.training:
         parts += ["<h2>Training</h2>", to_html(content.training)]
     for name, plots in _sections(content.plots):
-        note = KNOB_NOTE if name == KNOBS else TRADE_OFF
+        note = KNOB_NOTE if name == KNOBS else TRADE_OFF if any(plot.name not in CURVES for plot in plots) else ""
         full = " full" if any(plot.panels > 1 for plot in plots) else ""
-        parts += [f"<h2>{escape(name)}</h2>", f'<p class="soft">{escape(note)}</p>']
+        parts += [f"<h2>{escape(name)}</h2>", *([f'<p class="soft">{escape(note)}</p>'] if note else [])]
         parts += [f'<div class="plots{full}">', *map(_plot, plots), "</div>"]
         parts += _tables(content.knobs) if name == KNOBS else []
     if content.paper:
@@ -151,7 +177,7 @@ def to_page(content: Content) -> str:
     if content.worst:
         parts += ["<h2>Worst views</h2>", *map(_pictures, content.worst)]
     if content.gallery:
-        parts += ["<h2>Rendered views</h2>", *map(_pictures, content.gallery)]
+        parts += ["<h2>Other pictures</h2>", *map(_pictures, content.gallery)]
     if content.everything:
         title = escape(content.everything.title)
         parts.append(f"<details><summary>{title}</summary>{to_html(content.everything)}</details>")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,9 +14,13 @@ from bitymi_ns.report.pareto import front
 from bitymi_ns.report.records import Curve, Evaluation, Records, neural_parent
 
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
-"""Marks of baked evaluations, one a format."""
+"""Marks of baked evaluations, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
 """Sections of the page."""
+CURVES = ("psnr_seconds", "psnr_cpu_seconds", "surfels_steps")
+"""Names of the plots of training curves, which have no Pareto front."""
+MIN_POINTS = 3
+"""Plots of fewer points are left out: the tables say the same."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
     key, what = ("bundle_bytes", "bundle") if whole else ("atlas_bytes", "atlas")
     return (
         Cost("train_seconds", "training seconds", "training seconds", TRAINING, _positive("train_seconds"), False),
-        Cost("render_ms", "render milliseconds", "milliseconds a view", RENDERING, _positive("render_ms"), True),
+        Cost("render_ms", "render milliseconds", "milliseconds per view", RENDERING, _positive("render_ms"), True),
         Cost("bytes", f"{what} size", f"{what} MB", SIZE, _positive(key, 1e-6), False),
     )
 
@@ -82,7 +87,8 @@ def _curve_sheet(name: str, title: str, x: str, y: str, keys: tuple[str, str], c
 
     labels = sorted({c.label for c in drawn})
     legend = tuple((label, {"color": colors[label], "linewidth": 2}) for label in labels)
-    return Sheet(name, title, TRAINING, x, y, tuple(sorted({c.scene for c in drawn})), panel, legend)
+    return Sheet(name, title, TRAINING, x, y, tuple(sorted({c.scene for c in drawn})), panel,
+                 max(len(c.series(*keys)[0]) for c in drawn), legend)  # fmt: skip
 
 
 def _scatter_sheet(metric: Metric, cost: Cost, evaluations: list[Evaluation], colors: dict[str, int]) -> Sheet | None:
@@ -130,7 +136,8 @@ def _scatter_sheet(metric: Metric, cost: Cost, evaluations: list[Evaluation], co
         legend.append(("Pareto front", {"linestyle": (0, (4, 3)), "linewidth": 0.9}))
     scenes = tuple(sorted({e.scene for e in drawn}))
     name, title = f"{metric.key}_{cost.name}", f"{metric.title.split()[0]} against {cost.title}"
-    return Sheet(name, title, cost.section, cost.label, metric.title, scenes, panel, tuple(legend))
+    most = max(Counter(e.scene for e in drawn).values())
+    return Sheet(name, title, cost.section, cost.label, metric.title, scenes, panel, most, tuple(legend))
 
 
 def _at_least(axes: Axes, values: list[float], span: float) -> None:
@@ -147,7 +154,7 @@ def _variant(row: Evaluation) -> str:
 
 
 def draw_plots(records: Records) -> list[Plot]:
-    """Every plot for which there are data."""
+    """Every plot for which there are enough data."""
     rows, curves = records.evaluations, records.curves
     names = dict.fromkeys([*sorted({e.method for e in rows}), *sorted({c.label for c in curves})])
     colors = {name: i for i, name in enumerate(names)}
@@ -161,11 +168,11 @@ def draw_plots(records: Records) -> list[Plot]:
                      ("step", "surfels"), curves, colors),
     ]  # fmt: skip
     sheets += [_scatter_sheet(metric, cost, rows, colors) for cost in costs(rows) for metric in METRICS]
-    return [draw(sheet) for sheet in [*sheets, *knob_sheets(records.knobs)] if sheet is not None]
+    sheets += knob_sheets(records.knobs)
+    return [draw(sheet) for sheet in sheets if sheet is not None and sheet.points >= MIN_POINTS]
 
 
 def is_plot_name(name: str) -> bool:
     """Whether `draw_plots` could have given a plot this name."""
-    known = {"psnr_seconds", "psnr_cpu_seconds", "surfels_steps"}
-    known |= {f"{metric.key}_{cost.name}" for metric in METRICS for cost in costs([])}
+    known = set(CURVES) | {f"{metric.key}_{cost.name}" for metric in METRICS for cost in costs([])}
     return name in known or name.startswith("knob_")

@@ -185,6 +185,11 @@ def is_point(data: Any) -> bool:
     return isinstance(data, dict) and "step" in finite_numbers(data)
 
 
+def is_bundle_name(name: str) -> bool:
+    """Whether a method, folder or path is called after a bundle."""
+    return _BUNDLE.search(name.lower()) is not None
+
+
 def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     """Build an evaluation from ns-eval's JSON object."""
     results = finite_numbers(data["results"])
@@ -192,8 +197,7 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     name = str(data.get("method_name") or "unnamed method")
     # Of the checkpoint only .../<folder>/<folder>/nerfstudio_models/step-*.ckpt counts: not the name of some data set.
     tail = "/".join(Path(checkpoint.replace("\\", "/")).parts[-4:]).lower()
-    named = _BUNDLE.search(name.lower()) or _BUNDLE.search(tail)
-    baked = results.get("atlas_bytes", 0.0) > 0 or bool(named)
+    baked = results.get("atlas_bytes", 0.0) > 0 or is_bundle_name(name) or is_bundle_name(tail)
     method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
     atlas_format = _FORMAT.search(tail) or _FORMAT.search(f"{source.parent.name}/{source.stem}".lower())
     return Evaluation(

@@ -222,7 +222,7 @@ def everything_table(evaluations: list[Evaluation]) -> Table | None:
 
 
 def quality_tables(records: Records) -> list[Table]:
-    """One table a scene in the paper's layout, and the means when there are several scenes."""
+    """One table per scene in the paper's layout, and the means when there are several scenes."""
     evaluations = records.evaluations
     columns = _numbers(evaluations, evaluations)
     scenes = sorted({row.scene for row in evaluations})
@@ -242,7 +242,9 @@ def summary(records: Records, limit: int = 8) -> list[str]:
         parts = [f"{parent.results['psnr']:.2f} dB neural, {row.results['psnr']:.2f} dB baked ({signed(delta)})"]
         before, after = parent.get("render_ms"), row.get("render_ms")
         if before and after:
-            parts.append(f"{significant(before)} ms to {significant(after)} ms a view ({before / after:.1f}× as fast)")
+            parts.append(
+                f"{significant(before)} ms to {significant(after)} ms per view ({before / after:.1f}× as fast)"
+            )
         megabytes = _atlas_mb(row)
         if megabytes:
             parts.append(f"atlas of {significant(megabytes)} MB")

@@ -13,11 +13,11 @@ class SceneConfig:
     view_color: Literal["sv", "sh", "sb", "sg"] = "sv"
     """View colour: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta, sg = spherical Gaussians."""
     sv_sites: int = 7
-    """Number of Spherical Voronoi sites a surfel (the paper's K), 1 to 32."""
+    """Number of Spherical Voronoi sites per surfel (the paper's K), 1 to 32."""
     sh_degree: int = 3
     """Degree of the spherical harmonics, 0 to 3."""
     lobes: int = 2
-    """Number of lobes a surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
+    """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Literal["hash", "none"] = "hash"
     """Residual colour field: hash = multiresolution hash grid and MLP, none = surfels alone."""
     levels: int = 4

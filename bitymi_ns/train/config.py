@@ -24,7 +24,7 @@ class LossConfig:
     falloff_gradient: Literal["full", "beta_only"] = "full"
     """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
     overdraw_weight: float = 0.0
-    """Weight of the loss on the number of fragments a pixel, which fades with the error as the falloff loss does."""
+    """Weight of the loss on the number of fragments per pixel, which fades with the error as the falloff loss does."""
     overdraw_start: int = 12_000
     """First step with the overdraw loss: before, it costs quality."""
     overdraw_stop: int = 27_000
@@ -48,7 +48,7 @@ class DensifyConfig:
     error_threshold: float = 0.1
     """A pixel counts as bad when its min-max normalised error is above this."""
     importance: int = 5
-    """Surfels are densified when their mean count of bad pixels a view is above this."""
+    """Surfels are densified when their mean count of bad pixels per view is above this."""
     grad_threshold: float = 2e-4
     """Clone when the mean gradient of the projected centre (NDC) is at least this."""
     abs_grad_threshold: float = 7e-4

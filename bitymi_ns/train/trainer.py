@@ -274,7 +274,7 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where `state_dict` was taken; the run has the same options, views and length."""
         if state["max_steps"] != self.schedule.max_steps:
-            raise ValueError(f"the run was one of {state['max_steps']} steps, this is one of {self.schedule.max_steps}")
+            raise ValueError(f"the run had {state['max_steps']} steps, this one has {self.schedule.max_steps}")
         self.scene.resize(len(state["scene"]["surfels.means"]))
         self.scene.load_state_dict(state["scene"])
         for name, optimizer in self.optimizers.items():

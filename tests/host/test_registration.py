@@ -76,9 +76,9 @@ def test_a_cpu_gets_a_short_run_and_says_so() -> None:
     run.machine.device_type = "cpu"
     run.set_timestamp()
     assert run.max_num_iterations == 3000 and run.steps_per_save == 600
-    assert "3,000 steps on cpu. This is the short schedule" in run.announcement()
+    assert "3,000 steps on cpu, the short schedule" in run.length()
     run.max_num_iterations = 500
-    assert run.announcement() == "Training for 500 steps on cpu."
+    assert run.length() == "500 steps on cpu"
 
 
 def test_a_gpu_gets_the_full_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,10 +33,10 @@ def evaluation(scene: str, method: str, checkpoint: str, **results: float) -> di
     }
 
 
-def view(path: Path, index: int, noise: float) -> None:
+def view(path: Path, index: int, noise: float, phase: float) -> None:
     """A photograph beside its rendering, as the method's `img` is written."""
     y, x = np.mgrid[0:90, 0:160] / 90.0
-    photo = np.stack([x / 1.8, 0.5 + 0.5 * np.sin(9 * x + index), 1 - y], -1)
+    photo = np.stack([x / 1.8, 0.5 + 0.5 * np.sin(9 * x + index + phase), 1 - y], -1)
     rendered = photo + noise * np.random.default_rng(index).normal(size=photo.shape)
     both = np.concatenate([photo, rendered], 1).clip(0, 1)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -88,9 +88,10 @@ def write_results(root: Path) -> Path:
             )
             (evals / f"{method}-{name}.json").write_text(json.dumps(baked, indent=2))
         if method == "bitymi":
+            phase = 0.5 * list(RUNS).index((scene, method))  # other photographs in every scene
             for index in range(7):
-                view(root / "renders" / scene / "neural" / f"eval_img_{index:04d}.png", index, 0.04)
-                view(root / "renders" / scene / "bc7" / f"eval_img_{index:04d}.png", index, 0.05)
+                view(root / "renders" / scene / "neural" / f"eval_img_{index:04d}.png", index, 0.04, phase)
+                view(root / "renders" / scene / "bc7" / f"eval_img_{index:04d}.png", index, 0.05, phase)
     (root / "outputs" / "transforms.json").write_text('{"frames": []}')
     return root
 

@@ -33,7 +33,10 @@ def test_full_report(results: Path, tmp_path: Path):
     assert {p.name for p in out.iterdir()} == {"index.html", "report.md", *(f"{name}.png" for name in PLOTS)}
     html, markdown = page.read_text("utf8"), (out / "report.md").read_text("utf8")
     assert "Two &lt;scenes&gt;" in html and not re.search(r"(?:src|srcset|href)=\"(?!data:)", html)
-    assert len(pictures(html)) == 2 * len(PLOTS) + 4 * 4
+    # of two scenes three views: photograph, two renders, two errors
+    assert len(pictures(html)) == 2 * len(PLOTS) + 2 * 3 * 5
+    assert html.index("Worst view of 7") < html.index("Median view of 7") < html.index("Best view of 7")
+    assert html.index("Best view of 7") < html.index("Quality and speed")
     for text in ("27.41", "−0.031", "Pre-baking (neural renderer)", "Mean of 2 scenes", "18,942"):
         assert text in html and text in markdown
     assert "LPIPS" not in html and "nan" not in markdown.lower()
@@ -53,7 +56,15 @@ def test_same_input_gives_the_same_bytes(results: Path, tmp_path: Path):
 def test_one_evaluation_is_enough(eval_json, tmp_path: Path):
     page = build([eval_json(psnr=20.0, render_ms=12.0)], tmp_path / "report")
     assert "20.00" in page.read_text("utf8")
-    assert (tmp_path / "report" / "psnr_render_ms.png").exists()
+
+
+@pytest.mark.parametrize(("count", "drawn"), [(2, set()), (3, {"psnr_render_ms.png"})])
+def test_plots_of_one_or_two_points_are_left_out(eval_json, tmp_path: Path, count: int, drawn: set[str]):
+    rows = [eval_json(f"{i}.json", method=f"m{i}", psnr=20.0 + i, render_ms=12.0 + i) for i in range(count)]
+    curve = tmp_path / "curve.jsonl"
+    curve.write_text("".join(json.dumps({"step": i, "seconds": i, "psnr": 20.0}) + "\n" for i in range(count)))
+    build([*rows, curve], tmp_path / "report")
+    assert {p.name for p in (tmp_path / "report").glob("*.png")} == drawn | ({"psnr_seconds.png"} if drawn else set())
 
 
 def test_curve_alone_without_psnr(tmp_path: Path):
@@ -151,15 +162,15 @@ def test_full_disk_leaves_the_older_report(eval_json, tmp_path: Path, monkeypatc
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".report")]
 
 
-def test_images_keep_their_views_and_sizes(eval_json, tmp_path: Path):
+def test_other_images_keep_their_names_and_sizes(eval_json, tmp_path: Path):
     folder = tmp_path / "renders"
     folder.mkdir()
     noise = Image.effect_noise((1600, 900), 80).convert("RGB")
     for i in range(5):
-        noise.save(folder / f"eval_img_{i:04d}.png")
+        noise.save(folder / f"eval_depth_{i:04d}.png")
     Image.new("RGBA", (32, 16), (255, 0, 0, 128)).save(folder / "preview.png")
     Image.new("RGB", (8, 8)).save(folder / "photograph.png")
     html = build([eval_json(psnr=20.0), folder], tmp_path / "report").read_text("utf8")
     sizes = [image.size for image in pictures(html)]
     assert sizes == [(32, 16)] + [(1200, 675)] * 4
-    assert "view 4" in html and len(html) < 8_000_000
+    assert "view 4, depth" in html and len(html) < 8_000_000

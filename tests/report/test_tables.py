@@ -55,7 +55,7 @@ def test_summary_says_what_baking_changed():
     ]
     (line,) = summary(Records(rows))
     assert "27.00 dB neural, 26.99 dB baked (−0.010)" in line
-    assert "50.0 ms to 10.0 ms a view (5.0× as fast)" in line and "3.00 MB" in line
+    assert "50.0 ms to 10.0 ms per view (5.0× as fast)" in line and "3.00 MB" in line
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,77 @@
+"""What nerfstudio and its viewer say about themselves, kept off the console while one of our runs starts."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rich
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.panel import Panel
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+REMARKS = re.compile(
+    r"Saving config to|Saving checkpoints to"  # our summary of the run says where
+    r"|Mixed precision is disabled|Auto image downscale factor of 1$"
+    r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
+    r"|\[bold yellow\]Disabled comet|disabled local writer"
+)
+"""Beginnings of the lines that are dropped. Everything else is shown: it may be about the capture."""
+
+
+@contextmanager
+def quiet_host() -> Iterator[None]:
+    """Drop these lines, the box in which the viewer's server states its address, and nerfstudio's warnings that it was
+    written for an older torch. Afterwards all is as before: other methods are not concerned."""
+
+    def remark(said: Any) -> bool:
+        return isinstance(said, str) and REMARKS.match(said) is not None
+
+    def box(said: Any) -> bool:
+        return isinstance(said, Panel) and "viser" in str(said.title)
+
+    with (
+        warnings.catch_warnings(),
+        _dropping(CONSOLE, "print", remark),
+        _dropping(CONSOLE, "log", remark, _stack_offset=2),  # it states its caller
+        _dropping(rich, "print", box),
+    ):
+        warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
+        yield
+
+
+@contextmanager
+def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: Any) -> Iterator[None]:
+    """Have the function `name` of `owner` do nothing where `dropped` holds for its first argument."""
+    write = getattr(owner, name)
+
+    def filtered(*said: Any, **options: Any) -> None:
+        if not (said and dropped(said[0])):
+            write(*said, **{**always, **options})
+
+    setattr(owner, name, filtered)
+    try:
+        yield
+    finally:
+        setattr(owner, name, write)
+
+
+@contextmanager
+def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar below whatever else is printed; nothing where the output is not a terminal.
+
+    Args:
+        done: steps that are done already.
+        total: steps in all.
+
+    Returns:
+        What is to be called with the index of every finished step.
+    """
+    columns = (TextColumn("step"), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
+    terminal = CONSOLE.is_terminal
+    with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=not terminal) as bar:
+        task = bar.add_task("", completed=done, total=total)
+        yield lambda step: bar.update(task, completed=step + 1)

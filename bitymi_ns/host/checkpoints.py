@@ -135,7 +135,8 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
     if len(set(rows.values())) > 1:
         counts = ", ".join(f"{count} {name.rpartition('.')[2]}" for name, count in rows.items())
         fail(
-            f"the checkpoint {path} was altered: its parameters differ in their number of surfels ({counts}). Train again."
+            f"the checkpoint {path} was altered: its parameters differ in their number of surfels ({counts}). Train "
+            "again."
         )
 
 

@@ -27,7 +27,6 @@ from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
 from bitymi_ns.host.preset import Preset, load_preset
-from bitymi_ns.host.quiet import quiet_host
 from bitymi_ns.host.trainer import BitymiTrainer
 from bitymi_ns.host.viewer import LOOPBACK, adopt_viewer
 from bitymi_ns.train.config import AdamConfig

@@ -9,7 +9,7 @@
 // multiplied by the sign of n.p, so that W > 0 means "in front".
 #pragma once
 
-#include "core/common.h"
+#include "core/camera.h"
 
 namespace bt {
 
@@ -89,12 +89,13 @@ BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
-// Fills a row of geom and frames; false (and untouched rows) when the surfel is not finite or its centre is nearer than
-// `near` (camera z).
+// Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre is
+// nearer than `near` (camera z).
 template <class S>
-BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
-                   S beta_raw, S near, bool prefilter, S* geom, S* frame) {
-  const Rotation<S> rot = rotation(quat);
+BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, bool prefilter, S* geom, S* frame) {
+  const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
+  const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
+  const Rotation<S> rot = rotation(in.quats + 4 * i);
   const Vec3<S> m = load3(mean);
   const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
   const Vec3<S> p = to_camera(cam, mean);
@@ -128,13 +129,23 @@ BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S*
   return true;
 }
 
-// Gradients of the parameters of one projected surfel; they are written, not added. The slope of a sigmoid is taken
-// from its argument, sigmoid(x) sigmoid(-x): at o -> 1 nothing is left of 1 - o in float32.
+// Gradients of the parameters of surfel i from those of its rows; they are written, not added, and 0 where the camera
+// does not see the surfel. dframe may be null (zero). The slope of a sigmoid is taken from its argument, sigmoid(x)
+// sigmoid(-x): at o -> 1 nothing is left of 1 - o in float32.
 template <class S>
-BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
-                       S beta_raw, const S* geom, const S* dgeom, const S* dframe, S* dmean, S* dquat, S* dlog_scales,
-                       S* dopacity_logit, S* dbeta_raw) {
-  const Rotation<S> rot = rotation(quat);
+BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, const S* geom, const S* dgeom,
+                       const S* dframe, const SurfelGradients<S>& out) {
+  S *dquat = out.quats + 4 * i, *dlog_scales = out.log_scales + 2 * i;
+  if (geom[kZ] == S(0)) {
+    store3(out.means + 3 * i, Vec3<S>{S(0), S(0), S(0)});
+    for (int k = 0; k < 4; ++k) dquat[k] = S(0);
+    dlog_scales[0] = dlog_scales[1] = out.opacity_logits[i] = out.beta_raw[i] = S(0);
+    return;
+  }
+  const S none[kFrame] = {};
+  if (!dframe) dframe = none;
+  const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
+  const Rotation<S> rot = rotation(in.quats + 4 * i);
   const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
   const Vec3<S> p = to_camera(cam, mean);
   const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
@@ -158,18 +169,20 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, cons
   const S darea = dgeom[kArea] * geom[kArea];  // towards log n
   dp.z -= S(2) * iz * darea;
 
-  store3(dmean, rotate_transposed(cam.R, dp) + load3(dframe));
+  const Vec3<S> dmean = rotate_transposed(cam.R, dp) + load3(dframe);
   const Vec3<S> dtu = load3(dframe + 3), dtv = load3(dframe + 6);
   const Vec3<S> gu = rotate_transposed(cam.R, da) + su * dtu;
   const Vec3<S> gv = rotate_transposed(cam.R, db) + sv * dtv;
-  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
   // u1, u2 scale with 1/s_u and the frame with s_u
   const S gsu = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu) + darea;
   const S gsv = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv) + darea;
+  const S dopacity = dgeom[kOpacity] * geom[kOpacity], dbeta = dgeom[kBeta] * geom[kBeta];
+  store3(out.means + 3 * i, dmean);
+  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
   dlog_scales[0] = scale_moves(log_scales[0]) ? gsu : S(0);
   dlog_scales[1] = scale_moves(log_scales[1]) ? gsv : S(0);
-  *dopacity_logit = dgeom[kOpacity] * geom[kOpacity] * sigmoid(-opacity_logit);
-  *dbeta_raw = dgeom[kBeta] * geom[kBeta] * sigmoid(-beta_raw);
+  out.opacity_logits[i] = dopacity * sigmoid(-in.opacity_logits[i]);
+  out.beta_raw[i] = dbeta * sigmoid(-in.beta_raw[i]);
 }
 
 }  // namespace bt

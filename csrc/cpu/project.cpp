@@ -1,8 +1,8 @@
 // Projection of all surfels, tile lists, and the number of threads.
-#include <cmath>
+#include "core/visibility.h"
+
 #include <numeric>
 
-#include "core/bounds.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 
@@ -27,32 +27,8 @@ int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bo
                         S* geom, S* frames, S* radii) {
   std::vector<int64_t> broken(num_threads(), 0);
   parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      S *g = geom + i * kGeom, *f = frames + i * kFrame, *r = radii + 2 * i;
-      r[0] = r[1] = S(0);
-      bool seen = project(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                          in.beta_raw[i], near, prefilter, g, f);
-      if (seen) {
-        const Extent e = extent(g);
-        seen =
-            e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
-        if (seen) {
-          const double most = 1e6;
-          r[0] = S(std::min(most, std::max(e.x1, -e.x0)));
-          r[1] = S(std::min(most, std::max(e.y1, -e.y0)));
-        }
-      } else {
-        bool finite = true;
-        for (int k = 0; k < 3; ++k) finite &= finite_(in.means[3 * i + k]);
-        for (int k = 0; k < 4; ++k) finite &= finite_(in.quats[4 * i + k]);
-        for (int k = 0; k < 2; ++k) finite &= finite_(in.log_scales[2 * i + k]);
-        broken[thread] += !(finite && finite_(in.opacity_logits[i]) && finite_(in.beta_raw[i]));
-      }
-      if (!seen) {
-        std::fill(g, g + kGeom, S(0));
-        std::fill(f, f + kFrame, S(0));
-      }
-    }
+    for (int64_t i = begin; i < end; ++i)
+      broken[thread] += !see(cam, width, height, in, i, near, prefilter, geom, frames, radii);
   });
   return std::accumulate(broken.begin(), broken.end(), int64_t(0));
 }
@@ -60,21 +36,9 @@ int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bo
 template <class S>
 void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
                       const SurfelGradients<S>& out) {
-  const S none[kFrame] = {};
   parallel_parts(in.n, 1024, [&](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const S* g = geom + i * kGeom;
-      if (g[kZ] == S(0)) {
-        std::fill(out.means + 3 * i, out.means + 3 * i + 3, S(0));
-        std::fill(out.quats + 4 * i, out.quats + 4 * i + 4, S(0));
-        std::fill(out.log_scales + 2 * i, out.log_scales + 2 * i + 2, S(0));
-        out.opacity_logits[i] = out.beta_raw[i] = S(0);
-        continue;
-      }
-      project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i],
-                  g, dgeom + i * kGeom, dframes ? dframes + i * kFrame : none, out.means + 3 * i, out.quats + 4 * i,
-                  out.log_scales + 2 * i, out.opacity_logits + i, out.beta_raw + i);
-    }
+    for (int64_t i = begin; i < end; ++i)
+      project_vjp(cam, in, i, geom + i * kGeom, dgeom + i * kGeom, dframes ? dframes + i * kFrame : nullptr, out);
   });
 }
 

@@ -76,8 +76,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
     const Surfels<float>& in = s.geometry;
     float geom[kGeom], frame[kFrame];
     const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
-    seen = project(camera, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                   in.beta_raw[i], s.near, kPrefilter, geom, frame);
+    seen = project(camera, in, i, s.near, kPrefilter, geom, frame);
     if (seen) {
       LevelSet<float> level;
       if (kPrefilter && geom[kArea] > 0)

@@ -1,5 +1,5 @@
 // Projection of all surfels: a thread a surfel.
-#include "core/bounds.h"
+#include "core/visibility.h"
 #include "cuda/kernels.h"
 
 namespace bt::cuda {
@@ -14,27 +14,7 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.n) return;
   const Pinhole<S> cam = pinhole(viewmat, K);
-  S g[kGeom], f[kFrame], r[2] = {S(0), S(0)};
-  bool seen = project(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                      in.beta_raw[i], near, prefilter, g, f);
-  if (seen) {
-    const Extent e = extent(g);
-    seen = e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
-    if (seen) {
-      const double most = 1e6;
-      r[0] = S(min_(most, max_(e.x1, -e.x0)));
-      r[1] = S(min_(most, max_(e.y1, -e.y0)));
-    }
-  } else {
-    bool finite = finite_(in.opacity_logits[i]) && finite_(in.beta_raw[i]);
-    for (int k = 0; k < 3; ++k) finite &= finite_(in.means[3 * i + k]);
-    for (int k = 0; k < 4; ++k) finite &= finite_(in.quats[4 * i + k]);
-    for (int k = 0; k < 2; ++k) finite &= finite_(in.log_scales[2 * i + k]);
-    if (!finite) atomicAdd(broken, 1);
-  }
-  for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = seen ? g[k] : S(0);
-  for (int k = 0; k < kFrame; ++k) frames[i * kFrame + k] = seen ? f[k] : S(0);
-  radii[2 * i] = r[0], radii[2 * i + 1] = r[1];
+  if (!see(cam, width, height, in, i, near, prefilter, geom, frames, radii)) atomicAdd(broken, 1);
 }
 
 template <class S>
@@ -42,18 +22,8 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(const S* viewmat, co
                                                             const S* dgeom, const S* dframes, SurfelGradients<S> out) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.n) return;
-  const S* g = geom + i * kGeom;
-  S dmean[3] = {}, dquat[4] = {}, dscales[2] = {}, dopacity = S(0), dbeta = S(0);
-  if (g[kZ] != S(0)) {
-    const Pinhole<S> cam = pinhole(viewmat, K);
-    const S none[kFrame] = {};
-    project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i], g,
-                dgeom + i * kGeom, dframes ? dframes + i * kFrame : none, dmean, dquat, dscales, &dopacity, &dbeta);
-  }
-  for (int k = 0; k < 3; ++k) out.means[3 * i + k] = dmean[k];
-  for (int k = 0; k < 4; ++k) out.quats[4 * i + k] = dquat[k];
-  for (int k = 0; k < 2; ++k) out.log_scales[2 * i + k] = dscales[k];
-  out.opacity_logits[i] = dopacity, out.beta_raw[i] = dbeta;
+  const Pinhole<S> cam = pinhole(viewmat, K);
+  project_vjp(cam, in, i, geom + i * kGeom, dgeom + i * kGeom, dframes ? dframes + i * kFrame : nullptr, out);
 }
 }  // namespace
 

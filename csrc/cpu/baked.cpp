@@ -2,6 +2,7 @@
 #include <stdexcept>
 #include <string>
 
+#include "core/shading.h"
 #include "core/texel.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
@@ -123,7 +124,8 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
       const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
       const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
       const S extent = S(atlas.extent[id]);
-      const S view[3] = {relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)), relu(base[3 * id + 2] + S(0.5))};
+      S view[3];
+      store3(view, view_base(load3(base + 3 * id)));
       state.blend(g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
         const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
         const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
@@ -138,7 +140,7 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
         const uint32_t rest = bits(textures);
         if (!rest) return;
         if (!tiled) {
-          for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(relu(view[c] + S(flat[c])));
+          for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(shaded(view[c], S(flat[c])));
           return;
         }
         const P x = texel_position(f.u, sides[0], extent), y = texel_position(f.v, sides[1], extent);

@@ -3,6 +3,7 @@
 // A thread a surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters a surfel with
 // seven sites, 20 + 24 a term of lean ones) are computed for the visible ones alone, by threads that stand next to each
 // other: a block packs them.
+#include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_stages.h"
 
@@ -49,7 +50,7 @@ __device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> colo
     const Vec3<float> flat = load3(s.mean_residual + 3 * i);
     if (flat.x != 0 || flat.y != 0 || flat.z != 0) {
       scale = -1;
-      place[0] = relu(color.x + flat.x), place[1] = relu(color.y + flat.y), place[2] = relu(color.z + flat.z);
+      store3(place, shaded(color, flat));
     }
   }
   row[kTexelScale] = scale;
@@ -138,8 +139,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
   double center[3];  // -R^T t
   for (int k = 0; k < 3; ++k) center[k] = -(double(m[k]) * m[3] + double(m[4 + k]) * m[7] + double(m[8 + k]) * m[11]);
   const Vec3<float> d = view_direction(s.geometry.means + 3 * j, center).n;
-  Vec3<float> color = view_color(s, j, d);
-  color = {relu(color.x + 0.5f), relu(color.y + 0.5f), relu(color.z + 0.5f)};
+  const Vec3<float> color = view_base(view_color(s, j, d));
   float* to = f.memory.rows + (first + j) * kRow;
   store3(to + kRed, color);
   write_texture(s, j, color, to);

@@ -9,6 +9,7 @@
 // one exponential and, where the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by
 // the texture unit; memory traffic is 96 bytes a row and warp, mostly from L2.
 #include "core/fragment.h"
+#include "core/shading.h"
 #include "core/texel.h"
 #include "cuda/atlas_texture.h"
 #include "cuda/baked_stages.h"
@@ -83,9 +84,9 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
       const float handle[2] = {c.z, c.w};
       memcpy(&page, handle, sizeof page);
       const float4 texel = fetch_texel(page, x, y);
-      red = relu(red + a.offset + a.scale * texel.x);
-      green = relu(green + a.offset + a.scale * texel.y);
-      blue = relu(blue + a.offset + a.scale * texel.z);
+      red = shaded(red + a.offset, a.scale * texel.x);
+      green = shaded(green + a.offset, a.scale * texel.y);
+      blue = shaded(blue + a.offset, a.scale * texel.z);
     } else {
       red = t.x, green = t.y, blue = t.z;
     }

@@ -31,7 +31,7 @@ BT_HD LevelSet<S> level_set(const S* g) {
   l.r2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(4e-6));
   // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x),
   // (1 - x)^beta >= exp(-d^2) holds out to d^2 = ln 255 where k >= beta + ln 255.
-  const S reach = S(2.36);  // > sqrt(ln 255)
+  const S reach = S(kLowPassReach);
   const S w1 = g[kW1] < S(0) ? -g[kW1] : g[kW1], w2 = g[kW2] < S(0) ? -g[kW2] : g[kW2];
   const S least = g[kW0] - reach * (w1 + w2);
   const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];

@@ -16,7 +16,8 @@ namespace bt {
 constexpr double kSupport = 3.0;         // R: the kernel ends at 3 scale units
 constexpr double kAlphaMax = 0.99;       // sigma is clamped to this
 constexpr double kAlphaMin = 1.0 / 255;  // fragments below this are skipped
-constexpr double kTransmittanceMin = 1e-4;
+constexpr double kTransmittanceMin = 1e-4;  // a pixel takes no fragment that would leave it less
+constexpr double kLowPassReach = 2.36;      // pixels, > sqrt(ln(1 / kAlphaMin)): where the low pass falls below that
 constexpr double kBetaMax = 4.0;
 constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their squares stay finite in float32
 

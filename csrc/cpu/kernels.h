@@ -6,6 +6,7 @@
 #include <memory>
 #include <vector>
 
+#include "core/blend.h"
 #include "core/bounds.h"
 #include "core/field.h"
 #include "core/surfel.h"
@@ -68,8 +69,7 @@ template <class S>
 void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
                     const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad);
 
-// Image [pixels, channels]: rgb, alpha, sum w beta, and with maps sum w depth and sum w normal. Written.
-constexpr int kImageChannels = 5, kMapChannels = 9;
+// Image [pixels, channels]: the sums of core/blend.h. Written.
 template <class S>
 void composite_forward(int64_t pixels, bool maps, const S* geom, const int64_t* tile_start, int64_t tiles,
                        const FragmentArrays<S>& f, const S* colors, S* image);

@@ -1,5 +1,5 @@
 // Fragments of a view and their backward pass; per-surfel counts.
-#include "core/fragment.h"
+#include "core/kernel.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
@@ -120,12 +120,11 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
           const S sigma = f.sigma[i] < S(0) ? -f.sigma[i] : f.sigma[i];
           S& rest = behind[(y - y0) * kTile + x - x0];
           const S gw = dweight ? dweight[i] : S(0);
-          dsigma[m] = f.weight[i] / sigma * gw - rest / (S(1) - sigma);
-          rest += f.weight[i] * gw;
+          dsigma[m] = blend_vjp(f.weight[i], sigma, gw, rest);
           du[m] = duv ? duv[i] : S(0), dv[m] = duv ? duv[total + i] : S(0);
           dz[m] = ddepth ? ddepth[i] : S(0);
           low[m] = f.sigma[i] < S(0) ? S(1) : S(0);
-          dx[m] = S(x) + S(0.5) - g[kCx], dy[m] = S(y) + S(0.5) - g[kCy];
+          dx[m] = pixel_centre<S>(x) - g[kCx], dy[m] = pixel_centre<S>(y) - g[kCy];
           ++m;
         }
         end = begin;

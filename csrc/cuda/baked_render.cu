@@ -8,7 +8,7 @@
 // 10 pixels that are looked at blend it: the masks leave little to reject. A hit costs one reciprocal, one logarithm,
 // one exponential and, where the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by
 // the texture unit; memory traffic is 96 bytes a row and warp, mostly from L2.
-#include "core/fragment.h"
+#include "core/kernel.h"
 #include "core/shading.h"
 #include "core/texel.h"
 #include "cuda/atlas_texture.h"
@@ -54,9 +54,8 @@ template <bool kMaps, Cover kCover>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel& p) {
   bool near_it = p.transmittance > 0;
   if (kCover != Cover::kFiltered) {  // the planes alone say for most pixels that the surfel is not there
-    const float W = s.g[kW0] + s.g[kW1] * dx + s.g[kW2] * dy;
-    const float U = s.g[kU1] * dx + s.g[kU2] * dy, V = s.g[kV1] * dx + s.g[kV2] * dy;
-    bool inside = U * U + V * V < s.r2 * (W * W) && W > 0;
+    const Planes<float> at = planes(s.g, dx, dy);
+    bool inside = within(at, s.r2) && at.W > 0;
     if (kCover == Cover::kLowPass) inside = inside || dx * dx + dy * dy < s.blur2;
     near_it = near_it && inside;
   }
@@ -67,13 +66,11 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   g[kArea] = kCover == Cover::kFiltered ? s.g[kArea] : 0.0f;  // known to the compiler
   const Fragment<Fast> f = fragment<float, Fast, kCover == Cover::kLowPass>(g, a.near, Fast(dx), Fast(dy));
   const float sigma = f.sigma.v;
-  if (!(sigma >= float(kAlphaMin))) return;
-  const float weight = sigma * p.transmittance, next = p.transmittance - weight;
-  if (next < a.transmittance_min) {  // the surfel that would do that is not blended
-    p.transmittance = -p.transmittance;
-    return;
-  }
-  p.transmittance = next;
+  const auto [weight, behind] = bt::blend(sigma, p.transmittance);
+  const Verdict<float> v = judge(true, sigma, behind, a.transmittance_min);
+  if (v.ends) p.transmittance = -p.transmittance;
+  if (!v.takes) return;
+  p.transmittance = behind;
   const float4 c = s.rest[0];
   float red = s.red, green = s.green, blue = c.x;
   if (weight >= a.weight_bound && c.y != 0) {
@@ -176,7 +173,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_ke
                      q3.w,
                      q + 4,
                      pair >> 8};
-      const float dx = x + 0.5f - s.g[kCx], dy = y + 0.5f - s.g[kCy];
+      const float dx = pixel_centre<float>(x) - s.g[kCx], dy = pixel_centre<float>(y) - s.g[kCy];
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j) {
         if (!(pair & part[j])) continue;

@@ -4,7 +4,7 @@
 // the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
 // marked pairs alone. Both are bound by arithmetic (about 100 operations a lane and pair, a third of the lanes with a
 // fragment), trace_fill also by the 28 bytes a fragment that it writes.
-#include "core/fragment.h"
+#include "core/kernel.h"
 #include "cuda/primitives.h"
 #include "cuda/trace.h"
 #include "cuda/workspace.h"
@@ -24,11 +24,6 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// beyond this squared distance the low pass cannot reach alpha 1/255: more than ln 255
-template <class S>
-__device__ bool near_centre(S dx, S dy) {
-  return dx * dx + dy * dy < S(5.6);
-}
 // `blur` is the same for a whole warp
 template <class S>
 __device__ Fragment<S> fragment_at(const S* g, S near, S dx, S dy, bool blur) {
@@ -43,7 +38,7 @@ __global__ void __launch_bounds__(kTileThreads)
   const int64_t end = tile_pairs[blockIdx.x + 1];
   int64_t first = tile_pairs[blockIdx.x];
   uint32_t* row = masks + s.warp * pairs;
-  const S x = S(s.x) + S(0.5), y = S(s.y) + S(0.5);
+  const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   bool open = s.x < width && s.y < height;  // the pixel still takes light
   S transmittance = S(1);
   for (; first < end && __any_sync(kFullMask, open); first += kWarp) {
@@ -67,21 +62,16 @@ __global__ void __launch_bounds__(kTileThreads)
       load_shape(geom + int64_t(__shfl_sync(kFullMask, id, j)) * kGeom, g);
       const S dx = x - g[kCx], dy = y - g[kCy];
       // a cheap look first: does any open pixel lie in the support or near the centre?
-      const S W = g[kW0] + g[kW1] * dx + g[kW2] * dy;
-      const S U = g[kU1] * dx + g[kU2] * dy, V = g[kV1] * dx + g[kV2] * dy;
       const bool close = near_centre(dx, dy);
       const bool reached = g[kArea] > S(0) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
-                                           : close || U * U + V * V < S(kSupport * kSupport) * W * W;
+                                           : close || within(planes<S, S>(g, dx, dy), S(kSupport * kSupport));
       if (!__any_sync(kFullMask, open && reached)) continue;
       const S sigma = fragment_at(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
-      bool take = open && sigma >= S(kAlphaMin);
-      const S next = transmittance - sigma * transmittance;
-      // the surfel that would take the pixel below the bound is not blended and ends it
-      const bool ends = take && next < S(kTransmittanceMin);
-      take = take && !ends;
-      open = open && !ends;
-      if (take) transmittance = next;
-      const unsigned taken = __ballot_sync(kFullMask, take);
+      const S behind = blend(sigma, transmittance).behind;
+      const Verdict<S> v = judge(open, sigma, behind, S(kTransmittanceMin));
+      open = open && !v.ends;
+      if (v.takes) transmittance = behind;
+      const unsigned taken = __ballot_sync(kFullMask, v.takes);
       if (s.lane == j) mark = taken;
       if (!__any_sync(kFullMask, open)) todo = 0;
     }
@@ -108,7 +98,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class S>
 __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
   const Spot s = spot(p.width);
-  const S x = S(s.x) + S(0.5), y = S(s.y) + S(0.5);
+  const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   const int32_t pixel = int32_t(s.y * p.width + s.x);
   S transmittance = S(1);
   const auto write = [&](int64_t, int32_t id, bool mine, int64_t i) {
@@ -117,10 +107,10 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
     const S dx = x - g[kCx], dy = y - g[kCy];
     const Fragment<S> f = fragment_at(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
     if (mine) {
-      const S weight = f.sigma * transmittance;
-      transmittance -= weight;
+      const Blend<S> b = blend(f.sigma, transmittance);
+      transmittance = b.behind;
       out.surfel[i] = id, out.pixel[i] = pixel;
-      out.weight[i] = weight;
+      out.weight[i] = b.weight;
       out.uv[i] = f.u, out.uv[out.total + i] = f.v;
       out.depth[i] = f.depth;
       out.sigma[i] = f.low_pass > S(0) ? -f.sigma : f.sigma;

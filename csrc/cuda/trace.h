@@ -2,6 +2,7 @@
 // the last entry of slot_start or offsets, allocates, and calls the next function.
 #pragma once
 
+#include "core/blend.h"
 #include "cuda/pairs.h"
 
 namespace bt::cuda {
@@ -37,7 +38,6 @@ void trace_backward(const S* geom, S near, S rim, const Pairs& pairs, const Frag
                     const S* duv, const S* ddepth, S* dsigma, S* partial, S* dgeom, S* absgrad, Stream stream);
 
 // As bt::composite_forward and bt::composite_backward. partial: [pairs, 4] with maps, else [pairs], working memory.
-constexpr int kImageChannels = 5, kMapChannels = 9;
 template <class S>
 void composite_forward(bool maps, const S* geom, const Pairs& pairs, const FragmentArrays<S>& f, const S* colors,
                        S* image, Stream stream);

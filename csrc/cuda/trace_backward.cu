@@ -3,7 +3,7 @@
 // dL/dsigma of a fragment needs the sum of w dL/dw over the fragments behind it in its pixel: a walk back to front with
 // that sum in a register, 16 bytes a fragment. The long formulas then need no order any more, so they run through the
 // list a pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once a pair.
-#include "core/fragment.h"
+#include "core/kernel.h"
 #include "cuda/trace.h"
 
 namespace bt::cuda {
@@ -22,7 +22,7 @@ template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     dsigma_kernel(Pairs p, FragmentArrays<S> f, const S* dweight, S* dsigma) {
   const Spot s = spot(p.width);
-  S behind = S(0);  // sum of w dL/dw
+  S later = S(0);  // sum of w dL/dw
   const auto load = [&](int64_t, int32_t, bool mine, int64_t i) {
     Step<S> t = {mine, i, S(0), S(0), S(0)};
     if (mine) t.weight = f.weight[i], t.sigma = f.sigma[i], t.dweight = dweight[i];
@@ -31,8 +31,7 @@ __global__ void __launch_bounds__(kTileThreads)
   const auto use = [&](const Step<S>& t) {
     if (!t.mine) return;
     const S sigma = t.sigma < S(0) ? -t.sigma : t.sigma;
-    dsigma[t.i] = t.weight / sigma * t.dweight - behind / (S(1) - sigma);
-    behind += t.weight * t.dweight;
+    dsigma[t.i] = blend_vjp(t.weight, sigma, t.dweight, later);
   };
   walk<4, true>(p, s, load, use);
 }
@@ -50,8 +49,8 @@ __global__ void __launch_bounds__(kRunThreads)
     for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
       const int32_t y = f.pixel[i] / p.width, x = f.pixel[i] - y * p.width;
       S ddx, ddy;
-      fragment_vjp<S, S>(g, near, rim, S(x) + S(0.5) - g[kCx], S(y) + S(0.5) - g[kCy], f.sigma[i] < S(0) ? S(1) : S(0),
-                         dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0), duv ? duv[f.total + i] : S(0),
+      fragment_vjp<S, S>(g, near, rim, pixel_centre<S>(x) - g[kCx], pixel_centre<S>(y) - g[kCy],
+                         f.sigma[i] < S(0) ? S(1) : S(0), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0), duv ? duv[f.total + i] : S(0),
                          ddepth ? ddepth[i] : S(0), d, ddx, ddy);
       ax += ddx < S(0) ? -ddx : ddx, ay += ddy < S(0) ? -ddy : ddy;
     }

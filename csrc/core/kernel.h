@@ -3,33 +3,70 @@
 // set, with the prefilter of core/prefilter.h.
 #pragma once
 
+#include "core/blend.h"
 #include "core/prefilter.h"
 
 namespace bt {
 
-// S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected centre. Without kBlur the low
-// pass is left out, for pixels so far from the centre that it cannot reach alpha 1/255.
+template <class T>
+BT_HD MaskOf<T> near_centre(T dx, T dy) {
+  return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
+}
+
+// The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected
+// centre.
+template <class T>
+struct Planes {
+  T U, V, W;
+};
+template <class S, class T>
+BT_HD Planes<T> planes(const S* g, T dx, T dy) {
+  return {T(g[kU1]) * dx + T(g[kU2]) * dy, T(g[kV1]) * dx + T(g[kV2]) * dy,
+          T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy};
+}
+// u^2 + v^2 < r2 without a division, on either side of the camera.
+template <class T>
+BT_HD MaskOf<T> within(const Planes<T>& p, T r2) {
+  return p.U * p.U + p.V * p.V < r2 * p.W * p.W;
+}
+
+// Where a ray meets a surfel's plane.
+template <class T>
+struct Hit {
+  MaskOf<T> ok;  // in front of the camera, behind `near`
+  T inv;         // 1 / W; 1 without a hit
+  T u, v;        // 0 without a hit
+  T rest;        // 1 - (u^2 + v^2) / 9
+};
+template <class S, class T>
+BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
+  const T zero = T(S(0)), one = T(S(1));
+  const Planes<T> p = planes(g, dx, dy);
+  Hit<T> h;
+  h.ok = (p.W > zero) & (T(g[kW0] * g[kZ]) > T(near) * p.W);
+  h.inv = one / select(h.ok, p.W, one);
+  h.u = select(h.ok, p.U * h.inv, zero);
+  h.v = select(h.ok, p.V * h.inv, zero);
+  h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / (kSupport * kSupport)));
+  return h;
+}
+
+// Without kBlur the low pass is left out, for pixels that are not near the centre.
 template <class S, class T, bool kBlur = true>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   if (g[kArea] > S(0)) return filtered_fragment<S, T>(g, near, filtered_place<S, T>(g, dx, dy));
-  const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
-  const S q = g[kW0] * g[kZ];
-  const auto hit = (W > zero) & (T(q) > T(near) * W);
-  const T inv = one / select(hit, W, one);
-  const T u = select(hit, (T(g[kU1]) * dx + T(g[kU2]) * dy) * inv, zero);
-  const T v = select(hit, (T(g[kV1]) * dx + T(g[kV2]) * dy) * inv, zero);
-  const T rest = one - (u * u + v * v) * T(S(1.0 / (kSupport * kSupport)));
-  const auto inside = hit & (rest > zero);
-  const T kernel = select(inside, power_(select(inside, rest, one), T(g[kBeta])), zero);
+  const Hit<T> h = hit(g, near, dx, dy);
+  const auto inside = h.ok & (h.rest > zero);
+  const T kernel = select(inside, power_(select(inside, h.rest, one), T(g[kBeta])), zero);
   Fragment<T> f;
-  f.u = u, f.v = v, f.depth = T(q) * inv, f.low_pass = zero;
+  f.u = h.u, f.v = h.v, f.depth = T(g[kW0] * g[kZ]) * h.inv, f.low_pass = zero;
   T most = kernel;
   if (kBlur) {
     const T blur = exp_(-(dx * dx + dy * dy));
     const auto low = blur > kernel;
     const T r = T(S(kSupport));
-    f.u = clamp_(u, -r, r), f.v = clamp_(v, -r, r);
+    f.u = clamp_(h.u, -r, r), f.v = clamp_(h.v, -r, r);
     f.depth = select(low, T(g[kZ]), f.depth);
     f.low_pass = select(low, one, zero);
     most = select(low, blur, kernel);
@@ -44,15 +81,10 @@ template <class S, class T>
 BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
                         T& ddy) {
   if (g[kArea] > S(0)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
-  const T zero = T(S(0)), one = T(S(1)), two = T(S(2));
-  const T W = T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy;
-  const S q = g[kW0] * g[kZ];
-  const auto hit = (W > zero) & (T(q) > T(near) * W);
+  const T zero = T(S(0)), two = T(S(2));
+  const Hit<T> h = hit(g, near, dx, dy);
+  const T u = h.u, v = h.v, inv = h.inv, rest = h.rest, q = T(g[kW0] * g[kZ]);
   const auto low = low_pass > zero;
-  const T inv = one / select(hit, W, one);
-  const T u = select(hit, (T(g[kU1]) * dx + T(g[kU2]) * dy) * inv, zero);
-  const T v = select(hit, (T(g[kV1]) * dx + T(g[kV2]) * dy) * inv, zero);
-  const T rest = one - (u * u + v * v) * T(S(1.0 / (kSupport * kSupport)));
   const T log_rest = log_(max_(rest, T(S(1e-30))));
   const T kernel = select(low, exp_(-(dx * dx + dy * dy)), exp_(T(g[kBeta]) * log_rest));
   const auto open = T(g[kOpacity]) * kernel < T(S(kAlphaMax));  // the clamp passes no gradient
@@ -64,12 +96,12 @@ BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsi
   const T drho = -gk3 * T(g[kBeta]) / max_(rest, T(rim)) * T(S(1.0 / (kSupport * kSupport)));
   const T r = T(S(kSupport));
   // the clamp of the low-pass branch passes gradient only inside the support
-  const T gu = select(hit & (u * u < r * r), du + two * u * drho, zero);
-  const T gv = select(hit & (v * v < r * r), dv + two * v * drho, zero);
+  const T gu = select(h.ok & (u * u < r * r), du + two * u * drho, zero);
+  const T gv = select(h.ok & (v * v < r * r), dv + two * v * drho, zero);
   const T gz = select(low, zero, ddepth);
   d[kZ] += select(low, ddepth, gz * inv * T(g[kW0]));
   const T dU = gu * inv, dV = gv * inv;
-  const T dW = -(gu * u + gv * v + gz * T(q) * inv) * inv;
+  const T dW = -(gu * u + gv * v + gz * q * inv) * inv;
   d[kU1] += dU * dx, d[kU2] += dU * dy;
   d[kV1] += dV * dx, d[kV2] += dV * dy;
   d[kW0] += dW + gz * inv * T(g[kZ]);

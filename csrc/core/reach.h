@@ -23,12 +23,11 @@ struct LevelSet {
 template <class S>
 BT_HD LevelSet<S> level_set(const S* g) {
   LevelSet<S> l = {false, S(0), S(0)};
-  const S o255 = S(255) * g[kOpacity];
-  l.visible = o255 >= S(1) - S(1e-6);
+  const S ratio = times_drawn(g[kOpacity]);
+  l.visible = ratio >= S(1) - S(1e-6);
   if (!l.visible) return l;
-  const S level = max_(log_(o255), S(0)) + S(1e-5);
-  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
-  l.r2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(4e-6));
+  const S level = max_(log_(ratio), S(0)) + S(1e-5);
+  l.r2 = level_radius2(level, g[kBeta], S(4e-6));
   // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x),
   // (1 - x)^beta >= exp(-d^2) holds out to d^2 = ln 255 where k >= beta + ln 255.
   const S reach = S(kLowPassReach);

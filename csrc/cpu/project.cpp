@@ -42,19 +42,6 @@ void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom
   });
 }
 
-namespace {
-// Calls fn(tile) for every tile that the surfel may touch.
-template <class S, class F>
-void for_tiles(const S* g, int width, int height, F&& fn) {
-  const Extent e = extent(g);
-  const TileSpan rows = tile_rows(e, g, height);
-  for (int ty = rows.first; ty <= rows.last; ++ty) {
-    const TileSpan columns = tile_columns(e, g, ty, width);
-    for (int tx = columns.first; tx <= columns.last; ++tx) fn(ty * tiles_across(width) + tx);
-  }
-}
-}  // namespace
-
 template <class S>
 void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
   bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
@@ -77,9 +64,11 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
     for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
       const size_t head = list.size();
       list.push_back(0);
-      for_tiles(geom + int64_t(order[k].second) * kGeom, width, height, [&](int tile) {
-        list.push_back(tile);
-        ++at[t][tile];
+      for_tile_rows(geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
+        for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
+          list.push_back(tile);
+          ++at[t][tile];
+        }
       });
       list[head] = int32_t(list.size() - head - 1);
     }

@@ -164,7 +164,7 @@ BakedFrame frame_of(int64_t surfels, const BakedViews& v, int64_t capacity) {
   BakedFrame f = {};
   f.n = surfels, f.rows = surfels * v.count;
   f.width = v.width, f.height = v.height;
-  f.tiles_x = int(ceil_div(v.width, kTileSide)), f.tiles_y = int(ceil_div(v.height, kTileSide));
+  f.tiles_x = tiles_across(v.width), f.tiles_y = tiles_across(v.height);
   f.tiles = int64_t(f.tiles_x) * f.tiles_y * v.count;
   f.capacity = ceil_div(max_<int64_t>(capacity, 1), 8) * 8;
   while (f.tiles >> f.key_bits) ++f.key_bits;

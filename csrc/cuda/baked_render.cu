@@ -124,8 +124,8 @@ __global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_ke
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const unsigned tile = blockIdx.x;
   const int in_view = int(tile % unsigned(a.tiles_of_view));
-  const int x = in_view % a.tiles_x * kTileSide + (warp & 1) * 8 + (lane & 7);
-  const int y = in_view / a.tiles_x * kTileSide + (warp >> 1) * 8 + (lane >> 3);
+  const int x = in_view % a.tiles_x * kTile + (warp & 1) * 8 + (lane & 7);
+  const int y = in_view / a.tiles_x * kTile + (warp >> 1) * 8 + (lane >> 3);
   float4* stage = staged[warp];
   uint32_t* queue = queues[warp];
   Pixel p[kPixels];

@@ -82,15 +82,8 @@ __global__ void __launch_bounds__(kThreads)
   if (i >= n) return;
   const bool visible = radii[2 * i] > S(0);
   int64_t count = 0;
-  if (visible) {
-    const S* g = geom + i * kGeom;
-    const Extent e = extent(g);
-    const TileSpan rows = tile_rows(e, g, height);
-    for (int row = rows.first; row <= rows.last; ++row) {
-      const TileSpan columns = tile_columns(e, g, row, width);
-      count += columns.last >= columns.first ? columns.last - columns.first + 1 : 0;
-    }
-  }
+  if (visible)
+    for_tile_rows(geom + i * kGeom, width, height, [&](int, int first, int last) { count += last - first + 1; });
   w.keys[i] = visible ? ordered(geom[i * kGeom + kZ]) : ~typename KeyOf<S>::type(0);
   w.rows[i] = int32_t(i);
   w.counts[i] = int32_t(count);  // at most the tiles of an image
@@ -111,20 +104,16 @@ __global__ void __launch_bounds__(kThreads) list_kernel(int64_t n, const S* geom
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = int(threadIdx.x) % kWarp, across = tiles_across(width);
   const int64_t from = r < n ? slot_start[r] : 0, count = r < n ? slot_start[r + 1] - from : 0;
-  const auto list = [&](int32_t id, int64_t at, int first, int step) {
-    const S* g = geom + int64_t(id) * kGeom;
-    const Extent e = extent(g);
-    const TileSpan rows = tile_rows(e, g, height);
-    for (int row = rows.first; row <= rows.last; ++row) {
-      const TileSpan columns = tile_columns(e, g, row, width);
-      for (int column = columns.first + first; column <= columns.last; column += step) {
-        const int64_t slot = at + column - columns.first;
+  const auto list = [&](int32_t id, int64_t at, int mine, int step) {
+    for_tile_rows(geom + int64_t(id) * kGeom, width, height, [&](int row, int first, int last) {
+      for (int column = first + mine; column <= last; column += step) {
+        const int64_t slot = at + column - first;
         w.tile[slot] = uint32_t(row * across + column);
         w.slots[slot] = int32_t(slot);
         w.owner[slot] = id;
       }
-      if (columns.last >= columns.first) at += columns.last - columns.first + 1;
-    }
+      at += last - first + 1;
+    });
   };
   const int32_t id = count ? order[r] : 0;
   if (count && count <= kAlone) list(id, from, 0, 1);

@@ -40,13 +40,12 @@ from bitymi_ns.bake.surfel_table import (
     to_columns,
     view_color_kind,
 )
+from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_color import check_lean
 
 __all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
 
 GENERATOR = f"bitymi-ns {__version__}"
-COLOR_BIAS = 0.5
-SUPPORT = 3.0  # radius of the kernel in scale units
 _MANIFEST_LIMIT = 64 << 20
 _CHUNK = 1 << 22
 _LEAN_FORMULAS = {
@@ -261,9 +260,9 @@ def _describe(
         "atlas": None,
         "color_bias": COLOR_BIAS,
         "render": {
-            "alpha_max": 0.99,
-            "alpha_min": 1.0 / 255.0,
-            "t_min": 1e-4,
+            "alpha_max": ALPHA_MAX,
+            "alpha_min": ALPHA_MIN,
+            "t_min": TRANSMITTANCE_MIN,
             "near": near,
             "weight_bound": weight_bound,
             "low_pass": 1.0,

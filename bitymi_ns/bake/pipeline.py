@@ -26,11 +26,10 @@ from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, encode
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.surfel_table import view_color_kind
 from bitymi_ns.bake.visibility import Visibility, visibility
+from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
-
-OPACITY_FLOOR = 1.0 / 255.0  # below it a surfel is skipped at every pixel
 
 
 class BakeableScene(Protocol):
@@ -256,7 +255,7 @@ def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
     turned = surfels["quats"].norm(dim=1)
     finite &= torch.isfinite(turned) & (turned > 1e-12)
-    transparent = finite & (surfels["opacity_logits"].sigmoid() < OPACITY_FLOOR)
+    transparent = finite & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
     kept = torch.nonzero(finite & ~transparent).squeeze(1)
     return kept, {"not_finite": int((~finite).sum()), "transparent": int(transparent.sum())}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -28,7 +29,7 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
     """
     global _emulated
     before = _emulated
-    _load("_emulated").set_seed(seed)
+    load("_emulated").set_seed(seed)
     _emulated = True
     try:
         yield
@@ -36,7 +37,12 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
         _emulated = before
 
 
-def _load(name: str) -> ModuleType:
+def load(name: str) -> ModuleType:
+    """The compiled module of that name: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
+
+    Raises:
+        RuntimeError: it is missing.
+    """
     try:
         return importlib.import_module(f"bitymi_ns.{name}")
     except ImportError as error:
@@ -48,6 +54,11 @@ def _load(name: str) -> ModuleType:
         raise RuntimeError(
             f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
         ) from (error)
+
+
+@functools.cache
+def _set_up_process() -> None:
+    load("_cpu").set_up_process()
 
 
 def cuda_backend(device: torch.device) -> bool:
@@ -63,7 +74,10 @@ def module(device: torch.device) -> ModuleType:
     """
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
-    return _load("_cuda" if device.type == "cuda" else "_emulated" if _emulated else "_cpu")
+    if cuda_backend(device):
+        return load("_cuda" if device.type == "cuda" else "_emulated")
+    _set_up_process()
+    return load("_cpu")
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:

@@ -9,13 +9,10 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel, on_same_device
+from .constants import FRAME, GEOM
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.camera import Camera
-
-GEOM = 16
-"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), area (prefilter)."""
-FRAME = 9
 
 
 @dataclass
@@ -33,7 +30,7 @@ class Projection:
         near: nearest depth that is drawn, camera z.
         broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
-        mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken a fragment before the sum.
+        mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken per fragment before the sum.
         whole: the view that this is a band of (ops/bands.py).
     """
 

@@ -14,15 +14,10 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, module, workspace
+from .constants import TILE
 from .errors import TooManyFragments
 from .project import Projection
 
-TILE = 16
-"""Pixels a side."""
-WARPS = 8
-"""Of a tile's block."""
-COLUMNS = 16
-"""Sums a pair in the backward pass."""
 NUMBERS = 24
 """That a fragment takes in a training step: 7 in the list, 3 of its colour, 8 of their gradients; the rest is slack."""
 FEW = 1 << 23
@@ -85,7 +80,7 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tens
     the number of fragments."""
     camera, pairs = projection.camera, bins.surfel.shape[0]
     size = (camera.width, camera.height)
-    masks, offsets = _ints(geom, WARPS, pairs), _longs(geom, pairs + 1)
+    masks, offsets = _ints(geom, module(geom.device).TILE_WARPS, pairs), _longs(geom, pairs + 1)
     tile_start = torch.empty_like(bins.tile_pairs)
     space = workspace("trace_mark", geom, pairs)
     kernel("trace_mark", geom)(
@@ -161,5 +156,6 @@ def backward(
     absgrad: Tensor,
 ) -> None:
     """Writes dgeom [N, 16] and absgrad [N, 2] from the gradients of weight, uv and depth (None = zero)."""
-    dsigma, partial = geom.new_empty(layout.fragments), geom.new_empty(layout.pairs, COLUMNS)
+    dsigma = geom.new_empty(layout.fragments)
+    partial = geom.new_empty(layout.pairs, module(geom.device).TRACE_SUMS)
     kernel("trace_backward", geom)(geom, projection.near, rim, layout, *arrays, *grads, dsigma, partial, dgeom, absgrad)

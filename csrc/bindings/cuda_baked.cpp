@@ -18,7 +18,7 @@ T choice(const std::string& name, const std::vector<std::pair<const char*, T>>& 
   throw std::invalid_argument("unknown name " + name);
 }
 
-struct Parameters {  // of a view colour, numbers a surfel
+struct Parameters {  // of a view colour, numbers per surfel
   int kind;
   int64_t a, b, c;
 };

@@ -95,7 +95,7 @@ void bind(nb::module_& m, const char* suffix) {
         trace_backward(rows(geom, p.surfels * kGeom, "geom"), S(near), S(rim), p,
                        fragments<S>(f, surfel, pixel, weight, uv, depth, sigma), data_or_null(dweight, f, "dweight"),
                        data_or_null(duv, 2 * f, "duv"), data_or_null(ddepth, f, "ddepth"), data(dsigma, f, "dsigma"),
-                       data(partial, 16 * p.pairs, "partial"), data(dgeom, p.surfels * kGeom, "dgeom"),
+                       data(partial, kTraceSums * p.pairs, "partial"), data(dgeom, p.surfels * kGeom, "dgeom"),
                        data(absgrad, 2 * p.surfels, "absgrad"), stream_of(stream));
       },
       "geom"_a.noconvert(), "near"_a, "rim"_a, "pairs"_a, "surfel"_a.noconvert(), "pixel"_a.noconvert(),
@@ -167,6 +167,8 @@ void bind_trace(nb::module_& m) {
       .def_prop_ro("fragments", [](const PairsHandle& p) { return p.fragments; });
   bind<float>(m, "_f32");
   bind<double>(m, "_f64");
+  m.attr("TILE_WARPS") = kTileWarps;
+  m.attr("TRACE_SUMS") = kTraceSums;
   m.def(
       "masked_counts",
       [](const PairsHandle& pairs, Array<const uint8_t> mask, Array<int32_t> counts, uintptr_t stream) {

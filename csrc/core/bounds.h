@@ -27,8 +27,8 @@ template <class S>
 BT_HD S times_drawn(S opacity) {
   return S(1 / kAlphaMin) * opacity;
 }
-// Squared radius r_c^2 = 9 (1 - exp(-level / beta)) at which the kernel is exp(-level) of its centre; a part in 5,000 and
-// `slack` wider: a bound must hold in spite of rounding.
+// Squared radius r_c^2 = 9 (1 - exp(-level / beta)) at which the kernel is exp(-level) of its centre; a part in 5,000
+// and `slack` wider: a bound must hold in spite of rounding.
 template <class S>
 BT_HD S level_radius2(S level, S beta, S slack) {
   const S x = S(1) - exp_(-level / max_(beta, S(1e-6)));
@@ -156,7 +156,7 @@ BT_HD void row_interval(const Extent& e, double lo, double hi, double& x0, doubl
 }
 
 // Which tiles: rows first, then the columns of a row.
-constexpr int kTile = 16;  // pixels a side
+constexpr int kTile = 16;  // pixels along a side
 BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
 
 struct TileSpan {

@@ -5,7 +5,7 @@
 
 namespace bt {
 
-constexpr int kFeatures = 4;  // a level
+constexpr int kFeatures = 4;  // per level
 constexpr int kWidth = 16;    // of both hidden layers
 constexpr int kMaxLevels = 4;
 

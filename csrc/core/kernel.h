@@ -13,8 +13,8 @@ BT_HD MaskOf<T> near_centre(T dx, T dy) {
   return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
 }
 
-// The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the projected
-// centre.
+// The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the
+// projected centre.
 template <class T>
 struct Planes {
   T U, V, W;

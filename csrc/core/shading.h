@@ -5,10 +5,12 @@
 
 namespace bt {
 
+constexpr double kColorBias = 0.5;
+
 // relu(f_view + 0.5): all of the colour where there is no residual.
 template <class S>
 BT_HD S view_base(S f_view) {
-  return relu(f_view + S(0.5));
+  return relu(f_view + S(kColorBias));
 }
 template <class S>
 BT_HD Vec3<S> view_base(Vec3<S> f_view) {
@@ -35,7 +37,7 @@ BT_HD Vec3<S> residual_gradient(Vec3<S> color, Vec3<S> dcolor) {
 }
 template <class S>
 BT_HD S base_gradient(S f_view, S dresidual) {
-  return f_view > S(-0.5) ? dresidual : S(0);
+  return f_view > S(-kColorBias) ? dresidual : S(0);
 }
 template <class S>
 BT_HD Vec3<S> base_gradient(Vec3<S> f_view, Vec3<S> dresidual) {

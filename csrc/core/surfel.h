@@ -13,9 +13,9 @@
 
 namespace bt {
 
-constexpr double kSupport = 3.0;         // R: the kernel ends at 3 scale units
-constexpr double kAlphaMax = 0.99;       // sigma is clamped to this
-constexpr double kAlphaMin = 1.0 / 255;  // fragments below this are skipped
+constexpr double kSupport = 3.0;            // R: the kernel ends at 3 scale units
+constexpr double kAlphaMax = 0.99;          // sigma is clamped to this
+constexpr double kAlphaMin = 1.0 / 255;     // fragments below this are skipped
 constexpr double kTransmittanceMin = 1e-4;  // a pixel takes no fragment that would leave it less
 constexpr double kLowPassReach = 2.36;      // pixels, > sqrt(ln(1 / kAlphaMin)): where the low pass falls below that
 constexpr double kBetaMax = 4.0;
@@ -90,8 +90,8 @@ BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
-// Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre is
-// nearer than `near` (camera z).
+// Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre
+// is nearer than `near` (camera z).
 template <class S>
 BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, bool prefilter, S* geom, S* frame) {
   const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;

@@ -40,7 +40,7 @@ template <class S>
 struct FragmentList {
   std::vector<int64_t> tile_start;  // [tiles + 1], in fragments
   int64_t total = 0;
-  // filled by trace, read out by copy: one arena a thread
+  // filled by trace, read out by copy: one arena per thread
   struct Arena {
     std::vector<int32_t> surfel, pixel;
     std::vector<S> weight, u, v, depth, sigma;

@@ -1,8 +1,7 @@
 // Projection of all surfels, tile lists, and the number of threads.
-#include "core/visibility.h"
-
 #include <numeric>
 
+#include "core/visibility.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 

@@ -1,4 +1,4 @@
-// Colours from texels, summed a pixel, and their backward pass: what the baked renderer shows, differentiable.
+// Colours from texels, summed per pixel, and their backward pass: what the baked renderer shows, differentiable.
 #include "core/texel.h"
 
 #include "core/shading.h"

@@ -96,7 +96,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
-  // a part's own sums: 15 numbers a surfel (12 columns of geom, the area, and the two absolute gradients)
+  // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
   const int parts = parallel_tiles(tile_start, tiles, most, [&](int part, int64_t first_tile, int64_t last_tile) {
     std::vector<S>& sums = partial[part];

@@ -41,7 +41,7 @@ __device__ int64_t write_pairs(const TileRow& r, uint32_t first_tile, uint32_t r
   return at;
 }
 
-// The surfels in order of depth, a thread each, a warp for the large ones; the last blocks clear what is left over.
+// The surfels in order of depth, one thread each, a warp for the large ones; the last blocks clear what is left over.
 template <class Key, bool kPrefilter>
 __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned surfel_blocks) {
   Key* keys = static_cast<Key*>(f.memory.keys);
@@ -93,7 +93,7 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
   }
 }
 
-// Where each tile's pairs begin and end: a thread a run of keys as long as 16 bytes.
+// Where each tile's pairs begin and end: one thread per run of keys as long as 16 bytes.
 template <class Key>
 __global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
   constexpr int kKeys = 16 / sizeof(Key);

@@ -1,7 +1,7 @@
 // First stage of the baked renderer: the surfels that a view sees, each as the row that the later stages read.
 //
-// A thread a surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters a surfel with
-// seven sites, 20 + 24 a term of lean ones) are computed for the visible ones alone, by threads that stand next to each
+// One thread per surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters per surfel with
+// seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next to each
 // other: a block packs them.
 #include "core/shading.h"
 #include "core/view_color.h"

@@ -2,7 +2,7 @@
 //
 // Two sorts instead of one by a joint key of tile and depth: the n surfels by depth, then, written out in that order,
 // the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
-// order. There are about six pairs a surfel: the large sort moves 8 bytes a pair through two passes (13 bits for 4,000
+// order. There are about six pairs per surfel: the large sort moves 8 bytes per pair through two passes (13 bits for 4,000
 // tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
 #include "cuda/primitives.h"
 #include "cuda/trace.h"
@@ -96,7 +96,7 @@ __global__ void __launch_bounds__(kThreads)
   if (r <= n) ranked[r] = r < n ? counts[order[r]] : 0;
 }
 
-// A thread a surfel, by rank; a warp lists its large surfels together, so that one disc before the camera does not keep
+// One thread per surfel, by rank; a warp lists its large surfels together, so that one disc before the camera does not keep
 // a thread busy with the whole screen.
 template <class S>
 __global__ void __launch_bounds__(kThreads) list_kernel(int64_t n, const S* geom, int width, int height,

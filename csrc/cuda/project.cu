@@ -1,4 +1,4 @@
-// Projection of all surfels: a thread a surfel.
+// Projection of all surfels: one thread per surfel.
 #include "core/visibility.h"
 #include "cuda/kernels.h"
 

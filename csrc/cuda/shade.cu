@@ -70,7 +70,7 @@ __global__ void __launch_bounds__(kForwardWarps* kWarp)
   }
 }
 
-// Adds M numbers of every lane to rows of width M, one addition a run of lanes with the same row. Row -1: none.
+// Adds M numbers of every lane to rows of width M, one addition per run of lanes with the same row. Row -1: none.
 template <int M, class S, bool kExact>
 __device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S, kExact>& to) {
   const unsigned run = run_of(row, lane);

@@ -1,9 +1,9 @@
-// Fragments of a view. A block a tile, a warp 8 x 4 pixels, a lane a pixel; warps do not wait for each other.
+// Fragments of a view. One block per tile, one warp per 8 x 4 pixels, one lane per pixel; warps do not wait for each other.
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
 // the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
-// marked pairs alone. Both are bound by arithmetic (about 100 operations a lane and pair, a third of the lanes with a
-// fragment), trace_fill also by the 28 bytes a fragment that it writes.
+// marked pairs alone. Both are bound by arithmetic (about 100 operations per lane and pair, a third of the lanes with a
+// fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
 #include "cuda/primitives.h"
 #include "cuda/trace.h"
@@ -42,7 +42,7 @@ __global__ void __launch_bounds__(kTileThreads)
   bool open = s.x < width && s.y < height;  // the pixel still takes light
   S transmittance = S(1);
   for (; first < end && __any_sync(kFullMask, open); first += kWarp) {
-    // a lane a pair: does its box meet the warp's pixels?
+    // one lane per pair: does its box meet the warp's pixels?
     const int64_t own = first + s.lane;
     int32_t id = 0;
     bool meets = false;

@@ -31,8 +31,9 @@ void trace_mark(const S* geom, const S* radii, S near, int width, int height, in
 template <class S>
 void trace_fill(const S* geom, S near, const Pairs& pairs, const FragmentArrays<S>& out, Stream stream);
 
-// As bt::trace_backward. dsigma [fragments] and partial [pairs, 16] are working memory; dweight, duv, ddepth may be
-// null.
+// As bt::trace_backward. dsigma [fragments] and partial [pairs, kTraceSums] are working memory; dweight, duv, ddepth
+// may be null. The sums: kShape columns of geom, two absolute gradients, one unused, kArea.
+constexpr int kTraceSums = 16;
 template <class S>
 void trace_backward(const S* geom, S near, S rim, const Pairs& pairs, const FragmentArrays<S>& f, const S* dweight,
                     const S* duv, const S* ddepth, S* dsigma, S* partial, S* dgeom, S* absgrad, Stream stream);

@@ -9,7 +9,6 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int kSums = 16;  // kShape columns of geom, two absolute gradients, one unused, kArea
 
 template <class S>
 struct Step {
@@ -41,8 +40,8 @@ __global__ void __launch_bounds__(kRunThreads)
     surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, const S* dsigma, const S* duv,
                   const S* ddepth, S* partial) {
   const Run r = run(p);
-  S d[kSums];
-  for (int c = 0; c < kSums; ++c) d[c] = S(0);
+  S d[kTraceSums];
+  for (int c = 0; c < kTraceSums; ++c) d[c] = S(0);
   if (r.begin < r.end) {
     S g[kGeom], ax = S(0), ay = S(0);
     load_shape(geom + int64_t(p.surfel[r.k]) * kGeom, g);
@@ -50,14 +49,14 @@ __global__ void __launch_bounds__(kRunThreads)
       const int32_t y = f.pixel[i] / p.width, x = f.pixel[i] - y * p.width;
       S ddx, ddy;
       fragment_vjp<S, S>(g, near, rim, pixel_centre<S>(x) - g[kCx], pixel_centre<S>(y) - g[kCy],
-                         f.sigma[i] < S(0) ? S(1) : S(0), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0), duv ? duv[f.total + i] : S(0),
-                         ddepth ? ddepth[i] : S(0), d, ddx, ddy);
+                         f.sigma[i] < S(0) ? S(1) : S(0), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0),
+                         duv ? duv[f.total + i] : S(0), ddepth ? ddepth[i] : S(0), d, ddx, ddy);
       ax += ddx < S(0) ? -ddx : ddx, ay += ddy < S(0) ? -ddy : ddy;
     }
     d[kShape] = ax, d[kShape + 1] = ay;
   }
   const S sum = sum_over_run(d, r.lane);
-  if (r.some) partial[int64_t(p.slot[r.k]) * kSums + r.lane] = sum;
+  if (r.some) partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
 }
 
 template <class S>
@@ -79,7 +78,7 @@ void trace_backward(const S* geom, S near, S rim, const Pairs& p, const Fragment
   if (p.pairs)
     BT_LAUNCH(surfel_kernel<S>, run_blocks(p), dim3(kRunThreads), 0, stream, geom, near, rim, p, f, given, duv, ddepth,
               partial);
-  sum_slots<kSums>(p, static_cast<const S*>(partial), PutGeometry<S>{dgeom, absgrad}, stream);
+  sum_slots<kTraceSums>(p, static_cast<const S*>(partial), PutGeometry<S>{dgeom, absgrad}, stream);
 }
 
 #define BT_INSTANTIATE(S)                                                                                     \

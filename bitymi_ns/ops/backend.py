@@ -80,6 +80,23 @@ def module(device: torch.device) -> ModuleType:
     return load("_cpu")
 
 
+def require(operation: str, kind: str, device: torch.device, instead: str) -> None:
+    """Refuses a device on which an operation has no kernel.
+
+    Args:
+        operation: what was called.
+        kind: cpu or cuda, where it has one.
+        device: of the tensors.
+        instead: what to do, the end of the message.
+
+    Raises:
+        RuntimeError: the device is not of that kind.
+    """
+    if cuda_backend(device) != (kind == "cuda"):
+        where = {"cpu": "on the CPU", "cuda": "on a CUDA device"}
+        raise RuntimeError(f"{operation} runs {where[kind]} only, and the tensors are on '{device}': {instead}")
+
+
 def function(name: str, device: torch.device) -> Callable[..., Any]:
     """The kernel function of that name; on a CUDA device it runs on torch's current stream of that device."""
     compiled = getattr(module(device), name)

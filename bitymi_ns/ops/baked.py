@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import function, module
+from .backend import function, module, require
 from .view_color import LEAN, VIEW_COLORS, check_lean, check_view_color
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
@@ -25,6 +25,8 @@ IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "overdraw": (1, torch.int32),
 }
 """Channels and dtype of what can be drawn. packed: red, green, blue and alpha as bytes, red the lowest."""
+
+ON_CPU = "move the scene there, or draw with `baked_cpu.draw`"
 
 
 class Stage(IntFlag):
@@ -46,10 +48,11 @@ class AtlasTexture:
         device: where the surfels are.
 
     Raises:
-        RuntimeError: the device has too little memory, or refuses textures of this size.
+        RuntimeError: the device has too little memory, refuses textures of this size, or is no CUDA device.
     """
 
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
+        require("baked.AtlasTexture", "cuda", device, ON_CPU)
         texels = texels.detach().cpu()
         layers, height, width = texels.shape[:3]
         if blocks:
@@ -147,7 +150,9 @@ class Workspace:
 
         Raises:
             ValueError: more surfels, views or pairs than a frame can have; the message gives the numbers.
+            RuntimeError: the scene is not on a CUDA device.
         """
+        require("baked.Workspace.fit", "cuda", arrays.device, ON_CPU)
         kernels, device = module(arrays.device), arrays.device
         most = kernels.MOST_PAIRS
         if capacity > most:
@@ -234,7 +239,9 @@ def draw(
 
     Raises:
         ValueError: a shape is wrong, or the workspace is too small.
+        RuntimeError: the scene is not on a CUDA device.
     """
+    require("baked.draw", "cuda", arrays.device, ON_CPU)
     _, height, width, _ = next(iter(images.values())).shape
     assert workspace.memory is not None
     function("baked_frame", arrays.device)(

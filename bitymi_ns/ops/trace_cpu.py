@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,25 +15,22 @@ from .backend import kernel, kernel_class
 from .errors import TooManyFragments
 from .project import Projection
 
-
-class _Tracers:
-    """Tracers keep their memory from view to view; one is used by one thread at a time."""
-
-    def __init__(self) -> None:
-        self._idle: dict[object, list] = defaultdict(list)
-        self._lock = threading.Lock()
-
-    def take(self, like: Tensor):
-        make = kernel_class("Trace", like)
-        with self._lock:
-            return self._idle[make].pop() if self._idle[make] else make()
-
-    def give(self, tracer) -> None:
-        with self._lock:
-            self._idle[type(tracer)].append(tracer)
+_idle: dict[object, list] = defaultdict(list)
+_lock = threading.Lock()
 
 
-tracers = _Tracers()
+@contextmanager
+def borrowed_tracer(like: Tensor) -> Iterator[Any]:
+    """A tracer for tensors like `like`. Tracers keep their memory from view to view; one is used by one thread at a
+    time."""
+    make = kernel_class("Trace", like)
+    with _lock:
+        tracer = _idle[make].pop() if _idle[make] else make()
+    try:
+        yield tracer
+    finally:
+        with _lock:
+            _idle[make].append(tracer)
 
 
 def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Tensor, ...]:
@@ -49,17 +48,15 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
         TooManyFragments: there are more than `most`.
     """
     camera = projection.camera
-    tracer = tracers.take(geom)
-    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near)
-    if most and n > most:
-        tracers.give(tracer)
-        raise TooManyFragments(n, most, camera.width, camera.height, 8 + 5 * geom.element_size())
-    surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
-    weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
-    uv = geom.new_empty(2, n)
-    tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
-    tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
-    tracers.give(tracer)
+    with borrowed_tracer(geom) as tracer:
+        n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near)
+        if most and n > most:
+            raise TooManyFragments(n, most, camera.width, camera.height, 8 + 5 * geom.element_size())
+        surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
+        weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
+        uv = geom.new_empty(2, n)
+        tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
+        tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
     return tile_start, tile_start, surfel, pixel, weight, uv, depth, sigma
 
 

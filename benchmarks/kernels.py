@@ -206,7 +206,7 @@ def pairs(projection: ops.Projection, camera: Camera) -> int:
     """Pairs of surfel and tile that the tracer looks at."""
     geom, size = projection.geom.detach(), (camera.width, camera.height)
     with borrowed_tracer(geom) as tracer:
-        tracer.run(geom, projection.radii, *size, projection.near, fragments=False)
+        tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, fragments=False)
         return tracer.pairs
 
 

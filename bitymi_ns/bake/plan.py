@@ -84,7 +84,7 @@ def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | Non
 def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor:
     """Radius in scale units at which opacity * (1 - r^2 / 9)^beta falls to the weight bound: [N], 0 where all is below.
 
-    What the low pass or the prefilter spreads beyond it, about a pixel, reads the tile's edge.
+    What the low pass or the pixel spreads beyond it, about a pixel, reads the tile's edge.
     """
     rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
     return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()

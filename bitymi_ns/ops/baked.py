@@ -87,7 +87,7 @@ class BakedArrays:
         mean_residual: [N, 3] residual of surfels without a tile, None = 0.
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight get no residual.
-        prefilter: the kernel is seen through a pixel (csrc/core/prefilter.h).
+        through_pixel: the kernel is seen through a pixel, as in `Projection`.
         transmittance_min: a surfel that would leave a pixel less transmittance is not blended and ends the pixel.
     """
 
@@ -101,7 +101,7 @@ class BakedArrays:
     mean_residual: Tensor | None
     near: float
     weight_bound: float
-    prefilter: bool
+    through_pixel: bool
     transmittance_min: float
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class BakedArrays:
         geometry = (p["means"], p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
         pages = None if self.texture is None else self.texture.pages
         optional = [None if t is None else t.detach().float().contiguous() for t in (self.extent, self.mean_residual)]
-        fixed = (self.offset, self.scale, self.weight_bound, self.near, self.prefilter, self.transmittance_min)
+        fixed = (self.offset, self.scale, self.weight_bound, self.near, self.through_pixel, self.transmittance_min)
         return (*geometry, self.view_color, terms, *full, *lean, self.tiles.contiguous(), *optional, pages, *fixed)
 
 

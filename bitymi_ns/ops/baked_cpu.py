@@ -72,12 +72,13 @@ def draw(
     image = geom.new_empty(camera.height, camera.width, MAP_CHANNELS if maps else BAKED_CHANNELS)
     overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
     with borrowed_tracer(geom) as tracer:
-        tracer.run(geom, projection.radii, *size, projection.near, fragments=False)
+        tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, fragments=False)
         tracer.baked(
             geom,
             projection.radii,
             *size,
             projection.near,
+            projection.through_pixel,
             weight_bound,
             transmittance_min,
             maps,

@@ -15,8 +15,8 @@ def _compiled(name: str) -> Any:
         return getattr(load("_cpu"), name)
     except AttributeError as error:
         raise RuntimeError(
-            f"the compiled module bitymi_ns._cpu does not know {name}: it is older than the package. Install the package "
-            "again (`pip install .`, or `make setup` in a checkout)"
+            f"the compiled module bitymi_ns._cpu does not know {name}: it is older than the package. Install the "
+            "package again (`pip install .`, or `make setup` in a checkout)"
         ) from error
 
 
@@ -47,7 +47,7 @@ MAX_LEVELS: int = _compiled("MAX_LEVELS")
 TILE: int = _compiled("TILE")
 """Pixels along a side of a tile."""
 GEOM: int = _compiled("GEOM")
-"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), area (prefilter)."""
+"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), area."""
 FRAME: int = _compiled("FRAME")
 """Columns of a row of `frames`: mean, s_u t_u, s_v t_v."""
 IMAGE_CHANNELS: int = _compiled("IMAGE_CHANNELS")

@@ -160,8 +160,8 @@ def add_texel_gradient(
     dtexels: Tensor | None,
     dbase: Tensor | None = None,
 ) -> None:
-    """The backward pass of `texel_image` for callers that sum over views: autograd would clear and add a whole atlas per
-    view.
+    """The backward pass of `texel_image` for callers that sum over views: autograd would clear and add a whole atlas
+    for each.
 
     Args:
         dimage: [H * W, 3] gradient of the image.

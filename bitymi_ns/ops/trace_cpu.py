@@ -49,7 +49,7 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
     """
     camera = projection.camera
     with borrowed_tracer(geom) as tracer:
-        n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near)
+        n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near, projection.through_pixel)
         if most and n > most:
             raise TooManyFragments(n, most, camera.width, camera.height, 8 + 5 * geom.element_size())
         surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
@@ -71,5 +71,7 @@ def backward(
     absgrad: Tensor,
 ) -> None:
     """Writes dgeom [N, 16] and absgrad [N, 2] from the gradients of weight, uv and depth (None = zero)."""
-    width = projection.camera.width
-    kernel("trace_backward", geom)(geom, projection.near, rim, width, tile_start, *arrays, *grads, dgeom, absgrad)
+    p = projection
+    kernel("trace_backward", geom)(
+        geom, p.near, p.through_pixel, rim, p.camera.width, tile_start, *arrays, *grads, dgeom, absgrad
+    )

@@ -20,8 +20,8 @@ VIEW_COLORS: dict[str, tuple[str, ...]] = {
 LEAN = ("view_base", "view_span", "view_terms")
 """Names of the parameters of lean view colours, of which every surfel has as many terms as it needs."""
 LEAN_WIDTH = {"sv": 6, "sh": 3, "sb": 6, "sg": 7}
-"""Numbers per term. sv: b, rgb relative to the first site (csrc/core/view_color.h); sh: the coefficients of one function,
-from degree 1 on; sb, sg: a lobe."""
+"""Numbers per term. sv: b, rgb relative to the first site (csrc/core/view_color.h); sh: the coefficients of one
+function, from degree 1 on; sb, sg: a lobe."""
 
 
 class _ViewColor(torch.autograd.Function):
@@ -69,9 +69,9 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
     if kind == "sh" and terms not in (1, 4, 9, 16):
         raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, not {terms - 1}")
     if kind == "sv" and terms < 1:
-        raise ValueError("Spherical Voronoi colours need at least one site a surfel")
+        raise ValueError("Spherical Voronoi colours need at least one site per surfel")
     if terms > MAX_TERMS:
-        raise ValueError(f"at most {MAX_TERMS} sites or lobes a surfel, not {terms}")
+        raise ValueError(f"at most {MAX_TERMS} sites or lobes per surfel, not {terms}")
     return terms
 
 

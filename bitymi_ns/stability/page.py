@@ -127,7 +127,9 @@ def _replace(path: Path, data: bytes) -> None:
 
 def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:
     parts = [
-        INTRODUCTION.format(backend=backend.name, rim=RIM, probes=PROBES, accurate=ACCURATE, steps=STEPS, allowance=ALLOWANCE),
+        INTRODUCTION.format(
+            backend=backend.name, rim=RIM, probes=PROBES, accurate=ACCURATE, steps=STEPS, allowance=ALLOWANCE
+        ),
         "## Error against stiffness\n",
         f"![Error against stiffness, eight kinds]({picture})\n",
         "Solid: float32. Dashed: what rounding the inputs does. Dotted: float64. Errors below 1e-17 are drawn there.\n",

@@ -35,8 +35,8 @@ BT_HD S level_radius2(S level, S beta, S slack) {
   return S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + slack);
 }
 
-// With the prefilter the level set lies in the ellipse q <= r_c^2 of the largest blur and magnification that any pixel
-// can have: omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
+// Seen through a pixel the level set lies in the ellipse q <= r_c^2 of the largest blur and magnification that any
+// pixel can have: omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
 BT_HD Extent filtered_extent(const double* g) {
   using S = double;
   Extent e = {};
@@ -67,12 +67,12 @@ BT_HD Extent filtered_extent(const double* g) {
   return e;
 }
 
-template <class F>
+template <class Kernel, class F>
 BT_HD Extent extent(const F* geom) {
   using S = double;
   S g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = S(geom[i]);
-  if (g[kArea] > S(0)) return filtered_extent(g);
+  if (filtered<Kernel>(g)) return filtered_extent(g);
   Extent e;
   const S ratio = times_drawn(g[kOpacity]);
   e.visible = ratio >= S(1);
@@ -179,9 +179,9 @@ BT_HD TileSpan tile_columns(const Extent& e, const F* geom, int row, int width) 
   return {int(max_(0.0, floor_(cx + x0))) / kTile, min_(tiles_across(width) - 1, last)};
 }
 // fn(row, first, last) for every row of tiles in which the surfel can touch those from `first` to `last`.
-template <class F, class Visit>
+template <class Kernel, class F, class Visit>
 BT_HD void for_tile_rows(const F* geom, int width, int height, Visit&& fn) {
-  const Extent e = extent(geom);
+  const Extent e = extent<Kernel>(geom);
   const TileSpan rows = tile_rows(e, geom, height);
   for (int row = rows.first; row <= rows.last; ++row) {
     const TileSpan columns = tile_columns(e, geom, row, width);

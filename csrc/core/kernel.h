@@ -1,6 +1,6 @@
 // Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel) with a
-// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or, where a row's kArea is
-// set, with the prefilter of core/prefilter.h.
+// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel, of which
+// core/prefilter.h has the formulas.
 #pragma once
 
 #include "core/blend.h"
@@ -52,10 +52,10 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
 }
 
 // Without kBlur the low pass is left out, for pixels that are not near the centre.
-template <class S, class T, bool kBlur = true>
+template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
-  if (g[kArea] > S(0)) return filtered_fragment<S, T>(g, near, filtered_place<S, T>(g, dx, dy));
+  if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_place<S, T>(g, dx, dy));
   const Hit<T> h = hit(g, near, dx, dy);
   const auto inside = h.ok & (h.rest > zero);
   const T kernel = select(inside, power_(select(inside, h.rest, one), T(g[kBeta])), zero);
@@ -77,10 +77,10 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
 
 // Gradients towards a row of geom, added to d[kGeom]; ddx, ddy is the gradient with respect to the pixel's offset.
 // `rim` bounds 1 - x from below in the kernel's derivative, which diverges at the rim for beta < 1.
-template <class S, class T>
+template <class Kernel, class S, class T>
 BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
                         T& ddy) {
-  if (g[kArea] > S(0)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
+  if (filtered<Kernel>(g)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
   const T zero = T(S(0)), two = T(S(2));
   const Hit<T> h = hit(g, near, dx, dy);
   const T u = h.u, v = h.v, inv = h.inv, rest = h.rest, q = T(g[kW0] * g[kZ]);

@@ -99,7 +99,7 @@ BT_HD Reach<S> reach(const S* g, S r2, S blur2) {
   return e;
 }
 
-// With the prefilter: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
+// Seen through a pixel: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
 template <class S>
 struct FilteredReach {
   bool visible;

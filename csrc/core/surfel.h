@@ -23,10 +23,31 @@ constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their 
 
 // Columns of a row of `geom` [N, kGeom].
 enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kArea, kGeom = 16 };
-// kArea: 0, or with the prefilter n = fx fy s_u s_v / z^2, for which n w0 is the area of the projected scale ellipse
-// over pi (core/prefilter.h).
-// Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
+// kArea: 0, or where PixelKernel filters the surfel n = fx fy s_u s_v / z^2, for which n w0 is the area of the
+// projected scale ellipse over pi. Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world
+// frame.
 constexpr int kFrame = 9;
+
+// How a launch draws surfels, known when its code is compiled: united with the low pass (core/kernel.h), or seen
+// through a pixel (core/prefilter.h), where rows without kArea are as with the low pass. with_kernel is the one place
+// that chooses.
+struct LowPassKernel {
+  static constexpr bool kPixel = false;
+};
+struct PixelKernel {
+  static constexpr bool kPixel = true;
+};
+template <class F>
+void with_kernel(bool through_pixel, F&& launch) {
+  through_pixel ? launch(PixelKernel()) : launch(LowPassKernel());
+}
+template <class Kernel, class S>
+BT_HD bool filtered(const S* g) {
+  if constexpr (Kernel::kPixel)
+    return g[kArea] > S(0);
+  else
+    return false;
+}
 
 // The geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
 template <class S>
@@ -92,8 +113,8 @@ BT_HD bool scale_moves(S log_scale) {
 
 // Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre
 // is nearer than `near` (camera z).
-template <class S>
-BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, bool prefilter, S* geom, S* frame) {
+template <class Kernel, class S>
+BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, S* geom, S* frame) {
   const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
   const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
   const Rotation<S> rot = rotation(in.quats + 4 * i);
@@ -120,7 +141,7 @@ BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S nea
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
   // discs of a million pixels need no filter, and their squared areas would overflow
   const S area = cam.fx * cam.fy * su * sv * iz * iz;
-  g[kArea] = prefilter && area < S(1e12) ? area : S(0);
+  g[kArea] = Kernel::kPixel && area < S(1e12) ? area : S(0);
   for (int i = 0; i < kGeom; ++i)
     if (!finite_(g[i])) return false;
   for (int i = 0; i < kGeom; ++i) geom[i] = g[i];

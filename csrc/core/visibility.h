@@ -16,14 +16,14 @@ BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
 
 // Rows of surfel i in geom, frames and radii (half extents of the level set's box in pixels); all 0 where the camera
 // does not see it. False when that is because a parameter is not finite.
-template <class S>
-BT_HD bool see(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near, bool prefilter,
-               S* geom, S* frames, S* radii) {
+template <class Kernel, class S>
+BT_HD bool see(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near, S* geom,
+               S* frames, S* radii) {
   S g[kGeom], f[kFrame], r[2] = {S(0), S(0)};
-  const bool projected = project(cam, in, i, near, prefilter, g, f);
+  const bool projected = project<Kernel>(cam, in, i, near, g, f);
   bool seen = projected;
   if (projected) {
-    const Extent e = extent(g);
+    const Extent e = extent<Kernel>(g);
     seen = e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
     const double most = 1e6;
     if (seen) r[0] = S(min_(most, max_(e.x1, -e.x0))), r[1] = S(min_(most, max_(e.y1, -e.y0)));

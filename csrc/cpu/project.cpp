@@ -22,12 +22,14 @@ int num_threads() {
 void set_num_threads(int n) { g_threads = n; }
 
 template <class S>
-int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bool prefilter, const Surfels<S>& in,
+int64_t project_forward(bool through_pixel, const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in,
                         S* geom, S* frames, S* radii) {
   std::vector<int64_t> broken(num_threads(), 0);
-  parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i)
-      broken[thread] += !see(cam, width, height, in, i, near, prefilter, geom, frames, radii);
+  with_kernel(through_pixel, [&](auto kernel) {
+    parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i)
+        broken[thread] += !see<decltype(kernel)>(cam, width, height, in, i, near, geom, frames, radii);
+    });
   });
   return std::accumulate(broken.begin(), broken.end(), int64_t(0));
 }
@@ -41,7 +43,8 @@ void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom
   });
 }
 
-template <class S>
+namespace {
+template <class Kernel, class S>
 void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
   bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
@@ -63,7 +66,7 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
     for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
       const size_t head = list.size();
       list.push_back(0);
-      for_tile_rows(geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
+      for_tile_rows<Kernel>(geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
         for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
           list.push_back(tile);
           ++at[t][tile];
@@ -92,12 +95,18 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
     }
   }
 }
+}  // namespace
+
+template <class S>
+void bin(bool through_pixel, int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
+  with_kernel(through_pixel, [&](auto kernel) { bin<decltype(kernel)>(n, geom, radii, width, height, bins); });
+}
 
 #define BT_INSTANTIATE(S)                                                                                   \
-  template int64_t project_forward<S>(const Pinhole<S>&, int, int, S, bool, const Surfels<S>&, S*, S*, S*); \
+  template int64_t project_forward<S>(bool, const Pinhole<S>&, int, int, S, const Surfels<S>&, S*, S*, S*); \
   template void project_backward<S>(const Pinhole<S>&, const Surfels<S>&, const S*, const S*, const S*,     \
                                     const SurfelGradients<S>&);                                             \
-  template void bin<S>(int64_t, const S*, const S*, int, int, Bins&);
+  template void bin<S>(bool, int64_t, const S*, const S*, int, int, Bins&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

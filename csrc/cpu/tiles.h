@@ -37,7 +37,7 @@ struct TileState {
   }
 
   // Blends a surfel: fn(pack, lanes, fragment, weight) for every pack in which some pixel takes it.
-  template <class F>
+  template <class Kernel, class F>
   void blend(const S* g, const S* radius, S near, F&& fn) {
     const S cx = g[kCx] - x0, cy = g[kCy] - y0;
     const int left = first(cx - radius[0]), right = last(cx + radius[0]);
@@ -47,7 +47,7 @@ struct TileState {
         const int pack = py * kPacksAcross + px;
         if (!bits(open[pack])) continue;
         const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
-        if (g[kArea] > S(0)) {
+        if (filtered<Kernel>(g)) {
           const FilteredPlace<P> at = filtered_place<S, P>(g, dx, dy);
           if (bits(open[pack] & (at.q < P(S(kSupport * kSupport)))))
             take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
@@ -56,8 +56,8 @@ struct TileState {
         // a cheap look first: does any lane lie in the support or near the centre?
         const M inside = within(planes(g, dx, dy), P(S(kSupport * kSupport))), close = near_centre(dx, dy);
         if (!bits(open[pack] & (inside | close))) continue;
-        take_fragment(pack,
-                      bits(close) ? fragment<S, P, true>(g, near, dx, dy) : fragment<S, P, false>(g, near, dx, dy), fn);
+        take_fragment(
+            pack, bits(close) ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy), fn);
       }
     }
   }

@@ -18,7 +18,8 @@ void reserve(typename FragmentList<S>::Arena& a, int64_t more) {
 }
 }  // namespace
 
-template <class S>
+namespace {
+template <class Kernel, class S>
 void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
                    FragmentList<S>& list) {
   using P = Pack<S>;
@@ -41,30 +42,38 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
       reserve<S>(a, kTile * kTile + kLanes);
-      state.blend(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
-                  [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
-                    const int64_t at = a.used;
-                    const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width + tx * kTile +
-                                           pack % kPacksAcross * kPackSide;
-                    int n = 0;
-                    for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
-                      const int lane = __builtin_ctz(rest);
-                      a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
-                      a.surfel[at + n] = id;
-                    }
-                    compress(&a.weight[at], weight, lanes);
-                    compress(&a.u[at], f.u, lanes);
-                    compress(&a.v[at], f.v, lanes);
-                    compress(&a.depth[at], f.depth, lanes);
-                    compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
-                    a.used = at + n;
-                  });
+      state.template blend<Kernel>(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
+                                   [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
+                                     const int64_t at = a.used;
+                                     const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width +
+                                                            tx * kTile + pack % kPacksAcross * kPackSide;
+                                     int n = 0;
+                                     for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
+                                       const int lane = __builtin_ctz(rest);
+                                       a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
+                                       a.surfel[at + n] = id;
+                                     }
+                                     compress(&a.weight[at], weight, lanes);
+                                     compress(&a.u[at], f.u, lanes);
+                                     compress(&a.v[at], f.v, lanes);
+                                     compress(&a.depth[at], f.depth, lanes);
+                                     compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
+                                     a.used = at + n;
+                                   });
     }
     list.pieces[tile] = {thread, from, a.used - from};
   }
   list.tile_start.assign(tiles + 1, 0);
   for (int64_t t = 0; t < tiles; ++t) list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
   list.total = list.tile_start[tiles];
+}
+}  // namespace
+
+template <class S>
+void trace_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   FragmentList<S>& list) {
+  with_kernel(through_pixel,
+              [&](auto kernel) { trace_forward<decltype(kernel)>(geom, radii, near, bins, width, height, list); });
 }
 
 template <class S>
@@ -85,7 +94,8 @@ void trace_copy(const FragmentList<S>& list, const FragmentArrays<S>& out) {
   }
 }
 
-template <class S>
+namespace {
+template <class Kernel, class S>
 void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
                     const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad) {
   using P = Pack<S>;
@@ -134,8 +144,8 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
         d[kArea] = P(S(0));
         for (int k = 0; k < m; k += kLanes) {
           P ddx, ddy;
-          fragment_vjp<S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k), load(du + k),
-                             load(dv + k), load(dz + k), d, ddx, ddy);
+          fragment_vjp<Kernel, S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k),
+                                     load(du + k), load(dv + k), load(dz + k), d, ddx, ddy);
           ax += max_(ddx, -ddx), ay += max_(ddy, -ddy);
         }
         S* to = sums.data() + int64_t(id) * kSums;
@@ -156,17 +166,28 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
     }
   });
 }
+}  // namespace
+
+template <class S>
+void trace_backward(bool through_pixel, int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start,
+                    int64_t tiles, const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth,
+                    S* dgeom, S* absgrad) {
+  with_kernel(through_pixel, [&](auto kernel) {
+    trace_backward<decltype(kernel)>(n, geom, near, rim, width, tile_start, tiles, f, dweight, duv, ddepth, dgeom,
+                                     absgrad);
+  });
+}
 
 void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixel, const uint8_t* mask,
                    int32_t* counts) {
   for (int64_t i = 0; i < fragments; ++i) counts[surfel[i]] += mask[pixel[i]] != 0;
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template void trace_forward<S>(const S*, const S*, S, const Bins&, int, int, FragmentList<S>&);                  \
-  template void trace_copy<S>(const FragmentList<S>&, const FragmentArrays<S>&);                                   \
-  template void trace_backward<S>(int64_t, const S*, S, S, int, const int64_t*, int64_t, const FragmentArrays<S>&, \
-                                  const S*, const S*, const S*, S*, S*);
+#define BT_INSTANTIATE(S)                                                                               \
+  template void trace_forward<S>(bool, const S*, const S*, S, const Bins&, int, int, FragmentList<S>&); \
+  template void trace_copy<S>(const FragmentList<S>&, const FragmentArrays<S>&);                        \
+  template void trace_backward<S>(bool, int64_t, const S*, S, S, int, const int64_t*, int64_t,          \
+                                  const FragmentArrays<S>&, const S*, const S*, const S*, S*, S*);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -5,7 +5,8 @@
 //   bin       surfels are sorted by depth (32-bit keys, in place of one sort of all pairs by tile and depth, whose keys
 //             are three times as wide and ten times as many); each then writes its (tile, surfel) pairs at its place,
 //             and a stable sort by tile alone, 16-bit keys where they fit, leaves every tile's list front to back.
-//   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the 8 x 4
+//   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the
+//   8 x 4
 //             parts of the tile that its surfel reaches, so a warp looks at those alone.
 //
 // Nothing is allocated and nothing waits: counts stay on the device, and the second sort runs over the whole capacity,
@@ -32,7 +33,7 @@ struct BakedSurfels {
   const uint64_t* pages;       // a texture per page of the atlas, null: none
   float offset, scale;         // residual = offset + scale * texel
   float weight_bound, near;
-  bool prefilter;
+  bool through_pixel;       // chooses between the kernels of core/surfel.h
   float transmittance_min;  // a surfel that would leave a pixel less is not blended and ends it; 0: all are
 };
 

@@ -1,8 +1,8 @@
 // First stage of the baked renderer: the surfels that a view sees, each as the row that the later stages read.
 //
-// One thread per surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters per surfel with
-// seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next to each
-// other: a block packs them.
+// One thread per surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters per surfel
+// with seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next
+// to each other: a block packs them.
 #include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_stages.h"
@@ -58,7 +58,7 @@ __device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> colo
   for (int k = 0; k < 4; ++k) row[kTileX + k] = place[k];
 }
 
-template <bool kPrefilter>
+template <class Kernel>
 __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, BakedViews v, BakedFrame f) {
   __shared__ int seen_count;
   __shared__ int seen_list[kThreads];
@@ -77,16 +77,16 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
     const Surfels<float>& in = s.geometry;
     float geom[kGeom], frame[kFrame];
     const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
-    seen = project(camera, in, i, s.near, kPrefilter, geom, frame);
+    seen = project<Kernel>(camera, in, i, s.near, geom, frame);
     if (seen) {
       LevelSet<float> level;
-      if (kPrefilter && geom[kArea] > 0)
+      if (filtered<Kernel>(geom))
         level = {filtered_reach(geom).visible, 0, -geom[kArea]};
       else
         level = level_set(geom);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
-      area = footprint<kPrefilter>(row, v.height);
+      area = footprint<Kernel>(row, v.height);
       const Reach<float>& e = area.reach;
       const float x0 = e.ellipse ? min_(e.x0, -e.blur) - area.pad : -e.blur;
       const float x1 = e.ellipse ? max_(e.x1, e.blur) + area.pad : e.blur;
@@ -115,7 +115,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
   for (unsigned rest = __ballot_sync(kFullMask, shared); rest; rest &= rest - 1) {
     const int source = __ffs(int(rest)) - 1;
     const Footprint big =
-        footprint<kPrefilter>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
+        footprint<Kernel>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
     int32_t sum = 0;
     for (int ty = big.top + lane; ty <= big.bottom; ty += kWarp) {
       const TileRow r = tile_row(big, ty, v.width);
@@ -149,10 +149,9 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
 void baked_prepare(const BakedSurfels& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
   if (!f.rows) return;
   const dim3 grid(unsigned(ceil_div(f.n, kThreads)), unsigned(v.count));
-  if (f.prefilter)
-    BT_LAUNCH(prepare_kernel<true>, grid, dim3(kThreads), 0, stream, s, v, f);
-  else
-    BT_LAUNCH(prepare_kernel<false>, grid, dim3(kThreads), 0, stream, s, v, f);
+  with_kernel(f.through_pixel, [&](auto kernel) {
+    BT_LAUNCH(prepare_kernel<decltype(kernel)>, grid, dim3(kThreads), 0, stream, s, v, f);
+  });
 }
 
 }  // namespace bt::cuda

@@ -1,13 +1,13 @@
 // Third stage of the baked renderer: the images.
 //
-// A warp draws 8 x 8 pixels, two per thread (four rows apart), and works for itself: no barrier of the block, no waiting
-// for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names one of
-// its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread reads the
-// same row (a broadcast, four loads of 16 bytes) for both its pixels. The three planes cost three multiply-adds for the
-// second pixel. On scenes like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of its 8 parts, and 6 of
-// 10 pixels that are looked at blend it: the masks leave little to reject. A hit costs one reciprocal, one logarithm,
-// one exponential and, where the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by
-// the texture unit; memory traffic is 96 bytes per row and warp, mostly from L2.
+// A warp draws 8 x 8 pixels, two per thread (four rows apart), and works for itself: no barrier of the block, no
+// waiting for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names
+// one of its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread
+// reads the same row (a broadcast, four loads of 16 bytes) for both its pixels. The three planes cost three
+// multiply-adds for the second pixel. On scenes like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of
+// its 8 parts, and 6 of 10 pixels that are looked at blend it: the masks leave little to reject. A hit costs one
+// reciprocal, one logarithm, one exponential and, where the weight is above the bound, one texture fetch. Bound by
+// issue of arithmetic, then by the texture unit; memory traffic is 96 bytes per row and warp, mostly from L2.
 #include "core/kernel.h"
 #include "core/shading.h"
 #include "core/texel.h"
@@ -47,24 +47,19 @@ struct Row {
   uint32_t id;
 };
 
-// How a surfel covers a pixel: the kernel alone, united with the low pass, or seen through the pixel.
-enum class Cover { kKernel, kLowPass, kFiltered };
-
-template <bool kMaps, Cover kCover>
+// A row under a thread's pixel. With LowPassKernel, kBlur says whether the low pass shows; PixelKernel is for the rows
+// that it filters alone.
+template <bool kMaps, class Kernel, bool kBlur>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel& p) {
   bool near_it = p.transmittance > 0;
-  if (kCover != Cover::kFiltered) {  // the planes alone say for most pixels that the surfel is not there
+  if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
     const Planes<float> at = planes(s.g, dx, dy);
     bool inside = within(at, s.r2) && at.W > 0;
-    if (kCover == Cover::kLowPass) inside = inside || dx * dx + dy * dy < s.blur2;
+    if (kBlur) inside = inside || dx * dx + dy * dy < s.blur2;
     near_it = near_it && inside;
   }
   if (!near_it) return;
-  float g[kGeom];
-  BT_UNROLL
-  for (int k = 0; k < kGeom; ++k) g[k] = s.g[k];
-  g[kArea] = kCover == Cover::kFiltered ? s.g[kArea] : 0.0f;  // known to the compiler
-  const Fragment<Fast> f = fragment<float, Fast, kCover == Cover::kLowPass>(g, a.near, Fast(dx), Fast(dy));
+  const Fragment<Fast> f = fragment<Kernel, kBlur>(s.g, a.near, Fast(dx), Fast(dy));
   const float sigma = f.sigma.v;
   const auto [weight, behind] = bt::blend(sigma, p.transmittance);
   const Verdict<float> v = judge(true, sigma, behind, a.transmittance_min);
@@ -117,8 +112,8 @@ __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
   }
 }
 
-template <bool kMaps, bool kPrefilter>
-__global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_kernel(DrawArgs a) {
+template <bool kMaps, class Kernel>
+__global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
@@ -165,7 +160,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_ke
       if (k % kLook == kLook - 1 && !__any_sync(kFullMask, p[0].transmittance > 0 || p[1].transmittance > 0)) break;
       const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
       const uint32_t pair = queue[k];
-      const float area = kPrefilter && q3.y < 0 ? -q3.y : 0.0f;
+      const float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
       const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
                      q3.x,
                      q3.y,
@@ -178,12 +173,12 @@ __global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_ke
       for (int j = 0; j < kPixels; ++j) {
         if (!(pair & part[j])) continue;
         const float below = dy + kBandRows * j;
-        if (kPrefilter && s.blur2 < 0)
-          blend<kMaps, Cover::kFiltered>(a, s, dx, below, p[j]);
+        if (filtered<Kernel>(s.g))
+          blend<kMaps, Kernel, true>(a, s, dx, below, p[j]);
         else if (s.blur2 > 0)
-          blend<kMaps, Cover::kLowPass>(a, s, dx, below, p[j]);
+          blend<kMaps, LowPassKernel, true>(a, s, dx, below, p[j]);
         else
-          blend<kMaps, Cover::kKernel>(a, s, dx, below, p[j]);
+          blend<kMaps, LowPassKernel, false>(a, s, dx, below, p[j]);
       }
     }
     wanted = 0;
@@ -219,14 +214,12 @@ void baked_draw(const BakedSurfels& s, const BakedImages& images, const BakedFra
                       images};
   const dim3 grid(static_cast<unsigned>(f.tiles));
   const bool maps = images.beta || images.depth || images.normal || images.overdraw;
-  if (maps && f.prefilter)
-    BT_LAUNCH((draw_kernel<true, true>), grid, dim3(kThreads), 0, stream, a);
-  else if (maps)
-    BT_LAUNCH((draw_kernel<true, false>), grid, dim3(kThreads), 0, stream, a);
-  else if (f.prefilter)
-    BT_LAUNCH((draw_kernel<false, true>), grid, dim3(kThreads), 0, stream, a);
-  else
-    BT_LAUNCH((draw_kernel<false, false>), grid, dim3(kThreads), 0, stream, a);
+  with_kernel(f.through_pixel, [&](auto kernel) {
+    if (maps)
+      BT_LAUNCH((draw_kernel<true, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
+    else
+      BT_LAUNCH((draw_kernel<false, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
+  });
 }
 
 }  // namespace bt::cuda

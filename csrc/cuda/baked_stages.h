@@ -11,9 +11,9 @@ constexpr uint32_t kNeverSeen = 0xffffffffu;  // depth key of a surfel that is n
 
 // A surfel's row: the first twelve columns are those of GeomColumn. 24 floats are three sectors of 32 bytes.
 enum RowColumn {
-  kR2 = kBeta + 1,         // level set u^2 + v^2 <= r2
-  kBlur2,                  // and d^2 <= blur2; 0: the low pass does not show; with the prefilter -kArea
-  kRed,                    // relu(view colour + 0.5), three
+  kR2 = kBeta + 1,  // level set u^2 + v^2 <= r2
+  kBlur2,           // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel
+  kRed,             // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
   kPage,                   // handle of the texture, 64 bits
   kTileX = kPage + 2,      // centre of the tile's first texel, two; or three: the colour with the constant residual
@@ -39,10 +39,10 @@ struct BakedMemory {
 struct BakedFrame {
   int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs
   int width, height, tiles_x, tiles_y;
-  int64_t tiles;   // of all views
-  int key_bits;    // tile numbers and the key of unused room
-  bool wide;       // keys of 32 bits
-  bool prefilter;  // some rows are of discs seen through a pixel
+  int64_t tiles;       // of all views
+  int key_bits;        // tile numbers and the key of unused room
+  bool wide;           // keys of 32 bits
+  bool through_pixel;  // as in BakedSurfels
   BakedMemory memory;
 };
 
@@ -69,10 +69,10 @@ BT_HD void geom_of(const float* row, float* geom) {
   for (int k = 0; k < kGeom; ++k) geom[k] = k <= kBeta ? row[k] : 0.0f;
   geom[kArea] = row[kBlur2] < 0 ? -row[kBlur2] : 0.0f;
 }
-template <bool kPrefilter>
+template <class Kernel>
 BT_HD Footprint footprint(const float* row, int height) {
   Footprint f;
-  if (kPrefilter && row[kBlur2] < 0) {
+  if (Kernel::kPixel && row[kBlur2] < 0) {
     float geom[kGeom];
     geom_of(row, geom);
     f.reach = filtered_reach<float>(geom).reach;

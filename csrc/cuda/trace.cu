@@ -1,4 +1,5 @@
-// Fragments of a view. One block per tile, one warp per 8 x 4 pixels, one lane per pixel; warps do not wait for each other.
+// Fragments of a view. One block per tile, one warp per 8 x 4 pixels, one lane per pixel; warps do not wait for each
+// other.
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
 // the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
@@ -25,12 +26,12 @@ struct MarkSpace {
 };
 
 // `blur` is the same for a whole warp
-template <class S>
+template <class Kernel, class S>
 __device__ Fragment<S> fragment_at(const S* g, S near, S dx, S dy, bool blur) {
-  return blur ? fragment<S, S, true>(g, near, dx, dy) : fragment<S, S, false>(g, near, dx, dy);
+  return blur ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy);
 }
 
-template <class S>
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
                 const int64_t* tile_pairs, uint32_t* masks) {
@@ -63,10 +64,10 @@ __global__ void __launch_bounds__(kTileThreads)
       const S dx = x - g[kCx], dy = y - g[kCy];
       // a cheap look first: does any open pixel lie in the support or near the centre?
       const bool close = near_centre(dx, dy);
-      const bool reached = g[kArea] > S(0) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
-                                           : close || within(planes<S, S>(g, dx, dy), S(kSupport * kSupport));
+      const bool reached = filtered<Kernel>(g) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
+                                               : close || within(planes<S, S>(g, dx, dy), S(kSupport * kSupport));
       if (!__any_sync(kFullMask, open && reached)) continue;
-      const S sigma = fragment_at(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
+      const S sigma = fragment_at<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
       const S behind = blend(sigma, transmittance).behind;
       const Verdict<S> v = judge(open, sigma, behind, S(kTransmittanceMin));
       open = open && !v.ends;
@@ -95,7 +96,7 @@ __global__ void __launch_bounds__(kThreads)
   if (t <= tiles) tile_start[t] = offsets[tile_pairs[t]];
 }
 
-template <class S>
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
   const Spot s = spot(p.width);
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
@@ -105,7 +106,7 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
     S g[kGeom];
     load_shape(geom + int64_t(id) * kGeom, g);
     const S dx = x - g[kCx], dy = y - g[kCy];
-    const Fragment<S> f = fragment_at(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+    const Fragment<S> f = fragment_at<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
     if (mine) {
       const Blend<S> b = blend(f.sigma, transmittance);
       transmittance = b.behind;
@@ -140,15 +141,17 @@ int64_t trace_mark_workspace(int64_t pairs) {
 }
 
 template <class S>
-void trace_mark(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
-                const int64_t* tile_pairs, uint32_t* masks, int64_t* offsets, int64_t* tile_start, void* workspace,
-                Stream stream) {
+void trace_mark(bool through_pixel, const S* geom, const S* radii, S near, int width, int height, int64_t pairs,
+                const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks, int64_t* offsets,
+                int64_t* tile_start, void* workspace, Stream stream) {
   const int64_t tiles = int64_t(tiles_across(width)) * tiles_across(height);
   Arena arena(workspace);
   const MarkSpace w(arena, pairs);
   if (pairs)
-    BT_LAUNCH(mark_kernel<S>, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, geom, radii, near, width, height,
-              pairs, surfel, tile_pairs, masks);
+    with_kernel(through_pixel, [&](auto kernel) {
+      BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, geom, radii,
+                near, width, height, pairs, surfel, tile_pairs, masks);
+    });
   BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs, masks,
             w.counts);
   exclusive_sum(w.counts, offsets, pairs + 1, w.temp, w.temp_size, stream);
@@ -157,9 +160,13 @@ void trace_mark(const S* geom, const S* radii, S near, int width, int height, in
 }
 
 template <class S>
-void trace_fill(const S* geom, S near, const Pairs& p, const FragmentArrays<S>& out, Stream stream) {
+void trace_fill(bool through_pixel, const S* geom, S near, const Pairs& p, const FragmentArrays<S>& out,
+                Stream stream) {
   if (!out.total) return;
-  BT_LAUNCH(fill_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, geom, near, p, out);
+  with_kernel(through_pixel, [&](auto kernel) {
+    BT_LAUNCH((fill_kernel<decltype(kernel), S>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, geom, near,
+              p, out);
+  });
 }
 
 void masked_counts(const Pairs& p, const uint8_t* mask, int32_t* counts, Stream stream) {
@@ -167,10 +174,10 @@ void masked_counts(const Pairs& p, const uint8_t* mask, int32_t* counts, Stream 
   BT_LAUNCH(counts_kernel, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, mask, counts);
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template void trace_mark<S>(const S*, const S*, S, int, int, int64_t, const int32_t*, const int64_t*, uint32_t*, \
-                              int64_t*, int64_t*, void*, Stream);                                                  \
-  template void trace_fill<S>(const S*, S, const Pairs&, const FragmentArrays<S>&, Stream);
+#define BT_INSTANTIATE(S)                                                                                     \
+  template void trace_mark<S>(bool, const S*, const S*, S, int, int, int64_t, const int32_t*, const int64_t*, \
+                              uint32_t*, int64_t*, int64_t*, void*, Stream);                                  \
+  template void trace_fill<S>(bool, const S*, S, const Pairs&, const FragmentArrays<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -1,6 +1,6 @@
-// View colours of all surfels: one thread per surfel. Spherical Voronoi with 7 sites reads 196 bytes per visible surfel and
-// does 330 operations, backward 392 bytes and 550: bound by memory. A thread's numbers lie together, so a warp reads
-// whole lines, a few numbers of each at a time, and finds the rest of them in the L1.
+// View colours of all surfels: one thread per surfel. Spherical Voronoi with 7 sites reads 196 bytes per visible surfel
+// and does 330 operations, backward 392 bytes and 550: bound by memory. A thread's numbers lie together, so a warp
+// reads whole lines, a few numbers of each at a time, and finds the rest of them in the L1.
 #include <type_traits>
 
 #include "cuda/appearance.h"

@@ -54,7 +54,7 @@ from common import number, page, publish, say, table
 
 from bitymi_ns import ops
 from bitymi_ns.bake.packing import pack
-from bitymi_ns.ops.trace_cpu import tracers
+from bitymi_ns.ops.trace_cpu import borrowed_tracer
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
@@ -204,13 +204,10 @@ def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:
 
 def pairs(projection: ops.Projection, camera: Camera) -> int:
     """Pairs of surfel and tile that the tracer looks at."""
-    tracer = tracers.take(projection.geom)
-    tracer.run(
-        projection.geom.detach(), projection.radii, camera.width, camera.height, projection.near, fragments=False
-    )
-    count = tracer.pairs
-    tracers.give(tracer)
-    return count
+    geom, size = projection.geom.detach(), (camera.width, camera.height)
+    with borrowed_tracer(geom) as tracer:
+        tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, fragments=False)
+        return tracer.pairs
 
 
 def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Callable[[], object]]]]:

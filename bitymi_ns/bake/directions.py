@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from bitymi_ns.train.init import fibonacci_sphere
+
 BETWEEN = 32
 """Directions between and around those of the views."""
 SPHERE = 64
@@ -34,15 +36,6 @@ class Directions:
     views: int
 
 
-def sphere(count: int) -> Tensor:
-    """Directions spread evenly over the sphere along a Fibonacci spiral: [count, 3] float32."""
-    i = torch.arange(count, dtype=torch.float64)
-    z = 1.0 - (2.0 * i + 1.0) / count
-    angle = i * torch.pi * (3.0 - 5.0**0.5)
-    radius = (1.0 - z * z).sqrt()
-    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1).float()
-
-
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
     """The directions of all surfels, in chunks of surfels that about equally many views see.
 
@@ -58,7 +51,7 @@ def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Di
     order = torch.argsort(count, stable=True)
     unseen = int((count == 0).sum())
     for rows in order[:unseen].split(_CHUNK // SPHERE):
-        unit = sphere(SPHERE).to(means).expand(len(rows), -1, -1)
+        unit = fibonacci_sphere(SPHERE).to(means).expand(len(rows), -1, -1)
         yield Directions(rows, unit, torch.ones(unit.shape[:2], dtype=torch.bool, device=means.device), 0)
     g = torch.Generator().manual_seed(0)
     lot = torch.rand(BETWEEN, 3, generator=g).to(means)

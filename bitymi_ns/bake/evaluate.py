@@ -12,6 +12,7 @@ from bitymi_ns.bake.geometry import tangent_vectors, tile_points
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene.field import HashField
 
@@ -57,7 +58,7 @@ def evaluate_tiles(
     quats: Tensor,
     scales: Tensor,
     packing: Packing,
-    extent: float = 3.0,
+    extent: float = SUPPORT,
     chunk: int = 1 << 18,
     progress: Progress = no_progress,
 ) -> tuple[Tensor, int]:

@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns.bake.directions import Directions, sphere, view_directions
+from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.limits import beyond
 from bitymi_ns.bake.plan import STEPS
 from bitymi_ns.bake.progress import Progress, no_progress
-from bitymi_ns.bake.surfel_table import SH_C0
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_vectors, site_weights
 from bitymi_ns.ops import view_color
+from bitymi_ns.ops.constants import COLOR_BIAS, SH_C0
+from bitymi_ns.ops.shade import view_base
 from bitymi_ns.ops.view_color import LEAN_WIDTH, VIEW_COLORS
+from bitymi_ns.train.init import fibonacci_sphere
 
-COLOR_BIAS = 0.5
 FIT_STEPS = 6
 FIT_VIEWS = 16
 """The fit looks at so many of a surfel's views; the error is measured in all of them."""
@@ -63,7 +64,7 @@ def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Ten
     """
     origin = directions.new_zeros(3)
     columns = [view_color(kind, params, d.contiguous(), origin) for d in directions.unbind(1)]
-    return (torch.stack(columns, dim=1) + COLOR_BIAS).relu()
+    return view_base(torch.stack(columns, dim=1))
 
 
 def largest_error(a: Tensor, b: Tensor, valid: Tensor) -> Tensor:
@@ -137,7 +138,7 @@ def _fewer_sites(
     """Sites for the surfels `rest` of a chunk: (rows [m], base [m, 3], terms [m, number, 6]) for every number."""
     vectors, rgb = site_vectors(own["sv_sites"], own["sv_log_tau"]), own["sv_rgb"]
     sites = vectors.shape[1]
-    outside = sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
+    outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
     stride = -(-at.views // FIT_VIEWS) if at.views else 1  # views that see a surfel come first: an even choice of them
     looked = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
     weight = torch.cat([at.valid[:, : at.views : stride], at.valid[:, at.views :: 2]], dim=1).float()
@@ -151,7 +152,7 @@ def _fewer_sites(
         kept = left[number - 1][rest, :, None].expand(-1, -1, 3)
         v, r = vectors[rest].gather(1, kept), rgb[rest].gather(1, kept)
         b, r = fit_sites(v[:, 1:] - v[:, :1], r, looked[rest], colors[rest], weight[rest], FIT_STEPS)
-        shown = (site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r + COLOR_BIAS).relu()
+        shown = view_base(site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r)
         terms = torch.cat([b, r[:, 1:]], dim=2)
         good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
         good &= ~beyond("view_terms", "sv", terms).flatten(1).any(1) & ~beyond("view_base", "sv", r[:, 0]).any(1)

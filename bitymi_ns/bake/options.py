@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from bitymi_ns.bake.ktx2 import Format
 from bitymi_ns.bake.limits import EXTENTS
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Profile, RangeRule, bc7_encoder
+from bitymi_ns.ops.constants import SUPPORT
 
 
 @dataclass
@@ -21,7 +22,7 @@ class BakeOptions:
     """Smallest tile side in texels, a power of two of at least 4."""
     r_max: int = 64
     """Largest tile side in texels, a power of two."""
-    extent: float = 3.0
+    extent: float = SUPPORT
     """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
     4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
     tolerance: float = 0.75

@@ -27,11 +27,10 @@ from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, encode
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.surfel_table import view_color_kind
 from bitymi_ns.bake.visibility import Visibility, visibility
+from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
-
-OPACITY_FLOOR = 1.0 / 255.0  # below it a surfel is skipped at every pixel
 
 
 class BakeableScene(Protocol):
@@ -259,7 +258,7 @@ def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:
     turned = surfels["quats"].norm(dim=1)
     finite &= torch.isfinite(turned) & (turned > 1e-12)
     storable = finite & within(surfels, view_color_kind(surfels))
-    transparent = storable & (surfels["opacity_logits"].sigmoid() < OPACITY_FLOOR)
+    transparent = storable & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
     kept = torch.nonzero(storable & ~transparent).squeeze(1)
     counts = {"not_finite": ~finite, "beyond_limits": finite & ~storable, "transparent": transparent}
     return kept, {name: int(rows.sum()) for name, rows in counts.items()}

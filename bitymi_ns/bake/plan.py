@@ -13,10 +13,9 @@ from torch import Tensor
 from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.resolution import max_projected_extent, nyquist_resolution, voxel_along_axes
+from bitymi_ns.ops.constants import ALPHA_MAX, BETA_MAX, SUPPORT
 from bitymi_ns.scene.camera import Camera
 
-SUPPORT = 3.0  # radius of the kernel in scale units
-ALPHA_MAX = 0.99
 STEPS = 255.0  # 8-bit steps in a colour of 1
 PAPER_EXTENT = 4.0  # e of the paper's rule
 MARGIN = 1.5
@@ -79,13 +78,13 @@ def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | Non
     opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
     if transmittance is not None:
         opacity = opacity * (MARGIN * transmittance).clamp(max=1.0)
-    return opacity, 4.0 * surfels["beta_raw"].sigmoid()
+    return opacity, BETA_MAX * surfels["beta_raw"].sigmoid()
 
 
 def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor:
     """Radius in scale units at which opacity * (1 - r^2 / 9)^beta falls to the weight bound: [N], 0 where all is below.
 
-    What the low pass or the prefilter spreads beyond it, about a pixel, reads the tile's edge.
+    What the low pass or the pixel spreads beyond it, about a pixel, reads the tile's edge.
     """
     rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
     return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()

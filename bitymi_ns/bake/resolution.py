@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.camera import Camera
 
 # Forgives the rounding of a ratio that is meant to be a power of two, so that it does not double the tile.
@@ -49,7 +50,7 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
 def nyquist_resolution(
     scales: Tensor,
     delta: Tensor,
-    extent: float = 3.0,
+    extent: float = SUPPORT,
     r_min: int = 4,
     r_max: int = 64,
     max_pixels: Tensor | None = None,
@@ -83,7 +84,7 @@ def nyquist_resolution(
 
 
 def max_projected_extent(
-    means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = 3.0, near: float = 0.2
+    means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = SUPPORT, near: float = 0.2
 ) -> tuple[Tensor, Tensor]:
     """Largest projected size in pixels of every surfel's tile, per tangent axis, over the training views.
 

@@ -18,14 +18,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.directions import sphere
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, TERM_LIMITS, UNIT_SLACK, beyond
 from bitymi_ns.bake.ply import PlyError
 from bitymi_ns.ops import view_color
-from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, MAX_TERMS, check_lean
+from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
+from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, check_lean
 from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.train.init import fibonacci_sphere
 
-SH_C0 = 0.28209479177387814
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
 EXTENT_COLUMN = "tile_extent"
@@ -69,7 +69,7 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
     kind = kind or view_color_kind(surfels)
     if kind == "sv" or "view_terms" in surfels:
         n, origin = len(surfels["means"]), torch.zeros(3)
-        parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in sphere(32)]
+        parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in fibonacci_sphere(32)]
         return torch.stack(parts).mean(0)
     if kind == "sh":
         return surfels["sh_dc"] * SH_C0

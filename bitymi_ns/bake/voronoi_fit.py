@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-LOG_TAU_MAX = 16.0  # csrc/core/view_color.h
+from bitymi_ns.ops.constants import LOG_TAU_MAX
 
 
 def site_vectors(sites: Tensor, log_tau: Tensor) -> Tensor:

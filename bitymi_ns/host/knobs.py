@@ -23,13 +23,13 @@ from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.host.target import see_writable
-from bitymi_ns.ops.trace import TRANSMITTANCE_MIN
+from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import as_float, over_background
 
-WEIGHT_BOUNDS = (0.0, 1 / 255, 0.01, 0.02, 0.05, 0.1)
+WEIGHT_BOUNDS = (0.0, ALPHA_MIN, 0.01, 0.02, 0.05, 0.1)
 TRANSMITTANCES = (0.0, TRANSMITTANCE_MIN, 1e-3, 1e-2, 5e-2)
 TILE_SIDES = (8, 16, 32, 64, 128)
 TOLERANCES = (0.0, 0.25, 0.5, 0.75, 1.0, 2.0, 4.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -32,7 +33,7 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
     """
     global _emulated
     before = _emulated
-    _load("_emulated").set_seed(seed)
+    load("_emulated").set_seed(seed)
     _emulated = True
     try:
         yield
@@ -69,7 +70,12 @@ def cpu_module() -> str:
     return usable[-1]
 
 
-def _load(name: str) -> ModuleType:
+def load(name: str) -> ModuleType:
+    """The compiled module of that name: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
+
+    Raises:
+        RuntimeError: it is missing, or not for this CPU.
+    """
     try:
         return importlib.import_module(f"bitymi_ns.{cpu_module() if name == '_cpu' else name}")
     except ImportError as error:
@@ -81,6 +87,11 @@ def _load(name: str) -> ModuleType:
         raise RuntimeError(
             f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
         ) from (error)
+
+
+@functools.cache
+def _set_up_process() -> None:
+    load("_cpu").set_up_process()
 
 
 def cuda_backend(device: torch.device) -> bool:
@@ -96,7 +107,27 @@ def module(device: torch.device) -> ModuleType:
     """
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
-    return _load("_cuda" if device.type == "cuda" else "_emulated" if _emulated else "_cpu")
+    if cuda_backend(device):
+        return load("_cuda" if device.type == "cuda" else "_emulated")
+    _set_up_process()
+    return load("_cpu")
+
+
+def require(operation: str, kind: str, device: torch.device, instead: str) -> None:
+    """Refuses a device on which an operation has no kernel.
+
+    Args:
+        operation: what was called.
+        kind: cpu or cuda, where it has one.
+        device: of the tensors.
+        instead: what to do, the end of the message.
+
+    Raises:
+        RuntimeError: the device is not of that kind.
+    """
+    if cuda_backend(device) != (kind == "cuda"):
+        where = {"cpu": "on the CPU", "cuda": "on a CUDA device"}
+        raise RuntimeError(f"{operation} runs {where[kind]} only, and the tensors are on '{device}': {instead}")
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import function, module
+from .backend import function, module, require
 from .view_color import LEAN, VIEW_COLORS, check_lean, check_view_color
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
@@ -25,6 +25,8 @@ IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "overdraw": (1, torch.int32),
 }
 """Channels and dtype of what can be drawn. packed: red, green, blue and alpha as bytes, red the lowest."""
+
+ON_CPU = "move the scene there, or draw with `baked_cpu.draw`"
 
 
 class Stage(IntFlag):
@@ -46,10 +48,11 @@ class AtlasTexture:
         device: where the surfels are.
 
     Raises:
-        RuntimeError: the device has too little memory, or refuses textures of this size.
+        RuntimeError: the device has too little memory, refuses textures of this size, or is no CUDA device.
     """
 
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
+        require("baked.AtlasTexture", "cuda", device, ON_CPU)
         texels = texels.detach().cpu()
         layers, height, width = texels.shape[:3]
         if blocks:
@@ -84,7 +87,7 @@ class BakedArrays:
         mean_residual: [N, 3] residual of surfels without a tile, None = 0.
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight get no residual.
-        prefilter: the kernel is seen through a pixel (csrc/core/prefilter.h).
+        through_pixel: the kernel is seen through a pixel, as in `Projection`.
         transmittance_min: a surfel that would leave a pixel less transmittance is not blended and ends the pixel.
     """
 
@@ -98,7 +101,7 @@ class BakedArrays:
     mean_residual: Tensor | None
     near: float
     weight_bound: float
-    prefilter: bool
+    through_pixel: bool
     transmittance_min: float
 
     def __post_init__(self) -> None:
@@ -127,7 +130,7 @@ class BakedArrays:
         geometry = (p["means"], p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
         pages = None if self.texture is None else self.texture.pages
         optional = [None if t is None else t.detach().float().contiguous() for t in (self.extent, self.mean_residual)]
-        fixed = (self.offset, self.scale, self.weight_bound, self.near, self.prefilter, self.transmittance_min)
+        fixed = (self.offset, self.scale, self.weight_bound, self.near, self.through_pixel, self.transmittance_min)
         return (*geometry, self.view_color, terms, *full, *lean, self.tiles.contiguous(), *optional, pages, *fixed)
 
 
@@ -147,7 +150,9 @@ class Workspace:
 
         Raises:
             ValueError: more surfels, views or pairs than a frame can have; the message gives the numbers.
+            RuntimeError: the scene is not on a CUDA device.
         """
+        require("baked.Workspace.fit", "cuda", arrays.device, ON_CPU)
         kernels, device = module(arrays.device), arrays.device
         most = kernels.MOST_PAIRS
         if capacity > most:
@@ -234,7 +239,9 @@ def draw(
 
     Raises:
         ValueError: a shape is wrong, or the workspace is too small.
+        RuntimeError: the scene is not on a CUDA device.
     """
+    require("baked.draw", "cuda", arrays.device, ON_CPU)
     _, height, width, _ = next(iter(images.values())).shape
     assert workspace.memory is not None
     function("baked_frame", arrays.device)(

@@ -13,9 +13,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from .constants import TILE
 from .errors import TooManyFragments
 from .project import Projection
-from .trace import TILE, Fragments, masked_counts, trace
+from .trace import Fragments, masked_counts, trace
 
 T = TypeVar("T")
 
@@ -48,7 +49,7 @@ class Bands:
             del fragments  # before the next list is made
 
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels a pixel."""
+        """[H, W, 1] int32: blended surfels per pixel."""
         return torch.cat([fragments.overdraw() for fragments in self.lists()])
 
     def masked_counts(self, mask: Tensor, n: int) -> Tensor:
@@ -118,7 +119,7 @@ def refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, i
 
 
 def band(projection: Projection, top: int, bottom: int) -> Projection:
-    """The pixel rows from `top`, a multiple of 16, to `bottom` (exclusive) of a view, as a view of their own.
+    """The pixel rows from `top`, a multiple of TILE, to `bottom` (exclusive) of a view, as a view of their own.
 
     Its backward pass adds to `mean2d_grad` and `mean2d_absgrad` of `projection`.
     """

@@ -1,4 +1,4 @@
-"""Compositing: weighted sums of the fragments a pixel."""
+"""Compositing: weighted sums of the fragments per pixel."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, on_same_device
+from .constants import BETA_MAX, IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
 from .trace import Fragments
 
@@ -17,7 +18,7 @@ class _CompositeImage(torch.autograd.Function):
     def forward(ctx, weight, depth, geom, colors, fragments, maps):
         arrays = fragments.arrays
         g, c = dense(geom, geom), dense(colors, geom)
-        image = geom.new_empty(fragments.width * fragments.height, 9 if maps else 5)
+        image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
         kernel("composite_forward", geom)(maps, g, fragments.layout, *arrays, c, image)
         ctx.save_for_backward(g, c, *arrays)
         ctx.layout, ctx.maps = fragments.layout, maps
@@ -37,7 +38,7 @@ class _CompositeImage(torch.autograd.Function):
 
 
 def composite_image(fragments: Fragments, projection: Projection, colors: Tensor, maps: bool = False) -> Tensor:
-    """Sums of w times colour, 1 and beta, and with maps also depth and normal, a pixel.
+    """Sums of w times colour, 1 and beta, and with maps also depth and normal, per pixel.
 
     Args:
         fragments: F fragments of an H x W view.
@@ -84,12 +85,12 @@ def beta_map(fragments: Fragments, beta_raw: Tensor) -> Tensor:
         fragments: of an H x W view.
         beta_raw: [N] the surfels' parameter, beta = 4 sigmoid(beta_raw).
     """
-    beta = 4.0 * torch.sigmoid(beta_raw)
+    beta = BETA_MAX * torch.sigmoid(beta_raw)
     return composite(replace(fragments, weight=fragments.weight.detach()), beta[fragments.surfel.long(), None])
 
 
 def composite(fragments: Fragments, values: Tensor) -> Tensor:
-    """Sums of w times any values [F, C] a pixel: [H * W, C]."""
+    """Sums of w times any values [F, C] per pixel: [H * W, C]."""
     if values.dim() != 2 or len(values) != len(fragments):
         raise ValueError(f"values must have a row for each of the {len(fragments)} fragments, not {list(values.shape)}")
     on_same_device(fragments.weight, values=values)

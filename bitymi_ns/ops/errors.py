@@ -16,7 +16,7 @@ class TooManyFragments(RuntimeError):
         Args:
             count, most: fragments.
             width, height: of the view, pixels.
-            size: bytes a fragment in the list.
+            size: bytes per fragment in the list.
         """
         super().__init__(
             f"the view has {count:,} fragments, {count / (width * height):.0f} per pixel; their list needs "

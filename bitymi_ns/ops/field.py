@@ -8,12 +8,7 @@ import torch
 from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, kernel_class, module, on_same_device
-from .project import FRAME
-
-FEATURES = 4
-"""Features a level."""
-WIDTH = 16
-"""Width of both hidden layers."""
+from .constants import FEATURES, WIDTH
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ def backward_memory(
 ) -> tuple[Tensor | None, ...]:
     """Working memory that the backward kernels of field and shading take as their last arguments: none on the CPU.
 
-    On CUDA: sums of the MLP's gradients a block; and, where torch is asked for deterministic algorithms
+    On CUDA: sums of the MLP's gradients per block; and, where torch is asked for deterministic algorithms
     (torch.use_deterministic_algorithms), int64 sums of what blocks add up together: a sum of integers does not depend
     on the order.
 
@@ -70,10 +65,11 @@ def backward_memory(
     """
     if not cuda_backend(like.device):
         return ()
-    mlp = None if table is None else like.new_empty(module(like.device).MLP_WORK)
+    kernels = module(like.device)
+    mlp = None if table is None else like.new_empty(kernels.MLP_WORK)
     if not torch.are_deterministic_algorithms_enabled():
         return mlp, None
-    numbers = (0 if table is None else table.numel()) + 8 + (3 + FRAME if frames else 3) * surfels
+    numbers = kernels.exact_size(0 if table is None else table.numel(), surfels, frames)
     return mlp, torch.empty(numbers, dtype=torch.int64, device=like.device)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import dense, kernel, require
+from .constants import FRAME
 from .field import FieldGeometry, kernel_field
-from .project import FRAME
 
 WARP = 32
 """Texels that are evaluated together."""
@@ -40,7 +40,9 @@ def field_tiles(
 
     Raises:
         ValueError: shapes do not agree.
+        RuntimeError: the tensors are not on a CUDA device.
     """
+    require("field_tiles", "cuda", frames.device, "move them there, or evaluate `field` at the texel centres")
     n = frames.shape[0]
     shapes = {"frames": (frames, (n, FRAME)), "extent": (extent, (n,)), "tiles": (tiles, (n, 5))}
     for name, (tensor, shape) in shapes.items():

@@ -9,13 +9,10 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel, on_same_device
+from .constants import FRAME, GEOM
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.camera import Camera
-
-GEOM = 16
-"""Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), area (prefilter)."""
-FRAME = 9
 
 
 @dataclass
@@ -31,9 +28,10 @@ class Projection:
         radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0 = not visible.
         camera: the camera.
         near: nearest depth that is drawn, camera z.
+        through_pixel: the kernel is seen through a pixel: all that is done with the rows has to know.
         broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
-        mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken a fragment before the sum.
+        mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken per fragment before the sum.
         whole: the view that this is a band of (ops/bands.py).
     """
 
@@ -42,6 +40,7 @@ class Projection:
     radii: Tensor
     camera: Camera
     near: float
+    through_pixel: bool
     broken: Tensor
     mean2d_grad: Tensor | None = None
     mean2d_absgrad: Tensor | None = None
@@ -70,12 +69,14 @@ class Projection:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, width, height, near, prefilter):
+    def forward(
+        ctx, means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, width, height, near, through_pixel
+    ):
         n = means.shape[0]
         inputs = [dense(t, means) for t in (means, quats, log_scales, opacity_logits, beta_raw, viewmat, K)]
         geom, frames, radii = (means.new_empty(n, k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
-        kernel("project_forward", means)(*inputs, width, height, near, prefilter, geom, frames, radii, broken)
+        kernel("project_forward", means)(*inputs, width, height, near, through_pixel, geom, frames, radii, broken)
         ctx.save_for_backward(*inputs, geom)
         ctx.mark_non_differentiable(radii, broken)
         ctx.set_materialize_grads(False)
@@ -112,7 +113,7 @@ def project(
         camera: OpenCV axes.
         near: surfels with a centre nearer than this (camera z) are not seen.
         prefilter: the kernel is seen through a pixel (csrc/core/prefilter.h) instead of being united with a low pass;
-            column 15 of geom then holds n = fx fy s_u s_v / z^2 and tells all later operations.
+            column 15 of geom then holds n = fx fy s_u s_v / z^2.
 
     Raises:
         ValueError: shapes or devices do not agree, or the camera has skew.
@@ -130,4 +131,4 @@ def project(
     geom, frames, radii, broken = _Project.apply(
         means, quats, log_scales, opacity_logits, beta_raw, *view, near, prefilter
     )
-    return Projection(geom, frames, radii, camera, near, broken)
+    return Projection(geom, frames, radii, camera, near, prefilter, broken)

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel, on_same_device
+from .constants import COLOR_BIAS, FRAME
 from .field import FieldGeometry, backward_memory, kernel_field
-from .project import FRAME
 from .trace import Fragments
 
 
@@ -50,6 +50,11 @@ class _Shade(torch.autograd.Function):
             *backward_memory(base, params[0] if learn else None, len(base), dframes is not None),
         )
         return dbase, dframes, duv, None, None, None, None, *(grads if params else ())
+
+
+def view_base(f_view: Tensor) -> Tensor:
+    """ReLU(f_view + 0.5): a fragment's colour without residual."""
+    return torch.relu(f_view + COLOR_BIAS)
 
 
 def shade(

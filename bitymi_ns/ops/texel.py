@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import dense, kernel, require
 from .trace import Fragments
+
+
+def _on_the_cpu(operation: str, like: Tensor) -> None:
+    require(operation, "cpu", like.device, "move them to the CPU")
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class TexelFragments:
 
     @classmethod
     def of(cls, fragments: Fragments, keep: Tensor | None = None) -> TexelFragments:
-        """The fragments of a view, or those of them that `keep` [F] bool names."""
+        """The fragments of a view on the CPU, or those of them that `keep` [F] bool names."""
         return cls.of_lists([(fragments, keep)])
 
     @classmethod
@@ -77,6 +81,7 @@ class TexelFragments:
         parts: list[tuple[Tensor, ...]] = []
         starts, count, height, width = [torch.zeros(1, dtype=torch.int64)], 0, 0, 0
         for fragments, keep in lists:
+            _on_the_cpu("TexelFragments.of", fragments.weight)
             weight, uv = fragments.weight.detach(), fragments.uv.detach()
             surfel, pixel, tile_start = fragments.surfel, fragments.pixel, fragments.tile_start
             width = fragments.width
@@ -152,7 +157,9 @@ def texel_image(
 
     Raises:
         ValueError: the tiles are not those of these texels or surfels.
+        RuntimeError: the tensors are not on the CPU.
     """
+    _on_the_cpu("texel_image", texels)
     if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
         raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
     if tuple(base.shape) != (len(tiles.first), 3):
@@ -170,15 +177,19 @@ def add_texel_gradient(
     dtexels: Tensor | None,
     dbase: Tensor | None = None,
 ) -> None:
-    """The backward pass of `texel_image` for callers that sum over views: autograd would clear and add a whole atlas a
-    view.
+    """The backward pass of `texel_image` for callers that sum over views: autograd would clear and add a whole atlas
+    for each.
 
     Args:
         dimage: [H * W, 3] gradient of the image.
         fragments, base, texels, tiles, bound: as in `texel_image`.
         dtexels: [T, 3], added to; None = not wanted.
         dbase: [N, 3], written; None = not wanted.
+
+    Raises:
+        RuntimeError: the tensors are not on the CPU.
     """
+    _on_the_cpu("add_texel_gradient", texels)
     f, table = fragments, (tiles.first, tiles.size, tiles.extent)
     gradients = (dense(dimage, texels), dtexels, dbase)
     kernel("texel_image_backward", texels)(f.run_start, f.order, *f.arrays, bound, base, *table, texels, *gradients)

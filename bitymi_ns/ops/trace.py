@@ -11,15 +11,11 @@ from torch import Tensor
 
 from . import trace_cpu, trace_cuda
 from .backend import cuda_backend, dense, function, on_same_device
+from .constants import GEOM
 from .errors import TooManyFragments
-from .project import GEOM, Projection
+from .project import Projection
 
-__all__ = ["TILE", "TRANSMITTANCE_MIN", "Fragments", "TooManyFragments", "masked_counts", "trace"]
-
-TILE = trace_cuda.TILE
-"""Pixels a side of a tile, also in the CPU kernels (csrc/core/bounds.h)."""
-TRANSMITTANCE_MIN = 1e-4
-"""Transmittance below which a pixel takes no more light (csrc/core/surfel.h)."""
+__all__ = ["Fragments", "TooManyFragments", "masked_counts", "trace"]
 
 
 @dataclass
@@ -65,7 +61,7 @@ class Fragments:
         yield self
 
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels a pixel."""
+        """[H, W, 1] int32: blended surfels per pixel."""
         count = torch.bincount(self.pixel, minlength=self.width * self.height)
         return count.to(torch.int32).view(self.height, self.width, 1)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,25 +19,22 @@ MOST = 1 << 25
 """Fragments of a list whose length memory decides: 1.9 GB with what shading, blending and their backward pass add, 56
 bytes per fragment. Fixed, so that what is computed does not depend on the machine."""
 
-
-class _Tracers:
-    """Tracers keep their memory from view to view; one is used by one thread at a time."""
-
-    def __init__(self) -> None:
-        self._idle: dict[object, list] = defaultdict(list)
-        self._lock = threading.Lock()
-
-    def take(self, like: Tensor):
-        make = kernel_class("Trace", like)
-        with self._lock:
-            return self._idle[make].pop() if self._idle[make] else make()
-
-    def give(self, tracer) -> None:
-        with self._lock:
-            self._idle[type(tracer)].append(tracer)
+_idle: dict[object, list] = defaultdict(list)
+_lock = threading.Lock()
 
 
-tracers = _Tracers()
+@contextmanager
+def borrowed_tracer(like: Tensor) -> Iterator[Any]:
+    """A tracer for tensors like `like`. Tracers keep their memory from view to view; one is used by one thread at a
+    time."""
+    make = kernel_class("Trace", like)
+    with _lock:
+        tracer = _idle[make].pop() if _idle[make] else make()
+    try:
+        yield tracer
+    finally:
+        with _lock:
+            _idle[make].append(tracer)
 
 
 def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Tensor, ...]:
@@ -54,27 +53,25 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
     """
     camera = projection.camera
     most = MOST if most == 0 else most or 0
-    tracer = tracers.take(geom)
-    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near, most)
-    if most and n > most:
-        tracers.give(tracer)
-        raise TooManyFragments(n, most, camera.width, camera.height, 8 + 5 * geom.element_size())
-    surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
-    weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
-    uv = geom.new_empty(2, n)
-    tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
-    tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
-    tracers.give(tracer)
+    with borrowed_tracer(geom) as tracer:
+        size = (camera.width, camera.height)
+        n = tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, most)
+        if most and n > most:
+            raise TooManyFragments(n, most, *size, 8 + 5 * geom.element_size())
+        surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
+        weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
+        uv = geom.new_empty(2, n)
+        tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
+        tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
     return tile_start, tile_start, surfel, pixel, weight, uv, depth, sigma
 
 
 def count(projection: Projection) -> int:
     """Number of fragments of a view; their list is not made."""
     camera, geom = projection.camera, projection.geom.detach()
-    tracer = tracers.take(geom)
-    n = tracer.run(geom, projection.radii, camera.width, camera.height, projection.near, 1)
-    tracers.give(tracer)
-    return n
+    size = (camera.width, camera.height)
+    with borrowed_tracer(geom) as tracer:
+        return tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, 1)
 
 
 def backward(
@@ -88,5 +85,7 @@ def backward(
     absgrad: Tensor,
 ) -> None:
     """Writes dgeom [N, 16] and absgrad [N, 2] from the gradients of weight, uv and depth (None = zero)."""
-    width = projection.camera.width
-    kernel("trace_backward", geom)(geom, projection.near, rim, width, tile_start, *arrays, *grads, dgeom, absgrad)
+    p = projection
+    kernel("trace_backward", geom)(
+        geom, p.near, p.through_pixel, rim, p.camera.width, tile_start, *arrays, *grads, dgeom, absgrad
+    )

@@ -1,7 +1,7 @@
 """The fragment list by the CUDA kernels (csrc/cuda/pairs.h describes it).
 
-Two numbers decide how much memory is needed, so the host waits for the device twice a view: for the number of pairs of
-surfel and tile, and for the number of fragments. Nothing else in a training step has to wait.
+Two numbers decide how much memory is needed, so the host waits for the device twice per view: for the number of pairs
+of surfel and tile, and for the number of fragments. Nothing else in a training step has to wait.
 """
 
 from __future__ import annotations
@@ -14,15 +14,10 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, module, workspace
+from .constants import TILE
 from .errors import TooManyFragments
 from .project import Projection
 
-TILE = 16
-"""Pixels a side."""
-WARPS = 8
-"""Of a tile's block."""
-COLUMNS = 16
-"""Sums a pair in the backward pass."""
 NUMBERS = 24
 """That a fragment takes in a training step: 7 in the list, 3 of its colour, 8 of their gradients; the rest is slack."""
 FEW = 1 << 23
@@ -67,7 +62,7 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
     order, slot_start = _ints(geom, n), _longs(geom, n + 1)
     space = workspace("bin_count", geom, n)
-    kernel("bin_count", geom)(geom, projection.radii, *size, order, slot_start, space)
+    kernel("bin_count", geom)(geom, projection.radii, *size, projection.through_pixel, order, slot_start, space)
     pairs = int(slot_start[-1])
     if pairs >= 2**31:
         raise RuntimeError(
@@ -76,7 +71,7 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
         )
     slot, surfel, tile_pairs = _ints(geom, pairs), _ints(geom, pairs), _longs(geom, tiles + 1)
     space = workspace("bin_fill", geom, pairs, *size)
-    kernel("bin_fill", geom)(geom, *size, order, slot_start, slot, surfel, tile_pairs, space)
+    kernel("bin_fill", geom)(geom, *size, projection.through_pixel, order, slot_start, slot, surfel, tile_pairs, space)
     return Bins(order, slot_start, slot, surfel, tile_pairs)
 
 
@@ -85,11 +80,21 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tens
     the number of fragments."""
     camera, pairs = projection.camera, bins.surfel.shape[0]
     size = (camera.width, camera.height)
-    masks, offsets = _ints(geom, WARPS, pairs), _longs(geom, pairs + 1)
+    masks, offsets = _ints(geom, module(geom.device).TILE_WARPS, pairs), _longs(geom, pairs + 1)
     tile_start = torch.empty_like(bins.tile_pairs)
     space = workspace("trace_mark", geom, pairs)
     kernel("trace_mark", geom)(
-        geom, projection.radii, projection.near, *size, bins.surfel, bins.tile_pairs, masks, offsets, tile_start, space
+        geom,
+        projection.radii,
+        projection.near,
+        projection.through_pixel,
+        *size,
+        bins.surfel,
+        bins.tile_pairs,
+        masks,
+        offsets,
+        tile_start,
+        space,
     )
     count = int(offsets[-1])
     layout = module(geom.device).Pairs(
@@ -126,7 +131,9 @@ def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[Tensor, ...
         uv = geom.new_empty(2, count)
     except torch.cuda.OutOfMemoryError as error:
         raise _too_many(geom, projection, count, room(geom)) from error
-    kernel("trace_fill", geom)(geom, projection.near, layout, surfel, pixel, weight, uv, depth, sigma)
+    kernel("trace_fill", geom)(
+        geom, projection.near, projection.through_pixel, layout, surfel, pixel, weight, uv, depth, sigma
+    )
     return surfel, pixel, weight, uv, depth, sigma
 
 
@@ -161,5 +168,7 @@ def backward(
     absgrad: Tensor,
 ) -> None:
     """Writes dgeom [N, 16] and absgrad [N, 2] from the gradients of weight, uv and depth (None = zero)."""
-    dsigma, partial = geom.new_empty(layout.fragments), geom.new_empty(layout.pairs, COLUMNS)
-    kernel("trace_backward", geom)(geom, projection.near, rim, layout, *arrays, *grads, dsigma, partial, dgeom, absgrad)
+    dsigma = geom.new_empty(layout.fragments)
+    partial = geom.new_empty(layout.pairs, module(geom.device).TRACE_SUMS)
+    near, through = projection.near, projection.through_pixel
+    kernel("trace_backward", geom)(geom, near, through, rim, layout, *arrays, *grads, dsigma, partial, dgeom, absgrad)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel, on_same_device
+from .constants import MAX_TERMS
 
-MAX_TERMS = 32
 VIEW_COLORS: dict[str, tuple[str, ...]] = {
     "sv": ("sv_sites", "sv_log_tau", "sv_rgb"),
     "sh": ("sh_dc", "sh_rest"),
@@ -20,8 +20,8 @@ VIEW_COLORS: dict[str, tuple[str, ...]] = {
 LEAN = ("view_base", "view_span", "view_terms")
 """Names of the parameters of lean view colours, of which every surfel has as many terms as it needs."""
 LEAN_WIDTH = {"sv": 6, "sh": 3, "sb": 6, "sg": 7}
-"""Numbers a term. sv: b, rgb relative to the first site (csrc/core/view_color.h); sh: the coefficients of one function,
-from degree 1 on; sb, sg: a lobe."""
+"""Numbers per term. sv: b, rgb relative to the first site (csrc/core/view_color.h); sh: the coefficients of one
+function, from degree 1 on; sb, sg: a lobe."""
 
 
 class _ViewColor(torch.autograd.Function):

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import project, view_color
-from bitymi_ns.ops.backend import cuda_backend, module
+from bitymi_ns.ops import baked_cpu, project, view_color
+from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.baked import AtlasTexture, BakedArrays, WorkspacePool, draw, empty_images
-from bitymi_ns.ops.trace import TRANSMITTANCE_MIN
-from bitymi_ns.ops.trace_cpu import tracers
+from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 
 from .camera import Camera
 
@@ -159,30 +158,19 @@ class BakedScene:
         geometry = (means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
         projection = project(*geometry, camera, self.near, self.prefilter == "pixel")
         base = view_color(self.view_color, p, means, camera.exact_center, projection.visible)
-        size = (camera.width, camera.height)
-        image = means.new_empty(camera.height, camera.width, 9 if maps else 4)
-        overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
-        tracer = tracers.take(means)
-        tracer.run(projection.geom, projection.radii, *size, self.near, fragments=False)
         is_bytes = self.atlas is not None and self.atlas.dtype == torch.uint8
-        tracer.baked(
-            projection.geom,
-            projection.radii,
-            *size,
-            self.near,
-            self.weight_bound,
-            self.transmittance_min,
-            maps,
+        image, overdraw = baked_cpu.draw(
+            projection,
             base,
             self._gathered(),
             self.offset,
             self.scale / 255 if is_bytes else self.scale,
-            torch.full((len(self),), 3.0) if self.extent is None else self.extent,
-            torch.zeros(len(self), 3) if self.mean_residual is None else self.mean_residual,
-            image,
-            overdraw,
+            self.extent,
+            self.mean_residual,
+            self.weight_bound,
+            self.transmittance_min,
+            maps,
         )
-        tracers.give(tracer)
         rgb, alpha = image[..., :3], image[..., 3:4]
         if background is not None:
             rgb = rgb + (1 - alpha) * background
@@ -194,12 +182,7 @@ class BakedScene:
         atlas, tiles = self.atlas, self.tiles
         state = (id(atlas), 0 if atlas is None else atlas._version, id(tiles), tiles._version)
         if self._patches is None or self._patches[0] != state:
-            is_bytes = atlas is not None and atlas.dtype == torch.uint8
-            shape = (0, 0, 0) if atlas is None else tuple(atlas.shape[:3])
-            patches = module(tiles.device).Patches(
-                atlas if is_bytes else None, None if is_bytes else atlas, shape, tiles.contiguous()
-            )
-            self._patches = (state, patches)
+            self._patches = (state, baked_cpu.gather(atlas, tiles))
         return self._patches[1]
 
     @torch.no_grad()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops.field import FEATURES, WIDTH, FieldGeometry, field
+from bitymi_ns.ops.constants import FEATURES, WIDTH
+from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
 

@@ -20,7 +20,9 @@ from bitymi_ns.stability.scenes import SceneCase
 from bitymi_ns.stability.sweeps import SWEEPS, Sweep
 
 ACCURATE = 1e-4
-"""Errors up to this are below half an 8-bit step."""
+"""Largest error that counts as accurate."""
+STEPS = round(1 / (255 * ACCURATE))
+"""So many times ACCURATE is an 8-bit step."""
 ALLOWANCE = 4.0
 """A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
 EXTENDED_SIZE = 20_000
@@ -47,7 +49,7 @@ that were rounded once. Divided by 2^-24 it is the condition number of the case.
 evaluation in extended precision (64 bits of mantissa; gradients by complex steps); a dash where it is too large for
 that.
 
-**Verdict**: *accurate*: both errors at most {accurate:g}, a quarter of an 8-bit step or less; *as the inputs allow*: at
+**Verdict**: *accurate*: both errors at most {accurate:g}, 1/{steps} of an 8-bit step; *as the inputs allow*: at
 most {allowance:g} times what rounding the inputs does; *nothing drawn*; else *loses figures*.
 """
 
@@ -117,7 +119,9 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
 
 def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:
     parts = [
-        INTRODUCTION.format(backend=backend.name, rim=RIM, probes=PROBES, accurate=ACCURATE, allowance=ALLOWANCE),
+        INTRODUCTION.format(
+            backend=backend.name, rim=RIM, probes=PROBES, accurate=ACCURATE, steps=STEPS, allowance=ALLOWANCE
+        ),
         "## Error against stiffness\n",
         f"![Error against stiffness, eight kinds]({picture})\n",
         "Solid: float32. Dashed: what rounding the inputs does. Dotted: float64. Errors below 1e-17 are drawn there.\n",

@@ -7,14 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops.constants import MAX_LEVELS, MAX_TERMS
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import NEAR, Scene
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import PointReport, scene_extent, surfels_from_points
-
-MAX_TERMS = 32
-"""Most Voronoi sites or lobes a surfel that the kernels take."""
 
 
 def build_scene(
@@ -75,7 +73,7 @@ def check_representation(config: SceneConfig) -> None:
         "sv_sites": (config.sv_sites, 1, MAX_TERMS),
         "lobes": (config.lobes, 1, MAX_TERMS),
         "sh_degree": (config.sh_degree, 0, 3),
-        "levels": (config.levels, 1, 4),
+        "levels": (config.levels, 1, MAX_LEVELS),
         "min_resolution": (config.min_resolution, 2, 1 << 20),
         "log2_table_size": (1 if config.log2_table_size is None else config.log2_table_size, 1, 24),
         "near": (1.0 if config.near is None else config.near, 1e-6, 1e6),

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops.constants import SH_C0
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.rotations import facing
 
-SH_C0 = 0.28209479177387814
 """The constant real spherical harmonic."""
 BETA_RAW = 2.0
 """Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
@@ -139,7 +139,7 @@ def neighbour_distance(xyz: Tensor, extent: float, neighbours: int = 3) -> Tenso
 
 
 def fibonacci_sphere(n: int) -> Tensor:
-    """[n, 3] unit vectors spread evenly over the sphere."""
+    """[n, 3] float32 unit vectors spread evenly over the sphere along a Fibonacci spiral."""
     i = torch.arange(n, dtype=torch.float64)
     z = 1.0 - (2.0 * i + 1.0) / n
     phi = i * math.pi * (3.0 - math.sqrt(5.0))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 DrawViews = Callable[[int, torch.Generator], list[View]]
 """(k, CPU generator) -> k different training views, or all when there are fewer."""
 
-INVISIBLE = 1.0 / 255.0
-"""A surfel of this opacity or less has no fragment anywhere, hence no gradient: it stays invisible for good."""
 SPLIT_SHRINK = 1.6
 """The two halves of a split surfel are smaller by this factor."""
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
@@ -235,7 +234,8 @@ class Strategy:
         if not bool(finite.any()):
             raise TrainingDiverged(f"no surfel is left whose parameters are all finite: {describe_broken(scene)}")
         logits = surfels["opacity_logits"]
-        invisible = finite & (logits.sigmoid() <= INVISIBLE)
+        # no fragment anywhere, hence no gradient: they stay invisible for good
+        invisible = finite & (logits.sigmoid() <= ALPHA_MIN)
         over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
         if self.config.densify.max_surfels > 0 and over > 0:
             # only a scene loaded from elsewhere is over the cap: the faintest go

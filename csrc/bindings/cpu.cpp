@@ -8,10 +8,13 @@
 #include <malloc.h>
 #endif
 
+#include "core/shading.h"
 #include "cpu/threads.h"
 
-NB_MODULE(BITYMI_MODULE, m) {
-  using namespace bt;
+namespace {
+// Settings of the whole process that the kernels are fast with. Not made on import: who only reads a constant keeps his
+// threads and his memory as they are.
+void set_up_process() {
 #if defined(__GLIBC__)
   // Every view allocates and frees the same tens of megabytes. Given back to the system in between, they cost more in
   // page faults than what is computed in them.
@@ -19,10 +22,15 @@ NB_MODULE(BITYMI_MODULE, m) {
   mallopt(M_TRIM_THRESHOLD, 1 << 30);
   mallopt(M_TOP_PAD, 64 << 20);
 #endif
-  wait_without_spinning();
+  bt::wait_without_spinning();
+}
+}  // namespace
+
+NB_MODULE(BITYMI_MODULE, m) {
+  using namespace bt;
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
-  m.attr("FEATURES") = BITYMI_CPU_FEATURES;  // what of a CPU this needs, as in bitymi_ns._cpu_features
+  m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // what of a CPU this needs, as in bitymi_ns._cpu_features
   nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
       .def(
           "__init__",
@@ -47,6 +55,15 @@ NB_MODULE(BITYMI_MODULE, m) {
         masked_counts(n, surfel.data(), data(pixel, n, "pixel"), mask.data(), counts.data());
       },
       "surfel"_a.noconvert(), "pixel"_a.noconvert(), "mask"_a.noconvert(), "counts"_a.noconvert());
+  m.attr("SUPPORT") = kSupport, m.attr("ALPHA_MAX") = kAlphaMax, m.attr("ALPHA_MIN") = kAlphaMin;
+  m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin, m.attr("BETA_MAX") = kBetaMax, m.attr("TILE") = kTile;
+  m.attr("GEOM") = int(kGeom), m.attr("FRAME") = kFrame;
+  m.attr("IMAGE_CHANNELS") = kImageChannels, m.attr("MAP_CHANNELS") = kMapChannels;
+  m.attr("BAKED_CHANNELS") = kBakedChannels;
+  m.attr("FEATURES") = kFeatures, m.attr("WIDTH") = kWidth, m.attr("MAX_LEVELS") = kMaxLevels;
+  m.attr("MAX_TERMS") = kMaxTerms, m.attr("LOG_TAU_MAX") = kLogTauMax, m.attr("SH_C0") = kShC0;
+  m.attr("COLOR_BIAS") = kColorBias;
+  m.def("set_up_process", &set_up_process, "Before the first kernel: threads that wait asleep, memory that is kept.");
   m.def("set_num_threads", &set_num_threads, "n"_a, "Threads of the kernels; 0 = as many as there are cores.");
   m.def("num_threads", &num_threads);
 }

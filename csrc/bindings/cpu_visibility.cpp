@@ -24,7 +24,7 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(
       name("project_forward").c_str(),
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, int width, int height,
-         double near, bool prefilter, Out geom, Out frames, Out radii, Array<int32_t> broken) {
+         double near, bool through_pixel, Out geom, Out frames, Out radii, Array<int32_t> broken) {
         const Surfels<S> in = surfels(means, quats, log_scales, opacity_logits, beta_raw);
         const int64_t n = in.n;
         S *g = data(geom, n * kGeom, "geom"), *f = data(frames, n * kFrame, "frames");
@@ -32,11 +32,11 @@ void bind(nb::module_& m, const char* suffix) {
         const Pinhole<S> cam = pinhole(data(viewmat, 16, "viewmat"), data(K, 9, "K"));
         int32_t* count = data(broken, 1, "broken");
         nb::gil_scoped_release release;
-        *count += int32_t(project_forward(cam, width, height, S(near), prefilter, in, g, f, r));
+        *count += int32_t(project_forward(through_pixel, cam, width, height, S(near), in, g, f, r));
       },
       "means"_a.noconvert(), "quats"_a.noconvert(), "log_scales"_a.noconvert(), "opacity_logits"_a.noconvert(),
       "beta_raw"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a,
-      "prefilter"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert());
+      "through_pixel"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert());
 
   m.def(
       name("project_backward").c_str(),
@@ -60,15 +60,16 @@ void bind(nb::module_& m, const char* suffix) {
       .def(nb::init<>())
       .def(
           "run",
-          [](Trace<S>& t, In geom, In radii, int width, int height, double near, int64_t most, bool fragments_too) {
+          [](Trace<S>& t, In geom, In radii, int width, int height, double near, bool through_pixel, int64_t most,
+             bool fragments_too) {
             const int64_t n = int64_t(radii.size()) / 2;
             const S *g = data(geom, n * kGeom, "geom"), *r = radii.data();
             nb::gil_scoped_release release;
-            bin(n, g, r, width, height, t.bins);
-            if (fragments_too) trace_forward(g, r, S(near), t.bins, width, height, most, t.list);
+            bin(through_pixel, n, g, r, width, height, t.bins);
+            if (fragments_too) trace_forward(through_pixel, g, r, S(near), t.bins, width, height, most, t.list);
             return t.list.total;
           },
-          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "most"_a = 0,
+          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "through_pixel"_a, "most"_a = 0,
           "fragments"_a = true)
       .def_prop_ro("tiles", [](const Trace<S>& t) { return int64_t(t.bins.tiles_x) * t.bins.tiles_y; })
       .def_prop_ro("pairs", [](const Trace<S>& t) { return int64_t(t.bins.surfels.size()); })
@@ -88,9 +89,10 @@ void bind(nb::module_& m, const char* suffix) {
           "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert())
       .def(
           "baked",
-          [](const Trace<S>& t, In geom, In radii, int width, int height, double near, double weight_bound,
-             double transmittance_min, bool maps, In base, const Patches& patches, double offset, double scale,
-             Array<const float> extent, Array<const float> mean_residual, Out image, Maybe<int32_t> overdraw) {
+          [](const Trace<S>& t, In geom, In radii, int width, int height, double near, bool through_pixel,
+             double weight_bound, double transmittance_min, bool maps, In base, const Patches& patches, double offset,
+             double scale, Array<const float> extent, Array<const float> mean_residual, Out image,
+             Maybe<int32_t> overdraw) {
             const int64_t n = int64_t(radii.size()) / 2, pixels = int64_t(width) * height;
             if (int64_t(patches.first.size()) != n) throw std::invalid_argument("the patches belong to other surfels");
             const Atlas atlas = {patches,
@@ -104,18 +106,18 @@ void bind(nb::module_& m, const char* suffix) {
             S* out = data(image, pixels * (maps ? kMapChannels : kBakedChannels), "image");
             int32_t* o = data_or_null(overdraw, pixels, "overdraw");
             nb::gil_scoped_release release;
-            baked_forward(g, r, S(near), t.bins, width, height, maps, b, atlas, out, o);
+            baked_forward(through_pixel, g, r, S(near), t.bins, width, height, maps, b, atlas, out, o);
           },
-          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "weight_bound"_a,
-          "transmittance_min"_a, "maps"_a, "base"_a.noconvert(), "patches"_a, "offset"_a, "scale"_a,
+          "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "near"_a, "through_pixel"_a,
+          "weight_bound"_a, "transmittance_min"_a, "maps"_a, "base"_a.noconvert(), "patches"_a, "offset"_a, "scale"_a,
           "extent"_a.noconvert(), "mean_residual"_a.noconvert(), "image"_a.noconvert(),
           "overdraw"_a.noconvert().none());
 
   m.def(
       name("trace_backward").c_str(),
-      [](In geom, double near, double rim, int width, Starts tile_start, Ints surfel, Ints pixel, Out weight, Out uv,
-         Out depth, Out sigma, Maybe<const S> dweight, Maybe<const S> duv, Maybe<const S> ddepth, Out dgeom,
-         Out absgrad) {
+      [](In geom, double near, bool through_pixel, double rim, int width, Starts tile_start, Ints surfel, Ints pixel,
+         Out weight, Out uv, Out depth, Out sigma, Maybe<const S> dweight, Maybe<const S> duv, Maybe<const S> ddepth,
+         Out dgeom, Out absgrad) {
         const int64_t n = int64_t(geom.size()) / kGeom, count = int64_t(surfel.size());
         const int64_t tiles = tiles_of(tile_start, count);
         const FragmentArrays<S> f = fragments<S>(count, surfel, pixel, weight, uv, depth, sigma);
@@ -123,12 +125,13 @@ void bind(nb::module_& m, const char* suffix) {
         const S* dz = data_or_null(ddepth, count, "ddepth");
         S *dg = data(dgeom, n * kGeom, "dgeom"), *ag = data(absgrad, 2 * n, "absgrad");
         nb::gil_scoped_release release;
-        trace_backward(n, geom.data(), S(near), S(rim), width, tile_start.data(), tiles, f, dw, du, dz, dg, ag);
+        trace_backward(through_pixel, n, geom.data(), S(near), S(rim), width, tile_start.data(), tiles, f, dw, du, dz,
+                       dg, ag);
       },
-      "geom"_a.noconvert(), "near"_a, "rim"_a, "width"_a, "tile_start"_a.noconvert(), "surfel"_a.noconvert(),
-      "pixel"_a.noconvert(), "weight"_a.noconvert(), "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert(),
-      "dweight"_a.noconvert().none(), "duv"_a.noconvert().none(), "ddepth"_a.noconvert().none(), "dgeom"_a.noconvert(),
-      "absgrad"_a.noconvert());
+      "geom"_a.noconvert(), "near"_a, "through_pixel"_a, "rim"_a, "width"_a, "tile_start"_a.noconvert(),
+      "surfel"_a.noconvert(), "pixel"_a.noconvert(), "weight"_a.noconvert(), "uv"_a.noconvert(), "depth"_a.noconvert(),
+      "sigma"_a.noconvert(), "dweight"_a.noconvert().none(), "duv"_a.noconvert().none(), "ddepth"_a.noconvert().none(),
+      "dgeom"_a.noconvert(), "absgrad"_a.noconvert());
 
   m.def(
       name("composite_forward").c_str(),

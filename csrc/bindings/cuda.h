@@ -23,7 +23,7 @@ using Maybe = std::optional<Array<T>>;
 // torch gives a stream as a number
 inline Stream stream_of(uintptr_t handle) { return reinterpret_cast<Stream>(handle); }
 
-// The structure of a fragment list, made once a view: a CUDA kernel's counterpart of tile_start.
+// The structure of a fragment list, made once per view: a CUDA kernel's counterpart of tile_start.
 struct PairsHandle {
   Array<const int32_t> surfel, slot, masks;
   Array<const int64_t> offsets, tile_pairs;

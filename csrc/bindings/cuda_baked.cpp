@@ -18,7 +18,7 @@ T choice(const std::string& name, const std::vector<std::pair<const char*, T>>& 
   throw std::invalid_argument("unknown name " + name);
 }
 
-struct Parameters {  // of a view colour, numbers a surfel
+struct Parameters {  // of a view colour, numbers per surfel
   int kind;
   int64_t a, b, c;
 };
@@ -33,7 +33,7 @@ void frame(Floats means, Floats quats, Floats log_scales, Floats opacity_logits,
            const std::string& kind, int terms, MaybeFloats a, MaybeFloats b, MaybeFloats c, MaybeFloats base,
            Maybe<const int32_t> span, MaybeFloats lean, Array<const int32_t> tiles, MaybeFloats extent,
            MaybeFloats mean_residual, Maybe<const int64_t> pages, double offset, double scale, double weight_bound,
-           double near, bool prefilter, double transmittance_min, Floats viewmats, Floats Ks, int width, int height,
+           double near, bool through_pixel, double transmittance_min, Floats viewmats, Floats Ks, int width, int height,
            MaybeFloats background, Maybe<float> rgb, Maybe<float> alpha, Maybe<int32_t> packed, Maybe<float> beta,
            Maybe<float> depth, Maybe<float> normal, Maybe<int32_t> overdraw, int stages, Array<uint8_t> memory,
            int64_t capacity, uintptr_t stream) {
@@ -56,7 +56,7 @@ void frame(Floats means, Floats quats, Floats log_scales, Floats opacity_logits,
   s.mean_residual = data_or_null(mean_residual, 3 * n, "mean_residual");
   s.pages = pages ? reinterpret_cast<const uint64_t*>(pages->data()) : nullptr;
   s.offset = float(offset), s.scale = float(scale), s.weight_bound = float(weight_bound), s.near = float(near);
-  s.prefilter = prefilter, s.transmittance_min = float(transmittance_min);
+  s.through_pixel = through_pixel, s.transmittance_min = float(transmittance_min);
   BakedImages to = {};
   to.rgb = data_or_null(rgb, 3 * pixels, "rgb"), to.alpha = data_or_null(alpha, pixels, "alpha");
   to.packed = reinterpret_cast<uint32_t*>(data_or_null(packed, pixels, "packed"));
@@ -96,7 +96,7 @@ void bind_baked(nb::module_& m) {
         "b"_a.noconvert().none(), "c"_a.noconvert().none(), "base"_a.noconvert().none(), "span"_a.noconvert().none(),
         "lean"_a.noconvert().none(), "tiles"_a.noconvert(), "extent"_a.noconvert().none(),
         "mean_residual"_a.noconvert().none(), "pages"_a.noconvert().none(), "offset"_a, "scale"_a, "weight_bound"_a,
-        "near"_a, "prefilter"_a, "transmittance_min"_a, "viewmats"_a.noconvert(), "Ks"_a.noconvert(), "width"_a,
+        "near"_a, "through_pixel"_a, "transmittance_min"_a, "viewmats"_a.noconvert(), "Ks"_a.noconvert(), "width"_a,
         "height"_a, "background"_a.noconvert().none(), "rgb"_a.noconvert().none(), "alpha"_a.noconvert().none(),
         "packed"_a.noconvert().none(), "beta"_a.noconvert().none(), "depth"_a.noconvert().none(),
         "normal"_a.noconvert().none(), "overdraw"_a.noconvert().none(), "stages"_a, "memory"_a.noconvert(),

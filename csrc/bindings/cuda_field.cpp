@@ -10,8 +10,6 @@ namespace {
 template <class S>
 using Field = FieldHandle<S, Where, 16>;  // kernels read the table 16 bytes at a time
 
-constexpr int64_t kRange = 8;  // numbers of ExactRange
-
 template <class S>
 FieldWork<S> work_of(const Array<S>& mlp, const Maybe<int64_t>& exact, int64_t exact_size) {
   return {data(mlp, int64_t(kMostBlocks) * kMlpWeights, "mlp_work"), data_or_null(exact, exact_size, "exact_work")};
@@ -38,8 +36,8 @@ void bind(nb::module_& m, const char* suffix) {
          Maybe<int64_t> exact_work, uintptr_t stream) {
         const int64_t n = int64_t(x.size()) / 3;
         field_backward(n, field.arrays, x.data(), data(drho, 3 * n, "drho"), field.gradients(dtable, dw1, dw2, dw3),
-                       data_or_null(dx, 3 * n, "dx"), work_of(mlp_work, exact_work, field.entries() + kRange),
-                       stream_of(stream));
+                       data_or_null(dx, 3 * n, "dx"),
+                       work_of(mlp_work, exact_work, exact_size(field.entries(), 0, false)), stream_of(stream));
       },
       "field"_a, "x"_a.noconvert(), "drho"_a.noconvert(), "dtable"_a.noconvert(), "dw1"_a.noconvert(),
       "dw2"_a.noconvert(), "dw3"_a.noconvert(), "dx"_a.noconvert().none(), "mlp_work"_a.noconvert(),
@@ -72,7 +70,7 @@ void bind(nb::module_& m, const char* suffix) {
         if (learn && !mlp_work) throw std::invalid_argument("the field's gradients need mlp_work");
         if ((du != nullptr) != (df != nullptr) || (du && !learn))
           throw std::invalid_argument("duv and dframes come together, with the field's gradients");
-        const int64_t size = (learn ? field->entries() : 0) + kRange + (df ? 3 + kFrame : 3) * n;
+        const int64_t size = exact_size(learn ? field->entries() : 0, n, df != nullptr);
         const FieldWork<S> work = {
             data_or_null(mlp_work, int64_t(kMostBlocks) * kMlpWeights, "mlp_work"),
             data_or_null(exact_work, size, "exact_work"),
@@ -110,6 +108,7 @@ void bind_field(nb::module_& m) {
   bind<float>(m, "_f32");
   bind<double>(m, "_f64");
   m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
+  m.def("exact_size", &exact_size, "entries"_a, "surfels"_a, "frames"_a, "Numbers of exact_work, int64.");
 }
 
 }  // namespace bt::cuda

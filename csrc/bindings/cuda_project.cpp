@@ -10,16 +10,16 @@ void bind(nb::module_& m, const char* forward, const char* backward) {
   m.def(
       forward,
       [](In means, In quats, In log_scales, In opacity_logits, In beta_raw, In viewmat, In K, int width, int height,
-         double near, bool prefilter, Out geom, Out frames, Out radii, Array<int32_t> broken, uintptr_t stream) {
+         double near, bool through_pixel, Out geom, Out frames, Out radii, Array<int32_t> broken, uintptr_t stream) {
         const Surfels<S> in = surfels(means, quats, log_scales, opacity_logits, beta_raw);
         const int64_t n = in.n;
-        project_forward(data(viewmat, 16, "viewmat"), data(K, 9, "K"), width, height, S(near), prefilter, in,
+        project_forward(through_pixel, data(viewmat, 16, "viewmat"), data(K, 9, "K"), width, height, S(near), in,
                         data(geom, n * kGeom, "geom"), data(frames, n * kFrame, "frames"), data(radii, 2 * n, "radii"),
                         data(broken, 1, "broken"), stream_of(stream));
       },
       "means"_a.noconvert(), "quats"_a.noconvert(), "log_scales"_a.noconvert(), "opacity_logits"_a.noconvert(),
       "beta_raw"_a.noconvert(), "viewmat"_a.noconvert(), "K"_a.noconvert(), "width"_a, "height"_a, "near"_a,
-      "prefilter"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert(),
+      "through_pixel"_a, "geom"_a.noconvert(), "frames"_a.noconvert(), "radii"_a.noconvert(), "broken"_a.noconvert(),
       "stream"_a = 0);
   m.def(
       backward,

@@ -27,13 +27,14 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(name("bin_count_workspace").c_str(), &bin_count_workspace<S>, "n"_a);
   m.def(
       name("bin_count").c_str(),
-      [](In geom, In radii, int width, int height, Ints order, Longs slot_start, Bytes workspace, uintptr_t stream) {
+      [](In geom, In radii, int width, int height, bool through_pixel, Ints order, Longs slot_start, Bytes workspace,
+         uintptr_t stream) {
         const int64_t n = int64_t(order.size());
-        bin_count(n, rows(geom, n * kGeom, "geom"), data(radii, 2 * n, "radii"), width, height, order.data(),
-                  data(slot_start, n + 1, "slot_start"), memory(workspace, bin_count_workspace<S>(n)),
+        bin_count(through_pixel, n, rows(geom, n * kGeom, "geom"), data(radii, 2 * n, "radii"), width, height,
+                  order.data(), data(slot_start, n + 1, "slot_start"), memory(workspace, bin_count_workspace<S>(n)),
                   stream_of(stream));
       },
-      "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "order"_a.noconvert(),
+      "geom"_a.noconvert(), "radii"_a.noconvert(), "width"_a, "height"_a, "through_pixel"_a, "order"_a.noconvert(),
       "slot_start"_a.noconvert(), "workspace"_a.noconvert(), "stream"_a = 0);
 
   m.def(
@@ -44,15 +45,16 @@ void bind(nb::module_& m, const char* suffix) {
       "pairs"_a, "width"_a, "height"_a);
   m.def(
       name("bin_fill").c_str(),
-      [](In geom, int width, int height, Array<const int32_t> order, Array<const int64_t> slot_start, Ints slot,
-         Ints surfel, Longs tile_pairs, Bytes workspace, uintptr_t stream) {
+      [](In geom, int width, int height, bool through_pixel, Array<const int32_t> order,
+         Array<const int64_t> slot_start, Ints slot, Ints surfel, Longs tile_pairs, Bytes workspace, uintptr_t stream) {
         const int64_t n = int64_t(order.size()), pairs = checked_pairs(int64_t(slot.size()));
         const int64_t tiles = tiles_of(width, height);
-        bin_fill(n, rows(geom, n * kGeom, "geom"), width, height, order.data(), data(slot_start, n + 1, "slot_start"),
-                 pairs, slot.data(), data(surfel, pairs, "surfel"), data(tile_pairs, tiles + 1, "tile_pairs"),
-                 memory(workspace, bin_fill_workspace(pairs, tiles)), stream_of(stream));
+        bin_fill(through_pixel, n, rows(geom, n * kGeom, "geom"), width, height, order.data(),
+                 data(slot_start, n + 1, "slot_start"), pairs, slot.data(), data(surfel, pairs, "surfel"),
+                 data(tile_pairs, tiles + 1, "tile_pairs"), memory(workspace, bin_fill_workspace(pairs, tiles)),
+                 stream_of(stream));
       },
-      "geom"_a.noconvert(), "width"_a, "height"_a, "order"_a.noconvert(), "slot_start"_a.noconvert(),
+      "geom"_a.noconvert(), "width"_a, "height"_a, "through_pixel"_a, "order"_a.noconvert(), "slot_start"_a.noconvert(),
       "slot"_a.noconvert(), "surfel"_a.noconvert(), "tile_pairs"_a.noconvert(), "workspace"_a.noconvert(),
       "stream"_a = 0);
 
@@ -61,45 +63,45 @@ void bind(nb::module_& m, const char* suffix) {
       "pairs"_a);
   m.def(
       name("trace_mark").c_str(),
-      [](In geom, In radii, double near, int width, int height, Array<const int32_t> surfel,
+      [](In geom, In radii, double near, bool through_pixel, int width, int height, Array<const int32_t> surfel,
          Array<const int64_t> tile_pairs, Ints masks, Longs offsets, Longs tile_start, Bytes workspace,
          uintptr_t stream) {
         const int64_t n = int64_t(radii.size()) / 2, pairs = checked_pairs(int64_t(surfel.size()));
         const int64_t tiles = tiles_of(width, height);
-        trace_mark(rows(geom, n * kGeom, "geom"), radii.data(), S(near), width, height, pairs, surfel.data(),
-                   data(tile_pairs, tiles + 1, "tile_pairs"),
+        trace_mark(through_pixel, rows(geom, n * kGeom, "geom"), radii.data(), S(near), width, height, pairs,
+                   surfel.data(), data(tile_pairs, tiles + 1, "tile_pairs"),
                    reinterpret_cast<uint32_t*>(data(masks, kTileWarps * pairs, "masks")),
                    data(offsets, pairs + 1, "offsets"), data(tile_start, tiles + 1, "tile_start"),
                    memory(workspace, trace_mark_workspace(pairs)), stream_of(stream));
       },
-      "geom"_a.noconvert(), "radii"_a.noconvert(), "near"_a, "width"_a, "height"_a, "surfel"_a.noconvert(),
-      "tile_pairs"_a.noconvert(), "masks"_a.noconvert(), "offsets"_a.noconvert(), "tile_start"_a.noconvert(),
-      "workspace"_a.noconvert(), "stream"_a = 0);
+      "geom"_a.noconvert(), "radii"_a.noconvert(), "near"_a, "through_pixel"_a, "width"_a, "height"_a,
+      "surfel"_a.noconvert(), "tile_pairs"_a.noconvert(), "masks"_a.noconvert(), "offsets"_a.noconvert(),
+      "tile_start"_a.noconvert(), "workspace"_a.noconvert(), "stream"_a = 0);
   m.def(
       name("trace_fill").c_str(),
-      [](In geom, double near, const PairsHandle& pairs, Ints surfel, Ints pixel, Out weight, Out uv, Out depth,
-         Out sigma, uintptr_t stream) {
-        trace_fill(rows(geom, pairs.pairs.surfels * kGeom, "geom"), S(near), pairs.pairs,
+      [](In geom, double near, bool through_pixel, const PairsHandle& pairs, Ints surfel, Ints pixel, Out weight,
+         Out uv, Out depth, Out sigma, uintptr_t stream) {
+        trace_fill(through_pixel, rows(geom, pairs.pairs.surfels * kGeom, "geom"), S(near), pairs.pairs,
                    fragments<S>(pairs.fragments, surfel, pixel, weight, uv, depth, sigma), stream_of(stream));
       },
-      "geom"_a.noconvert(), "near"_a, "pairs"_a, "surfel"_a.noconvert(), "pixel"_a.noconvert(), "weight"_a.noconvert(),
-      "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert(), "stream"_a = 0);
+      "geom"_a.noconvert(), "near"_a, "through_pixel"_a, "pairs"_a, "surfel"_a.noconvert(), "pixel"_a.noconvert(),
+      "weight"_a.noconvert(), "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert(), "stream"_a = 0);
 
   m.def(
       name("trace_backward").c_str(),
-      [](In geom, double near, double rim, const PairsHandle& pairs, Ints surfel, Ints pixel, Out weight, Out uv,
-         Out depth, Out sigma, Maybe<const S> dweight, Maybe<const S> duv, Maybe<const S> ddepth, Out dsigma,
-         Out partial, Out dgeom, Out absgrad, uintptr_t stream) {
+      [](In geom, double near, bool through_pixel, double rim, const PairsHandle& pairs, Ints surfel, Ints pixel,
+         Out weight, Out uv, Out depth, Out sigma, Maybe<const S> dweight, Maybe<const S> duv, Maybe<const S> ddepth,
+         Out dsigma, Out partial, Out dgeom, Out absgrad, uintptr_t stream) {
         const Pairs& p = pairs.pairs;
         const int64_t f = pairs.fragments;
-        trace_backward(rows(geom, p.surfels * kGeom, "geom"), S(near), S(rim), p,
+        trace_backward(through_pixel, rows(geom, p.surfels * kGeom, "geom"), S(near), S(rim), p,
                        fragments<S>(f, surfel, pixel, weight, uv, depth, sigma), data_or_null(dweight, f, "dweight"),
                        data_or_null(duv, 2 * f, "duv"), data_or_null(ddepth, f, "ddepth"), data(dsigma, f, "dsigma"),
-                       data(partial, 16 * p.pairs, "partial"), data(dgeom, p.surfels * kGeom, "dgeom"),
+                       data(partial, kTraceSums * p.pairs, "partial"), data(dgeom, p.surfels * kGeom, "dgeom"),
                        data(absgrad, 2 * p.surfels, "absgrad"), stream_of(stream));
       },
-      "geom"_a.noconvert(), "near"_a, "rim"_a, "pairs"_a, "surfel"_a.noconvert(), "pixel"_a.noconvert(),
-      "weight"_a.noconvert(), "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert(),
+      "geom"_a.noconvert(), "near"_a, "through_pixel"_a, "rim"_a, "pairs"_a, "surfel"_a.noconvert(),
+      "pixel"_a.noconvert(), "weight"_a.noconvert(), "uv"_a.noconvert(), "depth"_a.noconvert(), "sigma"_a.noconvert(),
       "dweight"_a.noconvert().none(), "duv"_a.noconvert().none(), "ddepth"_a.noconvert().none(), "dsigma"_a.noconvert(),
       "partial"_a.noconvert(), "dgeom"_a.noconvert(), "absgrad"_a.noconvert(), "stream"_a = 0);
 
@@ -167,6 +169,8 @@ void bind_trace(nb::module_& m) {
       .def_prop_ro("fragments", [](const PairsHandle& p) { return p.fragments; });
   bind<float>(m, "_f32");
   bind<double>(m, "_f64");
+  m.attr("TILE_WARPS") = kTileWarps;
+  m.attr("TRACE_SUMS") = kTraceSums;
   m.def(
       "masked_counts",
       [](const PairsHandle& pairs, Array<const uint8_t> mask, Array<int32_t> counts, uintptr_t stream) {

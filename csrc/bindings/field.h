@@ -24,7 +24,7 @@ struct FieldHandle {
               std::tuple<double, double, double> mid, double half)
       : table(table_), w1(w1_), w2(w2_), w3(w3_) {
     if (levels < 1 || levels > kMaxLevels || log2_size < 1 || log2_size > 28)
-      throw std::invalid_argument("a field has 1 to 4 levels and 2 to 2^28 entries a level");
+      throw std::invalid_argument("a field has 1 to 4 levels and 2 to 2^28 entries per level");
     arrays = {levels,
               log2_size,
               min_resolution,

@@ -22,13 +22,26 @@ struct Extent {
   bool thin;                 // the conic is too flat to intersect: use the box
 };
 
-// With the prefilter the level set lies in the ellipse q <= r_c^2 of the largest blur and magnification that any pixel
-// can have: omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
+// How many times the smallest drawn sigma an opacity is.
+template <class S>
+BT_HD S times_drawn(S opacity) {
+  return S(1 / kAlphaMin) * opacity;
+}
+// Squared radius r_c^2 = 9 (1 - exp(-level / beta)) at which the kernel is exp(-level) of its centre; a part in 5,000
+// and `slack` wider: a bound must hold in spite of rounding.
+template <class S>
+BT_HD S level_radius2(S level, S beta, S slack) {
+  const S x = S(1) - exp_(-level / max_(beta, S(1e-6)));
+  return S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + slack);
+}
+
+// Seen through a pixel the level set lies in the ellipse q <= r_c^2 of the largest blur and magnification that any
+// pixel can have: omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
 BT_HD Extent filtered_extent(const double* g) {
   using S = double;
   Extent e = {};
   const S n = g[kArea], w0 = g[kW0], c = filter_variance(g[kBeta]);
-  if (!(w0 > S(0)) || !(g[kOpacity] * S(255) > S(1))) return e;  // exactly edge-on: nothing to see
+  if (!(w0 > S(0)) || !(times_drawn(g[kOpacity]) > S(1))) return e;  // exactly edge-on: nothing to see
   const S e1 = g[kW1] * g[kV2] - g[kW2] * g[kV1], e2 = g[kU1] * g[kW2] - g[kU2] * g[kW1];
   const S eta = S(kSupport) * sqrt_(e1 * e1 + e2 * e2) * n / w0 * S(1.0001);
   e.whole = !(eta < S(0.9));
@@ -42,11 +55,10 @@ BT_HD Extent filtered_extent(const double* g) {
   const S xy = -w2 * (g[kU1] * g[kU2] + g[kV1] * g[kV2]), area = w * w * n * w0;
   // the determinant without cancellation, and not below what rounding the coefficients leaves of it
   const S det = max_(area * area + c * (xx + yy - c), S(1e-12) * xx * yy);
-  const S level = log_(S(255) * g[kOpacity] * area / sqrt_(det)) + S(1e-4);
+  const S level = log_(times_drawn(g[kOpacity]) * area / sqrt_(det)) + S(1e-4);
   e.visible = level >= S(0);
   if (!e.visible) return e;
-  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
-  const S rc2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(1e-6));
+  const S rc2 = level_radius2(level, g[kBeta], S(1e-6));
   e.qa = yy / det, e.qb = -xy / det, e.qc = xx / det, e.qd = e.qe = S(0), e.qf = -rc2;
   const S hx = sqrt_(rc2 * xx) * S(1.0001) + S(0.01), hy = sqrt_(rc2 * yy) * S(1.0001) + S(0.01);
   e.ex0 = -hx, e.ex1 = hx, e.ey0 = -hy, e.ey1 = hy;
@@ -55,20 +67,18 @@ BT_HD Extent filtered_extent(const double* g) {
   return e;
 }
 
-template <class F>
+template <class Kernel, class F>
 BT_HD Extent extent(const F* geom) {
   using S = double;
   S g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = S(geom[i]);
-  if (g[kArea] > S(0)) return filtered_extent(g);
+  if (filtered<Kernel>(g)) return filtered_extent(g);
   Extent e;
-  const S o255 = S(255) * g[kOpacity];
-  e.visible = o255 >= S(1);
+  const S ratio = times_drawn(g[kOpacity]);
+  e.visible = ratio >= S(1);
   if (!e.visible) return e;
-  const S level = log_(o255);
-  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
-  // one part in 1e4 and a hundredth of a pixel wider: the bound must hold in spite of rounding
-  const S rc2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(1e-6));
+  const S level = log_(ratio);
+  const S rc2 = level_radius2(level, g[kBeta], S(1e-6));
   e.blur = sqrt_(level) + S(0.01);
   const S u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
   e.qa = u1 * u1 + v1 * v1 - rc2 * w1 * w1;
@@ -146,7 +156,7 @@ BT_HD void row_interval(const Extent& e, double lo, double hi, double& x0, doubl
 }
 
 // Which tiles: rows first, then the columns of a row.
-constexpr int kTile = 16;  // pixels a side
+constexpr int kTile = 16;  // pixels along a side
 BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
 
 struct TileSpan {
@@ -167,6 +177,16 @@ BT_HD TileSpan tile_columns(const Extent& e, const F* geom, int row, int width) 
   if (x0 > x1 || cx + x1 < 0 || cx + x0 > width - 1) return {0, -1};
   const int last = int(min_(double(width), ceil(cx + x1))) / kTile;
   return {int(max_(0.0, floor_(cx + x0))) / kTile, min_(tiles_across(width) - 1, last)};
+}
+// fn(row, first, last) for every row of tiles in which the surfel can touch those from `first` to `last`.
+template <class Kernel, class F, class Visit>
+BT_HD void for_tile_rows(const F* geom, int width, int height, Visit&& fn) {
+  const Extent e = extent<Kernel>(geom);
+  const TileSpan rows = tile_rows(e, geom, height);
+  for (int row = rows.first; row <= rows.last; ++row) {
+    const TileSpan columns = tile_columns(e, geom, row, width);
+    if (columns.first <= columns.last) fn(row, columns.first, columns.last);
+  }
 }
 
 }  // namespace bt

@@ -122,42 +122,4 @@ BT_HD Vec3<S> normalize_vjp(const Unit<S>& u, Vec3<S> dn) {
   return u.inv * (dn - dot(dn, u.n) * u.n);
 }
 
-// World to camera: x_cam = R x + t; pinhole in pixels.
-template <class S>
-struct Pinhole {
-  S R[9], t[3];  // row major
-  S fx, fy, cx, cy;
-};
-// viewmat [4, 4] and K [3, 3], row major
-template <class S>
-BT_HD Pinhole<S> pinhole(const S* viewmat, const S* K) {
-  Pinhole<S> c;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];
-    c.t[i] = viewmat[4 * i + 3];
-  }
-  c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
-  return c;
-}
-template <class S>
-BT_HD Vec3<S> rotate(const S* R, Vec3<S> a) {
-  return {R[0] * a.x + R[1] * a.y + R[2] * a.z, R[3] * a.x + R[4] * a.y + R[5] * a.z,
-          R[6] * a.x + R[7] * a.y + R[8] * a.z};
-}
-// Camera coordinates of a world point, accumulated in double: far from the origin R m and t cancel, and what is left of
-// float32 products would be their rounding.
-template <class S>
-BT_HD Vec3<S> to_camera(const Pinhole<S>& cam, const S* m) {
-  const double x = m[0], y = m[1], z = m[2];
-  const S *R = cam.R, *t = cam.t;
-  return {S(double(R[0]) * x + double(R[1]) * y + double(R[2]) * z + double(t[0])),
-          S(double(R[3]) * x + double(R[4]) * y + double(R[5]) * z + double(t[1])),
-          S(double(R[6]) * x + double(R[7]) * y + double(R[8]) * z + double(t[2]))};
-}
-template <class S>
-BT_HD Vec3<S> rotate_transposed(const S* R, Vec3<S> a) {
-  return {R[0] * a.x + R[3] * a.y + R[6] * a.z, R[1] * a.x + R[4] * a.y + R[7] * a.z,
-          R[2] * a.x + R[5] * a.y + R[8] * a.z};
-}
-
 }  // namespace bt

@@ -5,7 +5,7 @@
 
 namespace bt {
 
-constexpr int kFeatures = 4;  // a level
+constexpr int kFeatures = 4;  // per level
 constexpr int kWidth = 16;    // of both hidden layers
 constexpr int kMaxLevels = 4;
 
@@ -157,20 +157,6 @@ BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state,
   for (int i = 0; i < kInputs; ++i) sums.w1[i] += g.g1 * Row(features[i]);
 }
 
-// Shading, eq. (color): relu(relu(f_view + 0.5) + rho(x)). The residual passes gradient where the outer ReLU is open,
-// the view colour where both are.
-template <class S>
-BT_HD S view_base(S f_view) {
-  return relu(f_view + S(0.5));
-}
-template <class S>
-BT_HD S residual_gradient(S color, S dcolor) {
-  return color > S(0) ? dcolor : S(0);
-}
-template <class S>
-BT_HD S base_gradient(S f_view, S dresidual) {
-  return f_view > S(-0.5) ? dresidual : S(0);
-}
 // Where a fragment lies; frame: mean, s_u t_u, s_v t_v.
 template <class S>
 BT_HD Vec3<S> world_point(const S* frame, S u, S v) {

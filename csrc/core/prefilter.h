@@ -75,7 +75,7 @@ BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredPlace<T>& 
   return f;
 }
 
-// As fragment_vjp (core/fragment.h). 1 - x is bounded from below by what x changes over a pixel: the derivative is then
+// As fragment_vjp (core/kernel.h). 1 - x is bounded from below by what x changes over a pixel: the derivative is then
 // no larger than that of the kernel averaged over the pixel, also at the rim for beta < 1. rim = 0: no bound, the exact
 // derivative.
 template <class S, class T>

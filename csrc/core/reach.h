@@ -23,15 +23,14 @@ struct LevelSet {
 template <class S>
 BT_HD LevelSet<S> level_set(const S* g) {
   LevelSet<S> l = {false, S(0), S(0)};
-  const S o255 = S(255) * g[kOpacity];
-  l.visible = o255 >= S(1) - S(1e-6);
+  const S ratio = times_drawn(g[kOpacity]);
+  l.visible = ratio >= S(1) - S(1e-6);
   if (!l.visible) return l;
-  const S level = max_(log_(o255), S(0)) + S(1e-5);
-  const S x = S(1) - exp_(-level / max_(g[kBeta], S(1e-6)));
-  l.r2 = S(kSupport * kSupport) * min_(S(1), x * S(1.0002) + S(4e-6));
+  const S level = max_(log_(ratio), S(0)) + S(1e-5);
+  l.r2 = level_radius2(level, g[kBeta], S(4e-6));
   // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x),
   // (1 - x)^beta >= exp(-d^2) holds out to d^2 = ln 255 where k >= beta + ln 255.
-  const S reach = S(2.36);  // > sqrt(ln 255)
+  const S reach = S(kLowPassReach);
   const S w1 = g[kW1] < S(0) ? -g[kW1] : g[kW1], w2 = g[kW2] < S(0) ? -g[kW2] : g[kW2];
   const S least = g[kW0] - reach * (w1 + w2);
   const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];
@@ -100,7 +99,7 @@ BT_HD Reach<S> reach(const S* g, S r2, S blur2) {
   return e;
 }
 
-// With the prefilter: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
+// Seen through a pixel: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
 template <class S>
 struct FilteredReach {
   bool visible;

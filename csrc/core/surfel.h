@@ -9,23 +9,45 @@
 // multiplied by the sign of n.p, so that W > 0 means "in front".
 #pragma once
 
-#include "core/common.h"
+#include "core/camera.h"
 
 namespace bt {
 
-constexpr double kSupport = 3.0;         // R: the kernel ends at 3 scale units
-constexpr double kAlphaMax = 0.99;       // sigma is clamped to this
-constexpr double kAlphaMin = 1.0 / 255;  // fragments below this are skipped
-constexpr double kTransmittanceMin = 1e-4;
+constexpr double kSupport = 3.0;            // R: the kernel ends at 3 scale units
+constexpr double kAlphaMax = 0.99;          // sigma is clamped to this
+constexpr double kAlphaMin = 1.0 / 255;     // fragments below this are skipped
+constexpr double kTransmittanceMin = 1e-4;  // a pixel takes no fragment that would leave it less
+constexpr double kLowPassReach = 2.36;      // pixels, > sqrt(ln(1 / kAlphaMin)): where the low pass falls below that
 constexpr double kBetaMax = 4.0;
 constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their squares stay finite in float32
 
 // Columns of a row of `geom` [N, kGeom].
 enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kArea, kGeom = 16 };
-// kArea: 0, or with the prefilter n = fx fy s_u s_v / z^2, for which n w0 is the area of the projected scale ellipse
-// over pi (core/prefilter.h).
-// Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
+// kArea: 0, or where PixelKernel filters the surfel n = fx fy s_u s_v / z^2, for which n w0 is the area of the
+// projected scale ellipse over pi. Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world
+// frame.
 constexpr int kFrame = 9;
+
+// How a launch draws surfels, known when its code is compiled: united with the low pass (core/kernel.h), or seen
+// through a pixel (core/prefilter.h), where rows without kArea are as with the low pass. with_kernel is the one place
+// that chooses.
+struct LowPassKernel {
+  static constexpr bool kPixel = false;
+};
+struct PixelKernel {
+  static constexpr bool kPixel = true;
+};
+template <class F>
+void with_kernel(bool through_pixel, F&& launch) {
+  through_pixel ? launch(PixelKernel()) : launch(LowPassKernel());
+}
+template <class Kernel, class S>
+BT_HD bool filtered(const S* g) {
+  if constexpr (Kernel::kPixel)
+    return g[kArea] > S(0);
+  else
+    return false;
+}
 
 // The geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
 template <class S>
@@ -89,12 +111,13 @@ BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
-// Fills a row of geom and frames; false (and untouched rows) when the surfel is not finite or its centre is nearer than
-// `near` (camera z).
-template <class S>
-BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
-                   S beta_raw, S near, bool prefilter, S* geom, S* frame) {
-  const Rotation<S> rot = rotation(quat);
+// Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre
+// is nearer than `near` (camera z).
+template <class Kernel, class S>
+BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, S* geom, S* frame) {
+  const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
+  const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
+  const Rotation<S> rot = rotation(in.quats + 4 * i);
   const Vec3<S> m = load3(mean);
   const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
   const Vec3<S> p = to_camera(cam, mean);
@@ -118,7 +141,7 @@ BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S*
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
   // discs of a million pixels need no filter, and their squared areas would overflow
   const S area = cam.fx * cam.fy * su * sv * iz * iz;
-  g[kArea] = prefilter && area < S(1e12) ? area : S(0);
+  g[kArea] = Kernel::kPixel && area < S(1e12) ? area : S(0);
   for (int i = 0; i < kGeom; ++i)
     if (!finite_(g[i])) return false;
   for (int i = 0; i < kGeom; ++i) geom[i] = g[i];
@@ -128,13 +151,23 @@ BT_HD bool project(const Pinhole<S>& cam, const S* mean, const S* quat, const S*
   return true;
 }
 
-// Gradients of the parameters of one projected surfel; they are written, not added. The slope of a sigmoid is taken
-// from its argument, sigmoid(x) sigmoid(-x): at o -> 1 nothing is left of 1 - o in float32.
+// Gradients of the parameters of surfel i from those of its rows; they are written, not added, and 0 where the camera
+// does not see the surfel. dframe may be null (zero). The slope of a sigmoid is taken from its argument, sigmoid(x)
+// sigmoid(-x): at o -> 1 nothing is left of 1 - o in float32.
 template <class S>
-BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, const S* log_scales, S opacity_logit,
-                       S beta_raw, const S* geom, const S* dgeom, const S* dframe, S* dmean, S* dquat, S* dlog_scales,
-                       S* dopacity_logit, S* dbeta_raw) {
-  const Rotation<S> rot = rotation(quat);
+BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, const S* geom, const S* dgeom,
+                       const S* dframe, const SurfelGradients<S>& out) {
+  S *dquat = out.quats + 4 * i, *dlog_scales = out.log_scales + 2 * i;
+  if (geom[kZ] == S(0)) {
+    store3(out.means + 3 * i, Vec3<S>{S(0), S(0), S(0)});
+    for (int k = 0; k < 4; ++k) dquat[k] = S(0);
+    dlog_scales[0] = dlog_scales[1] = out.opacity_logits[i] = out.beta_raw[i] = S(0);
+    return;
+  }
+  const S none[kFrame] = {};
+  if (!dframe) dframe = none;
+  const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
+  const Rotation<S> rot = rotation(in.quats + 4 * i);
   const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
   const Vec3<S> p = to_camera(cam, mean);
   const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
@@ -158,18 +191,20 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const S* mean, const S* quat, cons
   const S darea = dgeom[kArea] * geom[kArea];  // towards log n
   dp.z -= S(2) * iz * darea;
 
-  store3(dmean, rotate_transposed(cam.R, dp) + load3(dframe));
+  const Vec3<S> dmean = rotate_transposed(cam.R, dp) + load3(dframe);
   const Vec3<S> dtu = load3(dframe + 3), dtv = load3(dframe + 6);
   const Vec3<S> gu = rotate_transposed(cam.R, da) + su * dtu;
   const Vec3<S> gv = rotate_transposed(cam.R, db) + sv * dtv;
-  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
   // u1, u2 scale with 1/s_u and the frame with s_u
   const S gsu = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu) + darea;
   const S gsv = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv) + darea;
+  const S dopacity = dgeom[kOpacity] * geom[kOpacity], dbeta = dgeom[kBeta] * geom[kBeta];
+  store3(out.means + 3 * i, dmean);
+  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
   dlog_scales[0] = scale_moves(log_scales[0]) ? gsu : S(0);
   dlog_scales[1] = scale_moves(log_scales[1]) ? gsv : S(0);
-  *dopacity_logit = dgeom[kOpacity] * geom[kOpacity] * sigmoid(-opacity_logit);
-  *dbeta_raw = dgeom[kBeta] * geom[kBeta] * sigmoid(-beta_raw);
+  out.opacity_logits[i] = dopacity * sigmoid(-in.opacity_logits[i]);
+  out.beta_raw[i] = dbeta * sigmoid(-in.beta_raw[i]);
 }
 
 }  // namespace bt

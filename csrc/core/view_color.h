@@ -7,8 +7,9 @@
 
 namespace bt {
 
-constexpr int kMaxTerms = 32;
-constexpr double kLogTauMax = 16;  // temperatures end at 9e6: finite in, finite out
+constexpr int kMaxTerms = 32;                  // sites or lobes
+constexpr double kShC0 = 0.28209479177387814;  // the harmonic of degree 0, 1 / (2 sqrt(pi))
+constexpr double kLogTauMax = 16;              // temperatures end at 9e6: finite in, finite out
 
 // Direction from the camera's centre, given in double: far from the origin its rounding to float32 would turn the
 // direction, while the difference is as exact as the surfel's own position.
@@ -92,7 +93,7 @@ BT_HD void sv_color_vjp(int K, const S* sites, const S* log_tau, const S* rgb, V
 template <class S>
 BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-  out[0] = S(0.28209479177387814);
+  out[0] = S(kShC0);
   if (terms > 1) {
     const S a = S(0.4886025119029199);
     out[1] = -a * y, out[2] = a * z, out[3] = -a * x;
@@ -252,7 +253,7 @@ struct ViewColorArrays {
   int kind, terms;
   S *a, *b, *c;
 };
-// Numbers a surfel of a, b and c.
+// Numbers per surfel of a, b and c.
 struct ViewColorWidths {
   int64_t a, b, c;
 };

@@ -2,6 +2,7 @@
 #include <stdexcept>
 #include <string>
 
+#include "core/shading.h"
 #include "core/texel.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
@@ -88,7 +89,8 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
   });
 }
 
-template <class S>
+namespace {
+template <class Kernel, class S>
 void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, bool maps,
                    const S* base, const Atlas& atlas, S* image, int32_t* overdraw) {
   using P = Pack<S>;
@@ -112,33 +114,36 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
       const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
       const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
       const S extent = S(atlas.extent[id]);
-      const S view[3] = {relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)), relu(base[3 * id + 2] + S(0.5))};
-      state.blend(g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
-        const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
-        const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
-        for (int c = 0; c < 3; ++c) sums[c][pack] += plain * P(view[c]);
-        sums[3][pack] += w;
-        if (maps) {
-          sums[4][pack] += w * P(g[kBeta]);
-          sums[5][pack] += w * f.depth;
-          for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
-        }
-        if (overdraw) sums[kMapChannels][pack] += select(taken, P(S(1)), P(S(0)));
-        const uint32_t rest = bits(textures);
-        if (!rest) return;
-        if (!tiled) {
-          for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(relu(view[c] + S(flat[c])));
-          return;
-        }
-        const P x = texel_position(f.u, sides[0], extent), y = texel_position(f.v, sides[1], extent);
-        const Quad<S> colour = {view[0] + S(atlas.offset), view[1] + S(atlas.offset), view[2] + S(atlas.offset), S(0)};
-        const int64_t first = 4 * patches.first[id];
-        Quad<S>* to = rgb + pack * kLanes;
-        if (patches.floats.empty())
-          add_textured(patches.bytes.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
-        else
-          add_textured(patches.floats.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
-      });
+      S view[3];
+      store3(view, view_base(load3(base + 3 * id)));
+      state.template blend<Kernel>(
+          g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
+            const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
+            const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
+            for (int c = 0; c < 3; ++c) sums[c][pack] += plain * P(view[c]);
+            sums[3][pack] += w;
+            if (maps) {
+              sums[4][pack] += w * P(g[kBeta]);
+              sums[5][pack] += w * f.depth;
+              for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
+            }
+            if (overdraw) sums[kMapChannels][pack] += select(taken, P(S(1)), P(S(0)));
+            const uint32_t rest = bits(textures);
+            if (!rest) return;
+            if (!tiled) {
+              for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(shaded(view[c], S(flat[c])));
+              return;
+            }
+            const P x = texel_position(f.u, sides[0], extent), y = texel_position(f.v, sides[1], extent);
+            const Quad<S> colour = {view[0] + S(atlas.offset), view[1] + S(atlas.offset), view[2] + S(atlas.offset),
+                                    S(0)};
+            const int64_t first = 4 * patches.first[id];
+            Quad<S>* to = rgb + pack * kLanes;
+            if (patches.floats.empty())
+              add_textured(patches.bytes.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
+            else
+              add_textured(patches.floats.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
+          });
     }
     for (int pack = 0; pack < kPacks; ++pack)
       for (int lane = 0; lane < kLanes; ++lane) {
@@ -153,10 +158,19 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
       }
   }
 }
+}  // namespace
 
-template void baked_forward<float>(const float*, const float*, float, const Bins&, int, int, bool, const float*,
+template <class S>
+void baked_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   bool maps, const S* base, const Atlas& atlas, S* image, int32_t* overdraw) {
+  with_kernel(through_pixel, [&](auto kernel) {
+    baked_forward<decltype(kernel)>(geom, radii, near, bins, width, height, maps, base, atlas, image, overdraw);
+  });
+}
+
+template void baked_forward<float>(bool, const float*, const float*, float, const Bins&, int, int, bool, const float*,
                                    const Atlas&, float*, int32_t*);
-template void baked_forward<double>(const double*, const double*, double, const Bins&, int, int, bool, const double*,
-                                    const Atlas&, double*, int32_t*);
+template void baked_forward<double>(bool, const double*, const double*, double, const Bins&, int, int, bool,
+                                    const double*, const Atlas&, double*, int32_t*);
 
 }  // namespace bt

@@ -1,4 +1,4 @@
-// Weighted sums of the fragments a pixel, and their backward pass.
+// Weighted sums of the fragments per pixel, and their backward pass.
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 
@@ -30,7 +30,7 @@ void composite_backward(int64_t n, bool maps, const S* geom, const int64_t* tile
                         const FragmentArrays<S>& f, const S* colors, const S* dimage, S* dweight, S* dcolors, S* ddepth,
                         S* dgeom) {
   const int channels = maps ? kMapChannels : kImageChannels;
-  constexpr int kSums = 4;  // beta and the normal, a surfel
+  constexpr int kSums = 4;  // beta and the normal, per surfel
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   const int parts = parallel_tiles(tile_start, tiles, 64, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];

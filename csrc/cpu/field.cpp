@@ -1,6 +1,8 @@
 // The residual field at points, and the colours of fragments.
 #include "cpu/field.h"
 
+#include "core/shading.h"
+
 namespace bt {
 
 namespace {
@@ -73,8 +75,7 @@ void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const
     int64_t who[kBatch];
     int count = 0;
     for (int64_t i = begin; i < end; ++i) {
-      const S* b = base + 3 * int64_t(f.surfel[i]);
-      for (int c = 0; c < 3; ++c) colors[3 * i + c] = view_base(b[c]);
+      store3(colors + 3 * i, view_base(load3(base + 3 * int64_t(f.surfel[i]))));
       if (field && f.weight[i] >= bound) {
         enc.set(count, world_point(frames + int64_t(f.surfel[i]) * kFrame, f.uv[i], f.uv[fragments + i]));
         who[count++] = i;
@@ -83,8 +84,7 @@ void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const
         enc.encode(*field, count);
         for (int p = 0; p < count; ++p) {
           S* to = colors + 3 * who[p];
-          const Vec3<S> rho = mlp(m, enc.features[p], state);
-          to[0] = relu(to[0] + rho.x), to[1] = relu(to[1] + rho.y), to[2] = relu(to[2] + rho.z);
+          store3(to, shaded(load3(to), mlp(m, enc.features[p], state)));
         }
         count = 0;
       }
@@ -128,15 +128,12 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
       S lanes[kWidth];
       for (int64_t k = begin; k < end; ++k) {
         const int64_t i = block + k, id = f.surfel[i];
-        const S* b = base + 3 * id;
-        S g[3];
-        for (int c = 0; c < 3; ++c) {
-          g[c] = residual_gradient(colors[3 * i + c], dcolors[3 * i + c]);
-          own[id * columns + c] += base_gradient(b[c], g[c]);
-        }
+        const Vec3<S> g = residual_gradient(load3(colors + 3 * i), load3(dcolors + 3 * i));
+        S* sum = own.data() + id * columns;
+        store3(sum, load3(sum) + base_gradient(load3(base + 3 * id), g));
         if (learn && f.weight[i] >= bound) {
           enc.set(count, world_point(frames + id * kFrame, f.uv[i], f.uv[fragments + i]));
-          drho[count] = load3(g);
+          drho[count] = g;
           who[count++] = i;
         }
         if (count == kBatch || (count && k + 1 == end)) {

@@ -6,6 +6,7 @@
 #include <memory>
 #include <vector>
 
+#include "core/blend.h"
 #include "core/bounds.h"
 #include "core/field.h"
 #include "core/surfel.h"
@@ -13,13 +14,15 @@
 
 namespace bt {
 
+// `through_pixel` chooses between the kernels of core/surfel.h, and has to be the same wherever a view's rows go.
+
 int num_threads();
 void set_num_threads(int n);
 
 // geom [n, kGeom], frames [n, kFrame], radii [n, 2] (half extents of the level-set box in pixels, 0 where not visible),
 // rows of surfels that are not visible are zero. Returns how many rows are not finite.
 template <class S>
-int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bool prefilter, const Surfels<S>& in,
+int64_t project_forward(bool through_pixel, const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in,
                         S* geom, S* frames, S* radii);
 template <class S>
 void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
@@ -32,7 +35,7 @@ struct Bins {
   std::vector<int32_t> surfels;  // [start.back()]
 };
 template <class S>
-void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins);
+void bin(bool through_pixel, int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins);
 
 // The fragments of a view, ordered by tile, then front to back by surfel, then by pixel.
 template <class S>
@@ -64,19 +67,19 @@ struct FragmentArrays {
 };
 // Where there are more than `most` (0 = any number) they are only counted.
 template <class S>
-void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, int64_t most,
-                   FragmentList<S>& list);
+void trace_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   int64_t most, FragmentList<S>& list);
 // Large lists give their memory back.
 template <class S>
 void trace_copy(FragmentList<S>& list, const FragmentArrays<S>& out);
 
 // dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero).
 template <class S>
-void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
-                    const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad);
+void trace_backward(bool through_pixel, int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start,
+                    int64_t tiles, const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth,
+                    S* dgeom, S* absgrad);
 
-// Image [pixels, channels]: rgb, alpha, sum w beta, and with maps sum w depth and sum w normal. Written.
-constexpr int kImageChannels = 5, kMapChannels = 9;
+// Image [pixels, channels]: the sums of core/blend.h. Written.
 template <class S>
 void composite_forward(int64_t pixels, bool maps, const S* geom, const int64_t* tile_start, int64_t tiles,
                        const FragmentArrays<S>& f, const S* colors, S* image);
@@ -172,7 +175,7 @@ struct Atlas {
 constexpr int kBakedChannels = 4;
 // image [pixels, channels] is written; overdraw [pixels] int32 or null
 template <class S>
-void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, bool maps,
-                   const S* base, const Atlas& atlas, S* image, int32_t* overdraw);
+void baked_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   bool maps, const S* base, const Atlas& atlas, S* image, int32_t* overdraw);
 
 }  // namespace bt

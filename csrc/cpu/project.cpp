@@ -1,8 +1,7 @@
 // Projection of all surfels, tile lists, and the number of threads.
-#include <cmath>
 #include <numeric>
 
-#include "core/bounds.h"
+#include "core/visibility.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 
@@ -23,36 +22,14 @@ int num_threads() {
 void set_num_threads(int n) { g_threads = n; }
 
 template <class S>
-int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bool prefilter, const Surfels<S>& in,
+int64_t project_forward(bool through_pixel, const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in,
                         S* geom, S* frames, S* radii) {
   std::vector<int64_t> broken(num_threads(), 0);
-  parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      S *g = geom + i * kGeom, *f = frames + i * kFrame, *r = radii + 2 * i;
-      r[0] = r[1] = S(0);
-      bool seen = project(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                          in.beta_raw[i], near, prefilter, g, f);
-      if (seen) {
-        const Extent e = extent(g);
-        seen =
-            e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
-        if (seen) {
-          const double most = 1e6;
-          r[0] = S(std::min(most, std::max(e.x1, -e.x0)));
-          r[1] = S(std::min(most, std::max(e.y1, -e.y0)));
-        }
-      } else {
-        bool finite = true;
-        for (int k = 0; k < 3; ++k) finite &= finite_(in.means[3 * i + k]);
-        for (int k = 0; k < 4; ++k) finite &= finite_(in.quats[4 * i + k]);
-        for (int k = 0; k < 2; ++k) finite &= finite_(in.log_scales[2 * i + k]);
-        broken[thread] += !(finite && finite_(in.opacity_logits[i]) && finite_(in.beta_raw[i]));
-      }
-      if (!seen) {
-        std::fill(g, g + kGeom, S(0));
-        std::fill(f, f + kFrame, S(0));
-      }
-    }
+  with_kernel(through_pixel, [&](auto kernel) {
+    parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i)
+        broken[thread] += !see<decltype(kernel)>(cam, width, height, in, i, near, geom, frames, radii);
+    });
   });
   return std::accumulate(broken.begin(), broken.end(), int64_t(0));
 }
@@ -60,38 +37,14 @@ int64_t project_forward(const Pinhole<S>& cam, int width, int height, S near, bo
 template <class S>
 void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
                       const SurfelGradients<S>& out) {
-  const S none[kFrame] = {};
   parallel_parts(in.n, 1024, [&](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const S* g = geom + i * kGeom;
-      if (g[kZ] == S(0)) {
-        std::fill(out.means + 3 * i, out.means + 3 * i + 3, S(0));
-        std::fill(out.quats + 4 * i, out.quats + 4 * i + 4, S(0));
-        std::fill(out.log_scales + 2 * i, out.log_scales + 2 * i + 2, S(0));
-        out.opacity_logits[i] = out.beta_raw[i] = S(0);
-        continue;
-      }
-      project_vjp(cam, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i], in.beta_raw[i],
-                  g, dgeom + i * kGeom, dframes ? dframes + i * kFrame : none, out.means + 3 * i, out.quats + 4 * i,
-                  out.log_scales + 2 * i, out.opacity_logits + i, out.beta_raw + i);
-    }
+    for (int64_t i = begin; i < end; ++i)
+      project_vjp(cam, in, i, geom + i * kGeom, dgeom + i * kGeom, dframes ? dframes + i * kFrame : nullptr, out);
   });
 }
 
 namespace {
-// Calls fn(tile) for every tile that the surfel may touch.
-template <class S, class F>
-void for_tiles(const S* g, int width, int height, F&& fn) {
-  const Extent e = extent(g);
-  const TileSpan rows = tile_rows(e, g, height);
-  for (int ty = rows.first; ty <= rows.last; ++ty) {
-    const TileSpan columns = tile_columns(e, g, ty, width);
-    for (int tx = columns.first; tx <= columns.last; ++tx) fn(ty * tiles_across(width) + tx);
-  }
-}
-}  // namespace
-
-template <class S>
+template <class Kernel, class S>
 void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
   bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
@@ -113,9 +66,11 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
     for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
       const size_t head = list.size();
       list.push_back(0);
-      for_tiles(geom + int64_t(order[k].second) * kGeom, width, height, [&](int tile) {
-        list.push_back(tile);
-        ++at[t][tile];
+      for_tile_rows<Kernel>(geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
+        for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
+          list.push_back(tile);
+          ++at[t][tile];
+        }
       });
       list[head] = int32_t(list.size() - head - 1);
     }
@@ -140,12 +95,18 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
     }
   }
 }
+}  // namespace
+
+template <class S>
+void bin(bool through_pixel, int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
+  with_kernel(through_pixel, [&](auto kernel) { bin<decltype(kernel)>(n, geom, radii, width, height, bins); });
+}
 
 #define BT_INSTANTIATE(S)                                                                                   \
-  template int64_t project_forward<S>(const Pinhole<S>&, int, int, S, bool, const Surfels<S>&, S*, S*, S*); \
+  template int64_t project_forward<S>(bool, const Pinhole<S>&, int, int, S, const Surfels<S>&, S*, S*, S*); \
   template void project_backward<S>(const Pinhole<S>&, const Surfels<S>&, const S*, const S*, const S*,     \
                                     const SurfelGradients<S>&);                                             \
-  template void bin<S>(int64_t, const S*, const S*, int, int, Bins&);
+  template void bin<S>(bool, int64_t, const S*, const S*, int, int, Bins&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -170,7 +170,7 @@ BT_HD Pack<double> log_(Pack<double> x) {
   return r;
 }
 
-// One bit a lane.
+// One bit per lane.
 BT_HD uint32_t bits(Pack<float>::M m) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
   return _mm512_movepi32_mask((__m512i)m);

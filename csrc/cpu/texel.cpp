@@ -1,6 +1,7 @@
-// Colours from texels, summed a pixel, and their backward pass: what the baked renderer shows, differentiable.
+// Colours from texels, summed per pixel, and their backward pass: what the baked renderer shows, differentiable.
 #include "core/texel.h"
 
+#include "core/shading.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 
@@ -13,13 +14,13 @@ struct Patch {
   const int32_t* size;  // r_u, r_v; 0, 0 = no tile
   int64_t first;        // texel
   S extent;
-  Vec3<S> view;  // relu(f_view + 0.5)
+  Vec3<S> view;  // the colour without residual
 
   Patch(const TexelTiles<S>& tiles, const S* base, int64_t id)
       : size(tiles.size + 2 * id),
         first(tiles.first[id]),
         extent(tiles.extent[id]),
-        view{relu(base[3 * id] + S(0.5)), relu(base[3 * id + 1] + S(0.5)), relu(base[3 * id + 2] + S(0.5))} {}
+        view(view_base(load3(base + 3 * id))) {}
   bool textured() const { return size[0] > 0; }
   TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
 };
@@ -37,8 +38,7 @@ void texel_image_forward(int64_t pixels, const int64_t* tile_start, int64_t tile
         Vec3<S> c = patch.view;
         if (patch.textured() && f.weight[i] >= bound) {
           const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
-          c = c + texel_fetch(texels + 3 * patch.first, corners);
-          c = {relu(c.x), relu(c.y), relu(c.z)};
+          c = shaded(c, texel_fetch(texels + 3 * patch.first, corners));
         }
         S* to = image + 3 * int64_t(f.pixel[i]);
         store3(to, load3(to) + f.weight[i] * c);
@@ -67,15 +67,13 @@ void texel_image_backward(int64_t n, const int64_t* run_start, const int64_t* or
         Vec3<S> g = f.weight[i] * load3(dimage + 3 * int64_t(f.pixel[i]));
         if (patch.textured() && f.weight[i] >= bound) {
           const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
-          const Vec3<S> c = patch.view + texel_fetch(texels + 3 * patch.first, corners);
-          g = {c.x > S(0) ? g.x : S(0), c.y > S(0) ? g.y : S(0), c.z > S(0) ? g.z : S(0)};
+          g = residual_gradient(shaded(patch.view, texel_fetch(texels + 3 * patch.first, corners)), g);
           if (dtexels) texel_fetch_vjp(corners, g, dtexels + 3 * patch.first);
         }
         sum = sum + g;
       }
       if (!dbase) continue;
-      const S v[3] = {patch.view.x, patch.view.y, patch.view.z}, g[3] = {sum.x, sum.y, sum.z};
-      for (int c = 0; c < 3; ++c) dbase[3 * id + c] += v[c] > S(0) ? g[c] : S(0);
+      store3(dbase + 3 * id, load3(dbase + 3 * id) + base_gradient(load3(base + 3 * id), sum));
     }
   });
 }

@@ -1,7 +1,7 @@
 // Walking a tile's surfels: a tile is 16 packs of 4 x 4 pixels.
 #pragma once
 
-#include "core/fragment.h"
+#include "core/kernel.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 
@@ -24,8 +24,8 @@ struct TileState {
   TileState(int tile_x, int tile_y, int width, int height, S stop = S(kTransmittanceMin)) : stop(stop) {
     x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
     for (int i = 0; i < kLanes; ++i) {
-      lane_x.v[i] = S(i % kPackSide) + S(0.5);
-      lane_y.v[i] = S(i / kPackSide) + S(0.5);
+      lane_x.v[i] = pixel_centre<S>(i % kPackSide);
+      lane_y.v[i] = pixel_centre<S>(i / kPackSide);
     }
     for (int p = 0; p < kPacks; ++p) {
       transmittance[p] = P(S(1));
@@ -37,32 +37,27 @@ struct TileState {
   }
 
   // Blends a surfel: fn(pack, lanes, fragment, weight) for every pack in which some pixel takes it.
-  template <class F>
+  template <class Kernel, class F>
   void blend(const S* g, const S* radius, S near, F&& fn) {
     const S cx = g[kCx] - x0, cy = g[kCy] - y0;
     const int left = first(cx - radius[0]), right = last(cx + radius[0]);
     const int top = first(cy - radius[1]), bottom = last(cy + radius[1]);
-    const S blur2 = S(5.6);  // > ln 255: beyond this the low pass cannot reach 1/255
     for (int py = top; py <= bottom; ++py) {
       for (int px = left; px <= right; ++px) {
         const int pack = py * kPacksAcross + px;
         if (!bits(open[pack])) continue;
         const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
-        if (g[kArea] > S(0)) {
+        if (filtered<Kernel>(g)) {
           const FilteredPlace<P> at = filtered_place<S, P>(g, dx, dy);
           if (bits(open[pack] & (at.q < P(S(kSupport * kSupport)))))
             take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
           continue;
         }
         // a cheap look first: does any lane lie in the support or near the centre?
-        const P W = P(g[kW0]) + P(g[kW1]) * dx + P(g[kW2]) * dy;
-        const P U = P(g[kU1]) * dx + P(g[kU2]) * dy, V = P(g[kV1]) * dx + P(g[kV2]) * dy;
-        const P reach = P(S(kSupport * kSupport)) * W * W;
-        const M near_centre = dx * dx + dy * dy < P(blur2);
-        if (!bits(open[pack] & ((U * U + V * V < reach) | near_centre))) continue;
+        const M inside = within(planes(g, dx, dy), P(S(kSupport * kSupport))), close = near_centre(dx, dy);
+        if (!bits(open[pack] & (inside | close))) continue;
         take_fragment(
-            pack, bits(near_centre) ? fragment<S, P, true>(g, near, dx, dy) : fragment<S, P, false>(g, near, dx, dy),
-            fn);
+            pack, bits(close) ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy), fn);
       }
     }
   }
@@ -70,17 +65,13 @@ struct TileState {
  private:
   template <class F>
   void take_fragment(int pack, const Fragment<P>& f, F& fn) {
-    M take = open[pack] & (f.sigma >= P(S(kAlphaMin)));
-    if (!bits(take)) return;
-    const P weight = f.sigma * transmittance[pack];
-    const P next = transmittance[pack] - weight;
-    // the surfel that would take a pixel below the bound is not blended and ends it
-    const M ends = take & (next < P(stop));
-    open[pack] = open[pack] & ~ends;
-    take = take & ~ends;
-    transmittance[pack] = select(take, next, transmittance[pack]);
-    const uint32_t lanes = bits(take);
-    if (lanes) fn(pack, lanes, f, weight);
+    const Blend<P> b = bt::blend(f.sigma, transmittance[pack]);
+    const Verdict<P> v = judge(open[pack], f.sigma, b.behind, P(stop));
+    if (!bits(v.takes | v.ends)) return;
+    open[pack] = open[pack] & ~v.ends;
+    transmittance[pack] = select(v.takes, b.behind, transmittance[pack]);
+    const uint32_t lanes = bits(v.takes);
+    if (lanes) fn(pack, lanes, f, b.weight);
     if (!bits(open[pack])) --open_packs;
   }
   static int first(S offset) {  // pack that holds the pixel at this offset, at least 0

@@ -1,7 +1,7 @@
 // Fragments of a view and their backward pass; per-surfel counts.
 #include <atomic>
 
-#include "core/fragment.h"
+#include "core/kernel.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
@@ -16,7 +16,8 @@ constexpr int64_t kTileMost = 2400 * kTile * kTile + kLanes;
 constexpr int64_t kKept = int64_t(1) << 22;  // lists up to this length keep their memory for the next view
 }  // namespace
 
-template <class S>
+namespace {
+template <class Kernel, class S>
 void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, int64_t most,
                    FragmentList<S>& list) {
   using P = Pack<S>;
@@ -49,28 +50,28 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
     TileState<S> state(tx, ty, width, height);
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
-      state.blend(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
-                  [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
-                    if (!keep) {
-                      count += __builtin_popcount(lanes);
-                      return;
-                    }
-                    const int64_t at = from + count;
-                    const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width + tx * kTile +
-                                           pack % kPacksAcross * kPackSide;
-                    int n = 0;
-                    for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
-                      const int lane = __builtin_ctz(rest);
-                      a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
-                      a.surfel[at + n] = id;
-                    }
-                    compress(&a.weight[at], weight, lanes);
-                    compress(&a.u[at], f.u, lanes);
-                    compress(&a.v[at], f.v, lanes);
-                    compress(&a.depth[at], f.depth, lanes);
-                    compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
-                    count += n;
-                  });
+      state.template blend<Kernel>(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
+                                   [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
+                                     if (!keep) {
+                                       count += __builtin_popcount(lanes);
+                                       return;
+                                     }
+                                     const int64_t at = from + count;
+                                     const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width +
+                                                            tx * kTile + pack % kPacksAcross * kPackSide;
+                                     int n = 0;
+                                     for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
+                                       const int lane = __builtin_ctz(rest);
+                                       a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
+                                       a.surfel[at + n] = id;
+                                     }
+                                     compress(&a.weight[at], weight, lanes);
+                                     compress(&a.u[at], f.u, lanes);
+                                     compress(&a.v[at], f.v, lanes);
+                                     compress(&a.depth[at], f.depth, lanes);
+                                     compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
+                                     count += n;
+                                   });
     }
     if (keep) a.used += count;
     found.fetch_add(count, std::memory_order_relaxed);
@@ -80,6 +81,15 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
   for (int64_t t = 0; t < tiles; ++t) list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
   list.total = list.tile_start[tiles];
   if (most && list.total > most) list.blocks.clear();  // nothing will be copied
+}
+}  // namespace
+
+template <class S>
+void trace_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
+                   int64_t most, FragmentList<S>& list) {
+  with_kernel(through_pixel, [&](auto kernel) {
+    trace_forward<decltype(kernel)>(geom, radii, near, bins, width, height, most, list);
+  });
 }
 
 template <class S>
@@ -102,7 +112,8 @@ void trace_copy(FragmentList<S>& list, const FragmentArrays<S>& out) {
   if (list.total > kKept) list.blocks.clear();
 }
 
-template <class S>
+namespace {
+template <class Kernel, class S>
 void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
                     const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad) {
   using P = Pack<S>;
@@ -113,7 +124,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
-  // a part's own sums: 15 numbers a surfel (12 columns of geom, the area, and the two absolute gradients)
+  // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
   const int parts = parallel_tiles(tile_start, tiles, most, [&](int part, int64_t first_tile, int64_t last_tile) {
     std::vector<S>& sums = partial[part];
@@ -137,12 +148,11 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
           const S sigma = f.sigma[i] < S(0) ? -f.sigma[i] : f.sigma[i];
           S& rest = behind[(y - y0) * kTile + x - x0];
           const S gw = dweight ? dweight[i] : S(0);
-          dsigma[m] = f.weight[i] / sigma * gw - rest / (S(1) - sigma);
-          rest += f.weight[i] * gw;
+          dsigma[m] = blend_vjp(f.weight[i], sigma, gw, rest);
           du[m] = duv ? duv[i] : S(0), dv[m] = duv ? duv[total + i] : S(0);
           dz[m] = ddepth ? ddepth[i] : S(0);
           low[m] = f.sigma[i] < S(0) ? S(1) : S(0);
-          dx[m] = S(x) + S(0.5) - g[kCx], dy[m] = S(y) + S(0.5) - g[kCy];
+          dx[m] = pixel_centre<S>(x) - g[kCx], dy[m] = pixel_centre<S>(y) - g[kCy];
           ++m;
         }
         end = begin;
@@ -152,8 +162,8 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
         d[kArea] = P(S(0));
         for (int k = 0; k < m; k += kLanes) {
           P ddx, ddy;
-          fragment_vjp<S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k), load(du + k),
-                             load(dv + k), load(dz + k), d, ddx, ddy);
+          fragment_vjp<Kernel, S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k),
+                                     load(du + k), load(dv + k), load(dz + k), d, ddx, ddy);
           ax += max_(ddx, -ddx), ay += max_(ddy, -ddy);
         }
         S* to = sums.data() + int64_t(id) * kSums;
@@ -174,17 +184,28 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
     }
   });
 }
+}  // namespace
+
+template <class S>
+void trace_backward(bool through_pixel, int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start,
+                    int64_t tiles, const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth,
+                    S* dgeom, S* absgrad) {
+  with_kernel(through_pixel, [&](auto kernel) {
+    trace_backward<decltype(kernel)>(n, geom, near, rim, width, tile_start, tiles, f, dweight, duv, ddepth, dgeom,
+                                     absgrad);
+  });
+}
 
 void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixel, const uint8_t* mask,
                    int32_t* counts) {
   for (int64_t i = 0; i < fragments; ++i) counts[surfel[i]] += mask[pixel[i]] != 0;
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template void trace_forward<S>(const S*, const S*, S, const Bins&, int, int, int64_t, FragmentList<S>&);         \
-  template void trace_copy<S>(FragmentList<S>&, const FragmentArrays<S>&);                                         \
-  template void trace_backward<S>(int64_t, const S*, S, S, int, const int64_t*, int64_t, const FragmentArrays<S>&, \
-                                  const S*, const S*, const S*, S*, S*);
+#define BT_INSTANTIATE(S)                                                                                        \
+  template void trace_forward<S>(bool, const S*, const S*, S, const Bins&, int, int, int64_t, FragmentList<S>&); \
+  template void trace_copy<S>(FragmentList<S>&, const FragmentArrays<S>&);                                       \
+  template void trace_backward<S>(bool, int64_t, const S*, S, S, int, const int64_t*, int64_t,                   \
+                                  const FragmentArrays<S>&, const S*, const S*, const S*, S*, S*);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -10,7 +10,7 @@ namespace bt::cuda {
 
 enum class TexelFormat { kBc7, kUint8, kHalf };
 
-// One texture a page: a handle is 64 bits, the same in a whole warp, and pages are as large as they like. Memory is
+// One texture per page: a handle is 64 bits, the same in a whole warp, and pages are as large as they like. Memory is
 // allocated here, once, and freed by the destructor. Throws std::runtime_error when the device refuses.
 class AtlasTexture {
  public:

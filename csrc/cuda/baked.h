@@ -1,11 +1,12 @@
 // The forward-only renderer of a baked scene on the device.
 //
-//   prepare   a thread a surfel: projection, level set, number of tiles; then, for the visible ones alone, the view
+//   prepare   one thread per surfel: projection, level set, number of tiles; then, for the visible ones alone, the view
 //             colour and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
 //   bin       surfels are sorted by depth (32-bit keys, in place of one sort of all pairs by tile and depth, whose keys
 //             are three times as wide and ten times as many); each then writes its (tile, surfel) pairs at its place,
 //             and a stable sort by tile alone, 16-bit keys where they fit, leaves every tile's list front to back.
-//   draw      a warp 8 x 8 pixels, two a thread, four warps a tile of 16 x 16. A pair carries the mask of the 8 x 4
+//   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the
+//   8 x 4
 //             parts of the tile that its surfel reaches, so a warp looks at those alone.
 //
 // Nothing is allocated and nothing waits: counts stay on the device, and the second sort runs over the whole capacity,
@@ -29,10 +30,10 @@ struct BakedSurfels {
   const int32_t* tiles;        // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
   const float* extent;         // [n], null: kSupport everywhere
   const float* mean_residual;  // [n, 3], null: 0
-  const uint64_t* pages;       // a texture a page of the atlas, null: none
+  const uint64_t* pages;       // a texture per page of the atlas, null: none
   float offset, scale;         // residual = offset + scale * texel
   float weight_bound, near;
-  bool prefilter;
+  bool through_pixel;       // chooses between the kernels of core/surfel.h
   float transmittance_min;  // a surfel that would leave a pixel less is not blended and ends it; 0: all are
 };
 
@@ -44,7 +45,7 @@ struct BakedViews {
 // What is drawn, [count, height, width, channels]; null: not wanted.
 struct BakedImages {
   float *rgb, *alpha;            // 3 channels over the background, 1
-  uint32_t* packed;              // the same as 8 bits a channel, red in the lowest byte
+  uint32_t* packed;              // the same as 8 bits per channel, red in the lowest byte
   float *beta, *depth, *normal;  // sums of w beta, w z and w n (1, 1 and 3 channels)
   int32_t* overdraw;             // blended surfels
   const float* background;       // [3], null: black

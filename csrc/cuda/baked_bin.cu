@@ -41,8 +41,8 @@ __device__ int64_t write_pairs(const TileRow& r, uint32_t first_tile, uint32_t r
   return at;
 }
 
-// The surfels in order of depth, a thread each, a warp for the large ones; the last blocks clear what is left over.
-template <class Key, bool kPrefilter>
+// The surfels in order of depth, one thread each, a warp for the large ones; the last blocks clear what is left over.
+template <class Kernel, class Key>
 __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned surfel_blocks) {
   Key* keys = static_cast<Key*>(f.memory.keys);
   int32_t* values = f.memory.values;
@@ -64,7 +64,7 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
   const int tiles_of_view = f.tiles_x * f.tiles_y;
   if (count > 0 && count <= kPairsAlone) {
     const int64_t end = min_(from + int64_t(count), f.capacity);
-    const Footprint area = footprint<kPrefilter>(f.memory.rows + int64_t(id) * kRow, f.height);
+    const Footprint area = footprint<Kernel>(f.memory.rows + int64_t(id) * kRow, f.height);
     const uint32_t base = id / uint32_t(f.n) * tiles_of_view;
     int64_t at = from;
     for (int ty = area.top; ty <= area.bottom; ++ty)
@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
     const uint32_t big = __shfl_sync(kFullMask, id, source);
     const int32_t pairs = __shfl_sync(kFullMask, count, source);
     const int64_t start = __shfl_sync(kFullMask, from, source), end = min_(start + int64_t(pairs), f.capacity);
-    const Footprint area = footprint<kPrefilter>(f.memory.rows + int64_t(big) * kRow, f.height);
+    const Footprint area = footprint<Kernel>(f.memory.rows + int64_t(big) * kRow, f.height);
     const uint32_t base = big / uint32_t(f.n) * tiles_of_view;
     int64_t at = start;
     for (int top = area.top; top <= area.bottom; top += kWarp) {
@@ -93,7 +93,7 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
   }
 }
 
-// Where each tile's pairs begin and end: a thread a run of keys as long as 16 bytes.
+// Where each tile's pairs begin and end: one thread per run of keys as long as 16 bytes.
 template <class Key>
 __global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
   constexpr int kKeys = 16 / sizeof(Key);
@@ -125,10 +125,9 @@ void bin(const BakedFrame& f, Stream stream) {
   BT_LAUNCH(order_counts_kernel, dim3(blocks), dim3(kThreads), 0, stream, f);
   exclusive_sum(m.ordered_counts, m.offsets, f.rows, m.scratch, m.scratch_bytes, stream);
   const unsigned rest = unsigned(min_<int64_t>(1024, ceil_div(f.capacity + 2 * f.tiles, kThreads * kRestPerThread)));
-  if (f.prefilter)
-    BT_LAUNCH((pairs_kernel<Key, true>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
-  else
-    BT_LAUNCH((pairs_kernel<Key, false>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
+  with_kernel(f.through_pixel, [&](auto kernel) {
+    BT_LAUNCH((pairs_kernel<decltype(kernel), Key>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
+  });
   sort_pairs(static_cast<const Key*>(m.keys), static_cast<Key*>(m.keys_sorted), m.values, m.values_sorted, f.capacity,
              f.key_bits, m.scratch, m.scratch_bytes, stream);
   const unsigned runs = unsigned(ceil_div(f.capacity, kThreads * int64_t(16 / sizeof(Key))));
@@ -164,7 +163,7 @@ BakedFrame frame_of(int64_t surfels, const BakedViews& v, int64_t capacity) {
   BakedFrame f = {};
   f.n = surfels, f.rows = surfels * v.count;
   f.width = v.width, f.height = v.height;
-  f.tiles_x = int(ceil_div(v.width, kTileSide)), f.tiles_y = int(ceil_div(v.height, kTileSide));
+  f.tiles_x = tiles_across(v.width), f.tiles_y = tiles_across(v.height);
   f.tiles = int64_t(f.tiles_x) * f.tiles_y * v.count;
   f.capacity = ceil_div(max_<int64_t>(capacity, 1), 8) * 8;
   while (f.tiles >> f.key_bits) ++f.key_bits;
@@ -190,7 +189,7 @@ size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, 
 void baked_frame(const BakedSurfels& surfels, const BakedViews& views, const BakedImages& images, int stages,
                  void* memory, size_t bytes, int64_t capacity, Stream stream) {
   BakedFrame f = frame_of(surfels.geometry.n, views, capacity);
-  f.prefilter = surfels.prefilter;
+  f.through_pixel = surfels.through_pixel;
   const int64_t needed = lay_out(f, memory, images.normal != nullptr);
   if (int64_t(bytes) < needed)
     throw std::invalid_argument("the working memory has " + std::to_string(bytes) + " bytes, the frame needs " +

@@ -1,8 +1,9 @@
 // First stage of the baked renderer: the surfels that a view sees, each as the row that the later stages read.
 //
-// A thread a surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters a surfel with
-// seven sites, 20 + 24 a term of lean ones) are computed for the visible ones alone, by threads that stand next to each
-// other: a block packs them.
+// One thread per surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters per surfel
+// with seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next
+// to each other: a block packs them.
+#include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_stages.h"
 
@@ -49,7 +50,7 @@ __device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> colo
     const Vec3<float> flat = load3(s.mean_residual + 3 * i);
     if (flat.x != 0 || flat.y != 0 || flat.z != 0) {
       scale = -1;
-      place[0] = relu(color.x + flat.x), place[1] = relu(color.y + flat.y), place[2] = relu(color.z + flat.z);
+      store3(place, shaded(color, flat));
     }
   }
   row[kTexelScale] = scale;
@@ -57,7 +58,7 @@ __device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> colo
   for (int k = 0; k < 4; ++k) row[kTileX + k] = place[k];
 }
 
-template <bool kPrefilter>
+template <class Kernel>
 __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, BakedViews v, BakedFrame f) {
   __shared__ int seen_count;
   __shared__ int seen_list[kThreads];
@@ -76,17 +77,16 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
     const Surfels<float>& in = s.geometry;
     float geom[kGeom], frame[kFrame];
     const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
-    seen = project(camera, in.means + 3 * i, in.quats + 4 * i, in.log_scales + 2 * i, in.opacity_logits[i],
-                   in.beta_raw[i], s.near, kPrefilter, geom, frame);
+    seen = project<Kernel>(camera, in, i, s.near, geom, frame);
     if (seen) {
       LevelSet<float> level;
-      if (kPrefilter && geom[kArea] > 0)
+      if (filtered<Kernel>(geom))
         level = {filtered_reach(geom).visible, 0, -geom[kArea]};
       else
         level = level_set(geom);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
-      area = footprint<kPrefilter>(row, v.height);
+      area = footprint<Kernel>(row, v.height);
       const Reach<float>& e = area.reach;
       const float x0 = e.ellipse ? min_(e.x0, -e.blur) - area.pad : -e.blur;
       const float x1 = e.ellipse ? max_(e.x1, e.blur) + area.pad : e.blur;
@@ -115,7 +115,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
   for (unsigned rest = __ballot_sync(kFullMask, shared); rest; rest &= rest - 1) {
     const int source = __ffs(int(rest)) - 1;
     const Footprint big =
-        footprint<kPrefilter>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
+        footprint<Kernel>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
     int32_t sum = 0;
     for (int ty = big.top + lane; ty <= big.bottom; ty += kWarp) {
       const TileRow r = tile_row(big, ty, v.width);
@@ -139,8 +139,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
   double center[3];  // -R^T t
   for (int k = 0; k < 3; ++k) center[k] = -(double(m[k]) * m[3] + double(m[4 + k]) * m[7] + double(m[8 + k]) * m[11]);
   const Vec3<float> d = view_direction(s.geometry.means + 3 * j, center).n;
-  Vec3<float> color = view_color(s, j, d);
-  color = {relu(color.x + 0.5f), relu(color.y + 0.5f), relu(color.z + 0.5f)};
+  const Vec3<float> color = view_base(view_color(s, j, d));
   float* to = f.memory.rows + (first + j) * kRow;
   store3(to + kRed, color);
   write_texture(s, j, color, to);
@@ -150,10 +149,9 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
 void baked_prepare(const BakedSurfels& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
   if (!f.rows) return;
   const dim3 grid(unsigned(ceil_div(f.n, kThreads)), unsigned(v.count));
-  if (f.prefilter)
-    BT_LAUNCH(prepare_kernel<true>, grid, dim3(kThreads), 0, stream, s, v, f);
-  else
-    BT_LAUNCH(prepare_kernel<false>, grid, dim3(kThreads), 0, stream, s, v, f);
+  with_kernel(f.through_pixel, [&](auto kernel) {
+    BT_LAUNCH(prepare_kernel<decltype(kernel)>, grid, dim3(kThreads), 0, stream, s, v, f);
+  });
 }
 
 }  // namespace bt::cuda

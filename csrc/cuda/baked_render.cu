@@ -1,14 +1,15 @@
 // Third stage of the baked renderer: the images.
 //
-// A warp draws 8 x 8 pixels, two a thread (four rows apart), and works for itself: no barrier of the block, no waiting
-// for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names one of
-// its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread reads the
-// same row (a broadcast, four loads of 16 bytes) for both its pixels. The three planes cost three multiply-adds for the
-// second pixel. On scenes like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of its 8 parts, and 6 of
-// 10 pixels that are looked at blend it: the masks leave little to reject. A hit costs one reciprocal, one logarithm,
-// one exponential and, where the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by
-// the texture unit; memory traffic is 96 bytes a row and warp, mostly from L2.
-#include "core/fragment.h"
+// A warp draws 8 x 8 pixels, two per thread (four rows apart), and works for itself: no barrier of the block, no
+// waiting for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names
+// one of its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread
+// reads the same row (a broadcast, four loads of 16 bytes) for both its pixels. The three planes cost three
+// multiply-adds for the second pixel. On scenes like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of
+// its 8 parts, and 6 of 10 pixels that are looked at blend it: the masks leave little to reject. A hit costs one
+// reciprocal, one logarithm, one exponential and, where the weight is above the bound, one texture fetch. Bound by
+// issue of arithmetic, then by the texture unit; memory traffic is 96 bytes per row and warp, mostly from L2.
+#include "core/kernel.h"
+#include "core/shading.h"
 #include "core/texel.h"
 #include "cuda/atlas_texture.h"
 #include "cuda/baked_stages.h"
@@ -20,7 +21,7 @@ namespace {
 constexpr int kWarps = 4, kThreads = kWarps * kWarp;
 constexpr int kRowQuads = kRow / 4;  // float4s of a row
 constexpr int kLook = 8;             // rows between looks whether all pixels are done
-constexpr int kPixels = 2;           // a thread
+constexpr int kPixels = 2;           // per thread
 
 struct DrawArgs {
   const float* rows;
@@ -46,33 +47,25 @@ struct Row {
   uint32_t id;
 };
 
-// How a surfel covers a pixel: the kernel alone, united with the low pass, or seen through the pixel.
-enum class Cover { kKernel, kLowPass, kFiltered };
-
-template <bool kMaps, Cover kCover>
+// A row under a thread's pixel. With LowPassKernel, kBlur says whether the low pass shows; PixelKernel is for the rows
+// that it filters alone.
+template <bool kMaps, class Kernel, bool kBlur>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel& p) {
   bool near_it = p.transmittance > 0;
-  if (kCover != Cover::kFiltered) {  // the planes alone say for most pixels that the surfel is not there
-    const float W = s.g[kW0] + s.g[kW1] * dx + s.g[kW2] * dy;
-    const float U = s.g[kU1] * dx + s.g[kU2] * dy, V = s.g[kV1] * dx + s.g[kV2] * dy;
-    bool inside = U * U + V * V < s.r2 * (W * W) && W > 0;
-    if (kCover == Cover::kLowPass) inside = inside || dx * dx + dy * dy < s.blur2;
+  if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
+    const Planes<float> at = planes(s.g, dx, dy);
+    bool inside = within(at, s.r2) && at.W > 0;
+    if (kBlur) inside = inside || dx * dx + dy * dy < s.blur2;
     near_it = near_it && inside;
   }
   if (!near_it) return;
-  float g[kGeom];
-  BT_UNROLL
-  for (int k = 0; k < kGeom; ++k) g[k] = s.g[k];
-  g[kArea] = kCover == Cover::kFiltered ? s.g[kArea] : 0.0f;  // known to the compiler
-  const Fragment<Fast> f = fragment<float, Fast, kCover == Cover::kLowPass>(g, a.near, Fast(dx), Fast(dy));
+  const Fragment<Fast> f = fragment<Kernel, kBlur>(s.g, a.near, Fast(dx), Fast(dy));
   const float sigma = f.sigma.v;
-  if (!(sigma >= float(kAlphaMin))) return;
-  const float weight = sigma * p.transmittance, next = p.transmittance - weight;
-  if (next < a.transmittance_min) {  // the surfel that would do that is not blended
-    p.transmittance = -p.transmittance;
-    return;
-  }
-  p.transmittance = next;
+  const auto [weight, behind] = bt::blend(sigma, p.transmittance);
+  const Verdict<float> v = judge(true, sigma, behind, a.transmittance_min);
+  if (v.ends) p.transmittance = -p.transmittance;
+  if (!v.takes) return;
+  p.transmittance = behind;
   const float4 c = s.rest[0];
   float red = s.red, green = s.green, blue = c.x;
   if (weight >= a.weight_bound && c.y != 0) {
@@ -83,9 +76,9 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
       const float handle[2] = {c.z, c.w};
       memcpy(&page, handle, sizeof page);
       const float4 texel = fetch_texel(page, x, y);
-      red = relu(red + a.offset + a.scale * texel.x);
-      green = relu(green + a.offset + a.scale * texel.y);
-      blue = relu(blue + a.offset + a.scale * texel.z);
+      red = shaded(red + a.offset, a.scale * texel.x);
+      green = shaded(green + a.offset, a.scale * texel.y);
+      blue = shaded(blue + a.offset, a.scale * texel.z);
     } else {
       red = t.x, green = t.y, blue = t.z;
     }
@@ -119,15 +112,15 @@ __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
   }
 }
 
-template <bool kMaps, bool kPrefilter>
-__global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_kernel(DrawArgs a) {
+template <bool kMaps, class Kernel>
+__global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const unsigned tile = blockIdx.x;
   const int in_view = int(tile % unsigned(a.tiles_of_view));
-  const int x = in_view % a.tiles_x * kTileSide + (warp & 1) * 8 + (lane & 7);
-  const int y = in_view / a.tiles_x * kTileSide + (warp >> 1) * 8 + (lane >> 3);
+  const int x = in_view % a.tiles_x * kTile + (warp & 1) * 8 + (lane & 7);
+  const int y = in_view / a.tiles_x * kTile + (warp >> 1) * 8 + (lane >> 3);
   float4* stage = staged[warp];
   uint32_t* queue = queues[warp];
   Pixel p[kPixels];
@@ -167,7 +160,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_ke
       if (k % kLook == kLook - 1 && !__any_sync(kFullMask, p[0].transmittance > 0 || p[1].transmittance > 0)) break;
       const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
       const uint32_t pair = queue[k];
-      const float area = kPrefilter && q3.y < 0 ? -q3.y : 0.0f;
+      const float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
       const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
                      q3.x,
                      q3.y,
@@ -175,17 +168,17 @@ __global__ void __launch_bounds__(kThreads, kMaps || kPrefilter ? 6 : 8) draw_ke
                      q3.w,
                      q + 4,
                      pair >> 8};
-      const float dx = x + 0.5f - s.g[kCx], dy = y + 0.5f - s.g[kCy];
+      const float dx = pixel_centre<float>(x) - s.g[kCx], dy = pixel_centre<float>(y) - s.g[kCy];
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j) {
         if (!(pair & part[j])) continue;
         const float below = dy + kBandRows * j;
-        if (kPrefilter && s.blur2 < 0)
-          blend<kMaps, Cover::kFiltered>(a, s, dx, below, p[j]);
+        if (filtered<Kernel>(s.g))
+          blend<kMaps, Kernel, true>(a, s, dx, below, p[j]);
         else if (s.blur2 > 0)
-          blend<kMaps, Cover::kLowPass>(a, s, dx, below, p[j]);
+          blend<kMaps, LowPassKernel, true>(a, s, dx, below, p[j]);
         else
-          blend<kMaps, Cover::kKernel>(a, s, dx, below, p[j]);
+          blend<kMaps, LowPassKernel, false>(a, s, dx, below, p[j]);
       }
     }
     wanted = 0;
@@ -221,14 +214,12 @@ void baked_draw(const BakedSurfels& s, const BakedImages& images, const BakedFra
                       images};
   const dim3 grid(static_cast<unsigned>(f.tiles));
   const bool maps = images.beta || images.depth || images.normal || images.overdraw;
-  if (maps && f.prefilter)
-    BT_LAUNCH((draw_kernel<true, true>), grid, dim3(kThreads), 0, stream, a);
-  else if (maps)
-    BT_LAUNCH((draw_kernel<true, false>), grid, dim3(kThreads), 0, stream, a);
-  else if (f.prefilter)
-    BT_LAUNCH((draw_kernel<false, true>), grid, dim3(kThreads), 0, stream, a);
-  else
-    BT_LAUNCH((draw_kernel<false, false>), grid, dim3(kThreads), 0, stream, a);
+  with_kernel(f.through_pixel, [&](auto kernel) {
+    if (maps)
+      BT_LAUNCH((draw_kernel<true, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
+    else
+      BT_LAUNCH((draw_kernel<false, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
+  });
 }
 
 }  // namespace bt::cuda

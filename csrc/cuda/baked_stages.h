@@ -6,14 +6,14 @@
 
 namespace bt::cuda {
 
-constexpr int kTileSide = 16, kBands = 4, kBandRows = kTileSide / kBands;
+constexpr int kBands = 4, kBandRows = kTile / kBands;
 constexpr uint32_t kNeverSeen = 0xffffffffu;  // depth key of a surfel that is not visible
 
 // A surfel's row: the first twelve columns are those of GeomColumn. 24 floats are three sectors of 32 bytes.
 enum RowColumn {
-  kR2 = kBeta + 1,         // level set u^2 + v^2 <= r2
-  kBlur2,                  // and d^2 <= blur2; 0: the low pass does not show; with the prefilter -kArea
-  kRed,                    // relu(view colour + 0.5), three
+  kR2 = kBeta + 1,  // level set u^2 + v^2 <= r2
+  kBlur2,           // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel
+  kRed,             // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
   kPage,                   // handle of the texture, 64 bits
   kTileX = kPage + 2,      // centre of the tile's first texel, two; or three: the colour with the constant residual
@@ -39,10 +39,10 @@ struct BakedMemory {
 struct BakedFrame {
   int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs
   int width, height, tiles_x, tiles_y;
-  int64_t tiles;   // of all views
-  int key_bits;    // tile numbers and the key of unused room
-  bool wide;       // keys of 32 bits
-  bool prefilter;  // some rows are of discs seen through a pixel
+  int64_t tiles;       // of all views
+  int key_bits;        // tile numbers and the key of unused room
+  bool wide;           // keys of 32 bits
+  bool through_pixel;  // as in BakedSurfels
   BakedMemory memory;
 };
 
@@ -69,10 +69,10 @@ BT_HD void geom_of(const float* row, float* geom) {
   for (int k = 0; k < kGeom; ++k) geom[k] = k <= kBeta ? row[k] : 0.0f;
   geom[kArea] = row[kBlur2] < 0 ? -row[kBlur2] : 0.0f;
 }
-template <bool kPrefilter>
+template <class Kernel>
 BT_HD Footprint footprint(const float* row, int height) {
   Footprint f;
-  if (kPrefilter && row[kBlur2] < 0) {
+  if (Kernel::kPixel && row[kBlur2] < 0) {
     float geom[kGeom];
     geom_of(row, geom);
     f.reach = filtered_reach<float>(geom).reach;
@@ -88,7 +88,7 @@ BT_HD Footprint footprint(const float* row, int height) {
   if (e.blur > 0) y0 = e.ellipse ? min_(y0, -e.blur) : -e.blur, y1 = e.ellipse ? max_(y1, e.blur) : e.blur;
   const int first = e.whole ? 0 : pixel_from(f.cy + y0, height),
             last = e.whole ? height - 1 : pixel_to(f.cy + y1, height);
-  f.top = first / kTileSide, f.bottom = last / kTileSide;
+  f.top = first / kTile, f.bottom = last / kTile;
   if (first > last) f.top = 0, f.bottom = -1;
   return f;
 }
@@ -103,9 +103,9 @@ BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
   const Reach<float>& e = f.reach;
   int from = width, to = -1;
   float upper0 = 1e30f, upper1 = -1e30f;  // crossings with the line above a band; below it those of the next
-  if (e.ellipse && !e.whole) widen_by_crossing(e, ty * kTileSide - f.cy, upper0, upper1);
+  if (e.ellipse && !e.whole) widen_by_crossing(e, ty * kTile - f.cy, upper0, upper1);
   for (int band = 0; band < kBands; ++band) {
-    const float lo = ty * kTileSide + band * kBandRows - f.cy, hi = lo + kBandRows;
+    const float lo = ty * kTile + band * kBandRows - f.cy, hi = lo + kBandRows;
     float x0 = 1e30f, x1 = -1e30f;
     if (e.whole) {
       x0 = -1e30f, x1 = 1e30f;
@@ -125,14 +125,14 @@ BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
     r.to[band] = x0 > x1 ? -1 : pixel_to(f.cx + x1, width);
     if (r.from[band] <= r.to[band]) from = min_(from, r.from[band]), to = max_(to, r.to[band]);
   }
-  r.left = from / kTileSide, r.right = to / kTileSide;
+  r.left = from / kTile, r.right = to / kTile;
   if (from > to) r.left = 0, r.right = -1;
   return r;
 }
 // Bit 2 band + half is set when the surfel reaches these 8 x 4 pixels of tile tx.
 BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   uint32_t mask = 0;
-  const int x = tx * kTileSide, half = kTileSide / 2;
+  const int x = tx * kTile, half = kTile / 2;
   for (int band = 0; band < kBands; ++band) {
     mask |= uint32_t(r.from[band] < x + half && r.to[band] >= x) << (2 * band);
     mask |= uint32_t(r.from[band] < x + 2 * half && r.to[band] >= x + half) << (2 * band + 1);

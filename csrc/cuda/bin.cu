@@ -2,8 +2,8 @@
 //
 // Two sorts instead of one by a joint key of tile and depth: the n surfels by depth, then, written out in that order,
 // the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
-// order. There are about six pairs a surfel: the large sort moves 8 bytes a pair through two passes (13 bits for 4,000
-// tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
+// order. There are about six pairs per surfel: the large sort moves 8 bytes per pair through two passes (13 bits for
+// 4,000 tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
 #include "cuda/primitives.h"
 #include "cuda/trace.h"
 #include "cuda/workspace.h"
@@ -75,22 +75,16 @@ struct FillSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-template <class S>
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kThreads)
     count_kernel(int64_t n, const S* geom, const S* radii, int width, int height, CountSpace<S> w) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   const bool visible = radii[2 * i] > S(0);
   int64_t count = 0;
-  if (visible) {
-    const S* g = geom + i * kGeom;
-    const Extent e = extent(g);
-    const TileSpan rows = tile_rows(e, g, height);
-    for (int row = rows.first; row <= rows.last; ++row) {
-      const TileSpan columns = tile_columns(e, g, row, width);
-      count += columns.last >= columns.first ? columns.last - columns.first + 1 : 0;
-    }
-  }
+  if (visible)
+    for_tile_rows<Kernel>(geom + i * kGeom, width, height,
+                          [&](int, int first, int last) { count += last - first + 1; });
   w.keys[i] = visible ? ordered(geom[i * kGeom + kZ]) : ~typename KeyOf<S>::type(0);
   w.rows[i] = int32_t(i);
   w.counts[i] = int32_t(count);  // at most the tiles of an image
@@ -103,28 +97,24 @@ __global__ void __launch_bounds__(kThreads)
   if (r <= n) ranked[r] = r < n ? counts[order[r]] : 0;
 }
 
-// A thread a surfel, by rank; a warp lists its large surfels together, so that one disc before the camera does not keep
-// a thread busy with the whole screen.
-template <class S>
+// One thread per surfel, by rank; a warp lists its large surfels together, so that one disc before the camera does not
+// keep a thread busy with the whole screen.
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kThreads) list_kernel(int64_t n, const S* geom, int width, int height,
                                                         const int32_t* order, const int64_t* slot_start, FillSpace w) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = int(threadIdx.x) % kWarp, across = tiles_across(width);
   const int64_t from = r < n ? slot_start[r] : 0, count = r < n ? slot_start[r + 1] - from : 0;
-  const auto list = [&](int32_t id, int64_t at, int first, int step) {
-    const S* g = geom + int64_t(id) * kGeom;
-    const Extent e = extent(g);
-    const TileSpan rows = tile_rows(e, g, height);
-    for (int row = rows.first; row <= rows.last; ++row) {
-      const TileSpan columns = tile_columns(e, g, row, width);
-      for (int column = columns.first + first; column <= columns.last; column += step) {
-        const int64_t slot = at + column - columns.first;
+  const auto list = [&](int32_t id, int64_t at, int mine, int step) {
+    for_tile_rows<Kernel>(geom + int64_t(id) * kGeom, width, height, [&](int row, int first, int last) {
+      for (int column = first + mine; column <= last; column += step) {
+        const int64_t slot = at + column - first;
         w.tile[slot] = uint32_t(row * across + column);
         w.slots[slot] = int32_t(slot);
         w.owner[slot] = id;
       }
-      if (columns.last >= columns.first) at += columns.last - columns.first + 1;
-    }
+      at += last - first + 1;
+    });
   };
   const int32_t id = count ? order[r] : 0;
   if (count && count <= kAlone) list(id, from, 0, 1);
@@ -175,35 +165,43 @@ int64_t bin_fill_workspace(int64_t pairs, int64_t tiles) {
 }
 
 template <class S>
-void bin_count(int64_t n, const S* geom, const S* radii, int width, int height, int32_t* order, int64_t* slot_start,
-               void* workspace, Stream stream) {
+void bin_count(bool through_pixel, int64_t n, const S* geom, const S* radii, int width, int height, int32_t* order,
+               int64_t* slot_start, void* workspace, Stream stream) {
   Arena arena(workspace);
   const CountSpace<S> w(arena, n);
-  if (n) BT_LAUNCH(count_kernel<S>, blocks(n), dim3(kThreads), 0, stream, n, geom, radii, width, height, w);
+  if (n)
+    with_kernel(through_pixel, [&](auto kernel) {
+      BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, n, geom, radii, width,
+                height, w);
+    });
   sort_pairs(w.keys, w.sorted, w.rows, order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
   BT_LAUNCH(rank_kernel, blocks(n + 1), dim3(kThreads), 0, stream, n, order, w.counts, w.ranked);
   exclusive_sum(w.ranked, slot_start, n + 1, w.temp, w.temp_size, stream);
 }
 
 template <class S>
-void bin_fill(int64_t n, const S* geom, int width, int height, const int32_t* order, const int64_t* slot_start,
-              int64_t pairs, int32_t* slot, int32_t* surfel, int64_t* tile_pairs, void* workspace, Stream stream) {
+void bin_fill(bool through_pixel, int64_t n, const S* geom, int width, int height, const int32_t* order,
+              const int64_t* slot_start, int64_t pairs, int32_t* slot, int32_t* surfel, int64_t* tile_pairs,
+              void* workspace, Stream stream) {
   const int64_t tiles = int64_t(tiles_across(width)) * tiles_across(height);
   Arena arena(workspace);
   const FillSpace w(arena, pairs, tiles);
   if (pairs) {
-    BT_LAUNCH(list_kernel<S>, blocks(n), dim3(kThreads), 0, stream, n, geom, width, height, order, slot_start, w);
+    with_kernel(through_pixel, [&](auto kernel) {
+      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, n, geom, width, height, order,
+                slot_start, w);
+    });
     sort_pairs(w.tile, w.sorted, w.slots, slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
     BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, slot, w.owner, surfel);
   }
   BT_LAUNCH(range_kernel, blocks(tiles + 1), dim3(kThreads), 0, stream, pairs, w.sorted, tiles, tile_pairs);
 }
 
-#define BT_INSTANTIATE(S)                                                                                             \
-  template int64_t bin_count_workspace<S>(int64_t);                                                                   \
-  template void bin_count<S>(int64_t, const S*, const S*, int, int, int32_t*, int64_t*, void*, Stream);               \
-  template void bin_fill<S>(int64_t, const S*, int, int, const int32_t*, const int64_t*, int64_t, int32_t*, int32_t*, \
-                            int64_t*, void*, Stream);
+#define BT_INSTANTIATE(S)                                                                                         \
+  template int64_t bin_count_workspace<S>(int64_t);                                                               \
+  template void bin_count<S>(bool, int64_t, const S*, const S*, int, int, int32_t*, int64_t*, void*, Stream);     \
+  template void bin_fill<S>(bool, int64_t, const S*, int, int, const int32_t*, const int64_t*, int64_t, int32_t*, \
+                            int32_t*, int64_t*, void*, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

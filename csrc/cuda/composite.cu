@@ -1,5 +1,5 @@
-// Weighted sums of the fragments a pixel, and their backward pass. Both are bound by memory: 16 bytes a fragment are
-// read forward (20 with maps), about 36 read and written backward.
+// Weighted sums of the fragments per pixel, and their backward pass. Both are bound by memory: 16 bytes per fragment
+// are read forward (20 with maps), about 36 read and written backward.
 #include "cuda/trace.h"
 
 namespace bt::cuda {

@@ -37,7 +37,7 @@ inline void check(cudaError_t error, const char* what) {
 #define BT_UNROLL_BY(n)
 #endif
 
-// More than 48 KB of shared memory a block has to be asked for.
+// More than 48 KB of shared memory per block has to be asked for.
 #define BT_ALLOW_SHARED(kernel, bytes) \
   ::bt::cuda::check(                   \
       cudaFuncSetAttribute((kernel), cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)), #kernel)

@@ -16,7 +16,7 @@
 namespace bt::emulator {
 
 Index thread_index, block_index;
-dim3 block_size, grid_size;
+dim3 grid_size;
 
 namespace {
 constexpr size_t kStack = 256 * 1024;
@@ -133,7 +133,7 @@ void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std:
     make(*fibers.back());
   }
   shared_memory.assign(shared / 8 + 1, 0xffffffffffffffffull);  // NaN: nobody may count on zeros
-  block_size = block, grid_size = grid;
+  grid_size = grid;
   body = &thread;
   std::vector<size_t> order(threads);
   for (size_t i = 0; i < threads; ++i) order[i] = i;

@@ -16,14 +16,7 @@ struct dim3 {
 struct alignas(16) float4 {
   float x, y, z, w;
 };
-struct alignas(8) float2 {
-  float x, y;
-};
-struct uchar4 {
-  unsigned char x, y, z, w;
-};
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
-inline float2 make_float2(float x, float y) { return {x, y}; }
 
 namespace bt::emulator {
 
@@ -31,7 +24,7 @@ struct Index {
   unsigned x, y, z;
 };
 extern Index thread_index, block_index;
-extern dim3 block_size, grid_size;
+extern dim3 grid_size;
 
 // Runs every thread of every block; `seed` of the order in which threads take turns is set by set_seed.
 // Throws std::runtime_error when threads wait at barriers that can never open.
@@ -62,16 +55,13 @@ T from_bits(uint64_t bits) {
 
 #define __global__
 #define __device__
-#define __host__
 #define __forceinline__ inline
 #define __shared__ static
-#define __constant__ static
 #define __launch_bounds__(...)
 #define __restrict__
 
 #define threadIdx (::bt::emulator::thread_index)
 #define blockIdx (::bt::emulator::block_index)
-#define blockDim (::bt::emulator::block_size)
 #define gridDim (::bt::emulator::grid_size)
 
 inline void __syncthreads() { bt::emulator::block_barrier(); }
@@ -83,12 +73,10 @@ inline unsigned __ballot_sync(unsigned mask, bool predicate) {
   return result & mask;
 }
 inline bool __any_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, predicate) != 0; }
-inline bool __all_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, !predicate) == 0; }
 template <class T>
-T __shfl_sync(unsigned mask, T value, int source, int width = 32) {
-  const int lane = bt::emulator::lane();
+T __shfl_sync(unsigned mask, T value, int source) {
   const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
-  return bt::emulator::from_bits<T>(values[(lane & ~(width - 1)) | (source & (width - 1))]);
+  return bt::emulator::from_bits<T>(values[source & 31]);
 }
 template <class T>
 T __shfl_xor_sync(unsigned mask, T value, int with) {
@@ -97,33 +85,12 @@ T __shfl_xor_sync(unsigned mask, T value, int with) {
   return bt::emulator::from_bits<T>(values[(lane ^ with) & 31]);
 }
 template <class T>
-T __shfl_down_sync(unsigned mask, T value, unsigned by) {
-  const int lane = bt::emulator::lane();
-  const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
-  return lane + by < 32 ? bt::emulator::from_bits<T>(values[lane + by]) : value;
-}
-template <class T>
 T __shfl_up_sync(unsigned mask, T value, unsigned by) {
   const unsigned lane = unsigned(bt::emulator::lane());
   const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
   return lane >= by ? bt::emulator::from_bits<T>(values[lane - by]) : value;
 }
-inline int __syncthreads_count(bool predicate) {
-  static int count;  // threads take turns, so a plain counter is enough
-  __syncthreads();
-  if (predicate) ++count;
-  __syncthreads();
-  const int result = count;
-  __syncthreads();
-  count = 0;
-  __syncthreads();
-  return result;
-}
-inline int __syncthreads_or(bool predicate) { return __syncthreads_count(predicate) > 0; }
-inline int __syncthreads_and(bool predicate) { return __syncthreads_count(!predicate) == 0; }
-
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
-inline int __popcll(unsigned long long x) { return __builtin_popcountll(x); }
 inline int __ffs(int x) { return __builtin_ffs(x); }
 inline long long __double2ll_rn(double x) { return std::fabs(x) < 9e18 ? std::llrint(x) : 0; }
 inline int __clz(int x) { return x ? __builtin_clz(unsigned(x)) : 32; }
@@ -145,10 +112,3 @@ T atomicMax(T* to, T value) {
   if (value > old) *to = value;
   return old;
 }
-template <class T>
-T atomicMin(T* to, T value) {
-  const T old = *to;
-  if (value < old) *to = value;
-  return old;
-}
-inline void __threadfence() {}

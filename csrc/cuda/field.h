@@ -6,7 +6,7 @@
 // decide, and neighbouring fragments that share cells find them in the L1. So a thread does one look-up, with the
 // weights in shared memory, read by all lanes at once, 4 multiply-adds a load; tensor cores would round to tf32 and
 // gain nothing. The backward pass repeats the look-up, adds 32 times 16 bytes to the table's gradient (one vector
-// reduction each, once a run of fragments in one cell where that halves them) and takes 2,240 more operations.
+// reduction each, once per run of fragments in one cell where that halves them) and takes 2,240 more operations.
 #pragma once
 
 #include "core/field.h"
@@ -17,12 +17,18 @@ namespace bt::cuda {
 constexpr int kMlpWeights = kInputs * kWidth + kWidth * kWidth + kWidth * 3;  // w1, w2, w3, each input-major
 constexpr int kMostBlocks = 1024;  // of a backward pass: fixed, so that sums do not depend on the card
 
+// Numbers of ExactRange (field_device.h), and of all that exact sums take: entries of the table (0 when frozen), 3 per
+// surfel (none for points), and their frames.
+constexpr int64_t kExactRange = 5;
+constexpr int64_t exact_size(int64_t entries, int64_t surfels, bool frames) {
+  return entries + kExactRange + (frames ? 3 + kFrame : 3) * surfels;
+}
+
 // Working memory of a backward pass.
 template <class S>
 struct FieldWork {
   S* mlp;          // [kMostBlocks, kMlpWeights]
-  int64_t* exact;  // null, or for sums that do not depend on the order: [entries + 8 + 3 n + kFrame n], entries = the
-                   // numbers in the table (0 when frozen), n surfels (0 for points), the last term with dframes alone
+  int64_t* exact;  // null, or for sums that do not depend on the order: [exact_size(...)]
 };
 
 template <class S>

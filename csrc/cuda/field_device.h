@@ -62,7 +62,7 @@ BT_HD S sum(const Row<S>& a) {
   for (int i = 4; i < kWidth; ++i) r[i % 4] += a.v[i];
   return (r[0] + r[2]) + (r[1] + r[3]);
 }
-// The 16 sums are chains enough: one multiply-add each an input.
+// The 16 sums are chains enough: one multiply-add each per input.
 template <class S>
 BT_HD Row<S> product(const Row<S>* w, const S* in) {
   Row<S> a(S(0));
@@ -147,7 +147,7 @@ struct Stage {
 };
 
 // A lane's share of the weights' gradients: a 4 x 4 patch of w1 (lanes 0 to 15) or of w2, and three numbers of w3. The
-// outer products of 32 look-ups are 560 multiply-adds a lane, two loads of four numbers for sixteen of them.
+// outer products of 32 look-ups are 560 multiply-adds per lane, two loads of four numbers for sixteen of them.
 template <class S>
 struct WeightSums {
   S patch[16], last[3];
@@ -250,7 +250,7 @@ __device__ Vec3<S> position_gradient(const FieldArrays<S>& f, Vec3<S> x, Vec3<S>
   return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
 }
 
-// One backward look-up a lane; all 32 lanes take part, those that are not active add nothing. Returns d loss / d x if
+// One backward look-up per lane; all 32 lanes take part, those that are not active add nothing. Returns d loss / d x if
 // asked for.
 template <class S, bool kExact>
 __device__ Vec3<S> learn(const FieldArrays<S>& f, const DeviceMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active, int lane,
@@ -332,8 +332,8 @@ int backward_blocks(int64_t n) {
 struct ExactRange {
   unsigned long long gradient, entry;
   double table, base, frames;
-  unsigned long long unused[3];
 };
+static_assert(sizeof(ExactRange) == kExactRange * sizeof(int64_t));
 // Pointers into FieldWork::exact, all null when sums need not be exact.
 struct ExactSums {
   unsigned long long *table = nullptr, *base = nullptr, *frames = nullptr;

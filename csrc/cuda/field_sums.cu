@@ -10,7 +10,7 @@ namespace {
 constexpr int kThreads = 256;
 constexpr int kRows = kThreads / kWarp;
 
-// 32 columns a block: 8 groups of threads walk down the rows, then the groups are added in order.
+// 32 columns per block: 8 groups of threads walk down the rows, then the groups are added in order.
 template <class S>
 __global__ void __launch_bounds__(kThreads)
     sum_weights_kernel(const S* partial, int blocks, int levels, FieldGradients<S> out) {
@@ -113,13 +113,12 @@ template <class S>
 ExactSums begin_exact(const FieldWork<S>& work, const FieldArrays<S>* field, int64_t surfels, bool frames,
                       int64_t count, const S* gradients, Stream stream) {
   const int64_t entries = field ? entries_of(*field) : 0;
-  const int64_t tail = sizeof(ExactRange) / sizeof(int64_t);
   ExactSums e;
   e.table = reinterpret_cast<unsigned long long*>(work.exact);
   e.range = reinterpret_cast<ExactRange*>(e.table + entries);
-  e.base = e.table + entries + tail;
+  e.base = e.table + entries + kExactRange;
   e.frames = e.base + 3 * surfels;
-  fill_zero(work.exact, entries + tail + (3 + (frames ? kFrame : 0)) * surfels, stream);
+  fill_zero(work.exact, exact_size(entries, surfels, frames), stream);
   largest(3 * count, gradients, &e.range->gradient, stream);
   if (frames) largest(entries, field->table, &e.range->entry, stream);
   FieldArrays<S> f = {};

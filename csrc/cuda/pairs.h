@@ -8,8 +8,8 @@
 //               slot_start[r] to slot_start[r + 1] - 1. A kernel writes what a pair adds to its surfel into the pair's
 //               slot, and sum_slots adds a surfel's slots in order: no atomics, and the same bits every time.
 //
-// A tile is a block of 8 warps, a warp 8 x 4 pixels, a lane a pixel. masks[warp][k] has a bit for every pixel of the
-// warp that blends pair k; a run has the fragments of warp 0 first, in a warp by lane. So a fragment's place is
+// A tile is a block of 8 warps, one warp per 8 x 4 pixels, one lane per pixel. masks[warp][k] has a bit for every pixel
+// of the warp that blends pair k; a run has the fragments of warp 0 first, in a warp by lane. So a fragment's place is
 // offsets[k] + the bits of lower warps + the bits of lower lanes, and no kernel has to search.
 #pragma once
 
@@ -88,7 +88,7 @@ __device__ inline void walk(const Pairs& p, const Spot& s, Load&& load, Use&& us
   const int64_t batches = ceil_div(end - begin, kWarp);
   const unsigned below = (1u << s.lane) - 1;
   for (int64_t b = 0; b < batches; ++b) {
-    // a lane a pair: marks, and where the warp's fragments begin
+    // one lane per pair: marks, and where the warp's fragments begin
     const int64_t first = begin + kWarp * (kBack ? batches - 1 - b : b), own = first + s.lane;
     uint32_t mark = 0;
     int32_t id = 0;
@@ -115,8 +115,8 @@ __device__ inline void walk(const Pairs& p, const Spot& s, Load&& load, Use&& us
   }
 }
 
-// The other way through the list: kRunLanes lanes a pair, which take the fragments of its run in turns. Fragments of a
-// pair are about thirty on average: 16 lanes are busier than 32, and share a row of geom and one sum.
+// The other way through the list: kRunLanes lanes per pair, which take the fragments of its run in turns. Fragments of
+// a pair are about thirty on average: 16 lanes are busier than 32, and share a row of geom and one sum.
 constexpr int kRunLanes = 16, kRunThreads = 128;
 struct Run {
   bool some;  // false behind the last pair: the lane has nothing to do but takes part in warp steps
@@ -155,9 +155,9 @@ __device__ inline S sum_over_run(S (&v)[kColumns], int lane) {
   return v[0];
 }
 
-// put(surfel, column, sum) for every surfel and column of partial [pairs, kColumns], by slot. A warp a surfel: lanes
-// are columns, and groups of lanes take slots in turns. A surfel with more than kLong slots, a disc before the camera,
-// say, would keep its warp long after all others: it is left to the whole block.
+// put(surfel, column, sum) for every surfel and column of partial [pairs, kColumns], by slot. One warp per surfel:
+// lanes are columns, and groups of lanes take slots in turns. A surfel with more than kLong slots, a disc before the
+// camera, say, would keep its warp long after all others: it is left to the whole block.
 constexpr int kSlotThreads = 256, kSlotWarps = kSlotThreads / kWarp, kLong = 64;
 template <int kColumns, class S>
 __device__ inline S sum_slots_of(const S* partial, int64_t begin, int64_t end, int worker, int workers) {

@@ -2,6 +2,7 @@
 // collects the others in a queue in shared memory and looks up the field for 32 at a time, with all lanes at work. The
 // list is in the order of tile and surfel, so a surfel's fragments in a tile are neighbours: they share cells of the
 // field, and their gradients are added up within the warp before they go to memory.
+#include "core/shading.h"
 #include "cuda/field_device.h"
 
 namespace bt::cuda {
@@ -55,25 +56,21 @@ __global__ void __launch_bounds__(kForwardWarps* kWarp)
     const int64_t i = first + lane;
     const bool in = i < end, looks_up = in && textured && f.weight[i] >= bound;
     if (in && !looks_up) {
-      const S* b = base + 3 * int64_t(f.surfel[i]);
-      for (int c = 0; c < 3; ++c) colors[3 * i + c] = view_base(b[c]);
+      store3(colors + 3 * i, view_base(load3(base + 3 * int64_t(f.surfel[i]))));
     }
     put(queue, count, looks_up, i, lane);
     while (count >= kWarp || (count && first + kWarp >= end)) {
       if (lane < count) {
         const int64_t j = queue[lane];
-        const S* b = base + 3 * int64_t(f.surfel[j]);
-        const Vec3<S> rho = evaluate(field, m, fragment_point(f, frames, j));
-        colors[3 * j] = bt::relu(view_base(b[0]) + rho.x);
-        colors[3 * j + 1] = bt::relu(view_base(b[1]) + rho.y);
-        colors[3 * j + 2] = bt::relu(view_base(b[2]) + rho.z);
+        const Vec3<S> color = view_base(load3(base + 3 * int64_t(f.surfel[j])));
+        store3(colors + 3 * j, shaded(color, evaluate(field, m, fragment_point(f, frames, j))));
       }
       drop(queue, count, lane);
     }
   }
 }
 
-// Adds M numbers of every lane to rows of width M, one addition a run of lanes with the same row. Row -1: none.
+// Adds M numbers of every lane to rows of width M, one addition per run of lanes with the same row. Row -1: none.
 template <int M, class S, bool kExact>
 __device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S, kExact>& to) {
   const unsigned run = run_of(row, lane);
@@ -112,8 +109,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
     Vec3<S> x = zero, d = zero;
     if (active) {
       x = fragment_point(f, frames, j);
-      d = {residual_gradient(colors[3 * j], dcolors[3 * j]), residual_gradient(colors[3 * j + 1], dcolors[3 * j + 1]),
-           residual_gradient(colors[3 * j + 2], dcolors[3 * j + 2])};
+      d = residual_gradient(load3(colors + 3 * j), load3(dcolors + 3 * j));
     }
     const bool moves = out.uv != nullptr;
     const Vec3<S> dx = learn(field, shared->mlp, x, d, active, lane, shared->stage[warp], weights, dtable, moves);
@@ -137,8 +133,8 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
     const int32_t surfel = in ? f.surfel[i] : -1;
     S g[3] = {};
     if (in)
-      for (int c = 0; c < 3; ++c)
-        g[c] = base_gradient(base[3 * int64_t(surfel) + c], residual_gradient(colors[3 * i + c], dcolors[3 * i + c]));
+      store3(g, base_gradient(load3(base + 3 * int64_t(surfel)),
+                              residual_gradient(load3(colors + 3 * i), load3(dcolors + 3 * i))));
     add_to_rows(surfel, lane, g, dbase);
     first += kWarp;
     if (first == chunk + kChunk) first = chunk += step;

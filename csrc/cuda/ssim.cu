@@ -1,6 +1,6 @@
-// SSIM and its gradient, separable, a channel at a time. A block takes a tile of windows: the pixels under it go to
+// SSIM and its gradient, separable, one channel at a time. A block takes a tile of windows: the pixels under it go to
 // shared memory once, are filtered along the rows, then down the columns, each thread keeping its part of a column in
-// registers. At 88 bytes and some 400 operations a value for both passes, memory and arithmetic are about even on an
+// registers. At 88 bytes and some 400 operations per value for both passes, memory and arithmetic are about even on an
 // H200; what is read twice, at the rims of tiles, comes from the L2.
 #include "core/ssim.h"
 #include "cuda/appearance.h"

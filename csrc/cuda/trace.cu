@@ -1,10 +1,11 @@
-// Fragments of a view. A block a tile, a warp 8 x 4 pixels, a lane a pixel; warps do not wait for each other.
+// Fragments of a view. One block per tile, one warp per 8 x 4 pixels, one lane per pixel; warps do not wait for each
+// other.
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
 // the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
-// marked pairs alone. Both are bound by arithmetic (about 100 operations a lane and pair, a third of the lanes with a
-// fragment), trace_fill also by the 28 bytes a fragment that it writes.
-#include "core/fragment.h"
+// marked pairs alone. Both are bound by arithmetic (about 100 operations per lane and pair, a third of the lanes with a
+// fragment), trace_fill also by the 28 bytes per fragment that it writes.
+#include "core/kernel.h"
 #include "cuda/primitives.h"
 #include "cuda/trace.h"
 #include "cuda/workspace.h"
@@ -24,18 +25,13 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// beyond this squared distance the low pass cannot reach alpha 1/255: more than ln 255
-template <class S>
-__device__ bool near_centre(S dx, S dy) {
-  return dx * dx + dy * dy < S(5.6);
-}
 // `blur` is the same for a whole warp
-template <class S>
+template <class Kernel, class S>
 __device__ Fragment<S> fragment_at(const S* g, S near, S dx, S dy, bool blur) {
-  return blur ? fragment<S, S, true>(g, near, dx, dy) : fragment<S, S, false>(g, near, dx, dy);
+  return blur ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy);
 }
 
-template <class S>
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
                 const int64_t* tile_pairs, uint32_t* masks) {
@@ -43,11 +39,11 @@ __global__ void __launch_bounds__(kTileThreads)
   const int64_t end = tile_pairs[blockIdx.x + 1];
   int64_t first = tile_pairs[blockIdx.x];
   uint32_t* row = masks + s.warp * pairs;
-  const S x = S(s.x) + S(0.5), y = S(s.y) + S(0.5);
+  const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   bool open = s.x < width && s.y < height;  // the pixel still takes light
   S transmittance = S(1);
   for (; first < end && __any_sync(kFullMask, open); first += kWarp) {
-    // a lane a pair: does its box meet the warp's pixels?
+    // one lane per pair: does its box meet the warp's pixels?
     const int64_t own = first + s.lane;
     int32_t id = 0;
     bool meets = false;
@@ -67,21 +63,16 @@ __global__ void __launch_bounds__(kTileThreads)
       load_shape(geom + int64_t(__shfl_sync(kFullMask, id, j)) * kGeom, g);
       const S dx = x - g[kCx], dy = y - g[kCy];
       // a cheap look first: does any open pixel lie in the support or near the centre?
-      const S W = g[kW0] + g[kW1] * dx + g[kW2] * dy;
-      const S U = g[kU1] * dx + g[kU2] * dy, V = g[kV1] * dx + g[kV2] * dy;
       const bool close = near_centre(dx, dy);
-      const bool reached = g[kArea] > S(0) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
-                                           : close || U * U + V * V < S(kSupport * kSupport) * W * W;
+      const bool reached = filtered<Kernel>(g) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
+                                               : close || within(planes<S, S>(g, dx, dy), S(kSupport * kSupport));
       if (!__any_sync(kFullMask, open && reached)) continue;
-      const S sigma = fragment_at(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
-      bool take = open && sigma >= S(kAlphaMin);
-      const S next = transmittance - sigma * transmittance;
-      // the surfel that would take the pixel below the bound is not blended and ends it
-      const bool ends = take && next < S(kTransmittanceMin);
-      take = take && !ends;
-      open = open && !ends;
-      if (take) transmittance = next;
-      const unsigned taken = __ballot_sync(kFullMask, take);
+      const S sigma = fragment_at<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
+      const S behind = blend(sigma, transmittance).behind;
+      const Verdict<S> v = judge(open, sigma, behind, S(kTransmittanceMin));
+      open = open && !v.ends;
+      if (v.takes) transmittance = behind;
+      const unsigned taken = __ballot_sync(kFullMask, v.takes);
       if (s.lane == j) mark = taken;
       if (!__any_sync(kFullMask, open)) todo = 0;
     }
@@ -105,22 +96,22 @@ __global__ void __launch_bounds__(kThreads)
   if (t <= tiles) tile_start[t] = offsets[tile_pairs[t]];
 }
 
-template <class S>
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
   const Spot s = spot(p.width);
-  const S x = S(s.x) + S(0.5), y = S(s.y) + S(0.5);
+  const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   const int32_t pixel = int32_t(s.y * p.width + s.x);
   S transmittance = S(1);
   const auto write = [&](int64_t, int32_t id, bool mine, int64_t i) {
     S g[kGeom];
     load_shape(geom + int64_t(id) * kGeom, g);
     const S dx = x - g[kCx], dy = y - g[kCy];
-    const Fragment<S> f = fragment_at(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+    const Fragment<S> f = fragment_at<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
     if (mine) {
-      const S weight = f.sigma * transmittance;
-      transmittance -= weight;
+      const Blend<S> b = blend(f.sigma, transmittance);
+      transmittance = b.behind;
       out.surfel[i] = id, out.pixel[i] = pixel;
-      out.weight[i] = weight;
+      out.weight[i] = b.weight;
       out.uv[i] = f.u, out.uv[out.total + i] = f.v;
       out.depth[i] = f.depth;
       out.sigma[i] = f.low_pass > S(0) ? -f.sigma : f.sigma;
@@ -150,15 +141,17 @@ int64_t trace_mark_workspace(int64_t pairs) {
 }
 
 template <class S>
-void trace_mark(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
-                const int64_t* tile_pairs, uint32_t* masks, int64_t* offsets, int64_t* tile_start, void* workspace,
-                Stream stream) {
+void trace_mark(bool through_pixel, const S* geom, const S* radii, S near, int width, int height, int64_t pairs,
+                const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks, int64_t* offsets,
+                int64_t* tile_start, void* workspace, Stream stream) {
   const int64_t tiles = int64_t(tiles_across(width)) * tiles_across(height);
   Arena arena(workspace);
   const MarkSpace w(arena, pairs);
   if (pairs)
-    BT_LAUNCH(mark_kernel<S>, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, geom, radii, near, width, height,
-              pairs, surfel, tile_pairs, masks);
+    with_kernel(through_pixel, [&](auto kernel) {
+      BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, geom, radii,
+                near, width, height, pairs, surfel, tile_pairs, masks);
+    });
   BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs, masks,
             w.counts);
   exclusive_sum(w.counts, offsets, pairs + 1, w.temp, w.temp_size, stream);
@@ -167,9 +160,13 @@ void trace_mark(const S* geom, const S* radii, S near, int width, int height, in
 }
 
 template <class S>
-void trace_fill(const S* geom, S near, const Pairs& p, const FragmentArrays<S>& out, Stream stream) {
+void trace_fill(bool through_pixel, const S* geom, S near, const Pairs& p, const FragmentArrays<S>& out,
+                Stream stream) {
   if (!out.total) return;
-  BT_LAUNCH(fill_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, geom, near, p, out);
+  with_kernel(through_pixel, [&](auto kernel) {
+    BT_LAUNCH((fill_kernel<decltype(kernel), S>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, geom, near,
+              p, out);
+  });
 }
 
 void masked_counts(const Pairs& p, const uint8_t* mask, int32_t* counts, Stream stream) {
@@ -177,10 +174,10 @@ void masked_counts(const Pairs& p, const uint8_t* mask, int32_t* counts, Stream 
   BT_LAUNCH(counts_kernel, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, mask, counts);
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template void trace_mark<S>(const S*, const S*, S, int, int, int64_t, const int32_t*, const int64_t*, uint32_t*, \
-                              int64_t*, int64_t*, void*, Stream);                                                  \
-  template void trace_fill<S>(const S*, S, const Pairs&, const FragmentArrays<S>&, Stream);
+#define BT_INSTANTIATE(S)                                                                                     \
+  template void trace_mark<S>(bool, const S*, const S*, S, int, int, int64_t, const int32_t*, const int64_t*, \
+                              uint32_t*, int64_t*, int64_t*, void*, Stream);                                  \
+  template void trace_fill<S>(bool, const S*, S, const Pairs&, const FragmentArrays<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

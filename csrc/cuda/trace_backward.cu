@@ -1,15 +1,14 @@
 // From gradients of the fragments to gradients of the surfels, in three kernels.
 //
 // dL/dsigma of a fragment needs the sum of w dL/dw over the fragments behind it in its pixel: a walk back to front with
-// that sum in a register, 16 bytes a fragment. The long formulas then need no order any more, so they run through the
-// list a pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once a pair.
-#include "core/fragment.h"
+// that sum in a register, 16 bytes per fragment. The long formulas then need no order any more, so they run through the
+// list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair.
+#include "core/kernel.h"
 #include "cuda/trace.h"
 
 namespace bt::cuda {
 
 namespace {
-constexpr int kSums = 16;  // kShape columns of geom, two absolute gradients, one unused, kArea
 
 template <class S>
 struct Step {
@@ -22,7 +21,7 @@ template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     dsigma_kernel(Pairs p, FragmentArrays<S> f, const S* dweight, S* dsigma) {
   const Spot s = spot(p.width);
-  S behind = S(0);  // sum of w dL/dw
+  S later = S(0);  // sum of w dL/dw
   const auto load = [&](int64_t, int32_t, bool mine, int64_t i) {
     Step<S> t = {mine, i, S(0), S(0), S(0)};
     if (mine) t.weight = f.weight[i], t.sigma = f.sigma[i], t.dweight = dweight[i];
@@ -31,34 +30,33 @@ __global__ void __launch_bounds__(kTileThreads)
   const auto use = [&](const Step<S>& t) {
     if (!t.mine) return;
     const S sigma = t.sigma < S(0) ? -t.sigma : t.sigma;
-    dsigma[t.i] = t.weight / sigma * t.dweight - behind / (S(1) - sigma);
-    behind += t.weight * t.dweight;
+    dsigma[t.i] = blend_vjp(t.weight, sigma, t.dweight, later);
   };
   walk<4, true>(p, s, load, use);
 }
 
-template <class S>
+template <class Kernel, class S>
 __global__ void __launch_bounds__(kRunThreads)
     surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, const S* dsigma, const S* duv,
                   const S* ddepth, S* partial) {
   const Run r = run(p);
-  S d[kSums];
-  for (int c = 0; c < kSums; ++c) d[c] = S(0);
+  S d[kTraceSums];
+  for (int c = 0; c < kTraceSums; ++c) d[c] = S(0);
   if (r.begin < r.end) {
     S g[kGeom], ax = S(0), ay = S(0);
     load_shape(geom + int64_t(p.surfel[r.k]) * kGeom, g);
     for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
       const int32_t y = f.pixel[i] / p.width, x = f.pixel[i] - y * p.width;
       S ddx, ddy;
-      fragment_vjp<S, S>(g, near, rim, S(x) + S(0.5) - g[kCx], S(y) + S(0.5) - g[kCy], f.sigma[i] < S(0) ? S(1) : S(0),
-                         dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0), duv ? duv[f.total + i] : S(0),
-                         ddepth ? ddepth[i] : S(0), d, ddx, ddy);
+      fragment_vjp<Kernel, S, S>(g, near, rim, pixel_centre<S>(x) - g[kCx], pixel_centre<S>(y) - g[kCy],
+                                 f.sigma[i] < S(0) ? S(1) : S(0), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0),
+                                 duv ? duv[f.total + i] : S(0), ddepth ? ddepth[i] : S(0), d, ddx, ddy);
       ax += ddx < S(0) ? -ddx : ddx, ay += ddy < S(0) ? -ddy : ddy;
     }
     d[kShape] = ax, d[kShape + 1] = ay;
   }
   const S sum = sum_over_run(d, r.lane);
-  if (r.some) partial[int64_t(p.slot[r.k]) * kSums + r.lane] = sum;
+  if (r.some) partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
 }
 
 template <class S>
@@ -72,19 +70,22 @@ struct PutGeometry {
 }  // namespace
 
 template <class S>
-void trace_backward(const S* geom, S near, S rim, const Pairs& p, const FragmentArrays<S>& f, const S* dweight,
-                    const S* duv, const S* ddepth, S* dsigma, S* partial, S* dgeom, S* absgrad, Stream stream) {
+void trace_backward(bool through_pixel, const S* geom, S near, S rim, const Pairs& p, const FragmentArrays<S>& f,
+                    const S* dweight, const S* duv, const S* ddepth, S* dsigma, S* partial, S* dgeom, S* absgrad,
+                    Stream stream) {
   if (dweight && f.total)
     BT_LAUNCH(dsigma_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, f, dweight, dsigma);
   const S* given = dweight ? dsigma : nullptr;
   if (p.pairs)
-    BT_LAUNCH(surfel_kernel<S>, run_blocks(p), dim3(kRunThreads), 0, stream, geom, near, rim, p, f, given, duv, ddepth,
-              partial);
-  sum_slots<kSums>(p, static_cast<const S*>(partial), PutGeometry<S>{dgeom, absgrad}, stream);
+    with_kernel(through_pixel, [&](auto kernel) {
+      BT_LAUNCH((surfel_kernel<decltype(kernel), S>), run_blocks(p), dim3(kRunThreads), 0, stream, geom, near, rim, p,
+                f, given, duv, ddepth, partial);
+    });
+  sum_slots<kTraceSums>(p, static_cast<const S*>(partial), PutGeometry<S>{dgeom, absgrad}, stream);
 }
 
-#define BT_INSTANTIATE(S)                                                                                     \
-  template void trace_backward<S>(const S*, S, S, const Pairs&, const FragmentArrays<S>&, const S*, const S*, \
+#define BT_INSTANTIATE(S)                                                                                           \
+  template void trace_backward<S>(bool, const S*, S, S, const Pairs&, const FragmentArrays<S>&, const S*, const S*, \
                                   const S*, S*, S*, S*, S*, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

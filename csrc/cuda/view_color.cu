@@ -1,6 +1,6 @@
-// View colours of all surfels: a thread a surfel. Spherical Voronoi with 7 sites reads 196 bytes a visible surfel and
-// does 330 operations, backward 392 bytes and 550: bound by memory. A thread's numbers lie together, so a warp reads
-// whole lines, a few numbers of each at a time, and finds the rest of them in the L1.
+// View colours of all surfels: one thread per surfel. Spherical Voronoi with 7 sites reads 196 bytes per visible surfel
+// and does 330 operations, backward 392 bytes and 550: bound by memory. A thread's numbers lie together, so a warp
+// reads whole lines, a few numbers of each at a time, and finds the rest of them in the L1.
 #include <type_traits>
 
 #include "cuda/appearance.h"
@@ -21,7 +21,7 @@ __global__ void __launch_bounds__(kThreads)
   store3(out + 3 * i, c);
 }
 
-// A surfel of one colour reads 20 bytes; a term more is 24 (sv).
+// A surfel of one colour reads 20 bytes; each further term is 24 (sv).
 template <class S>
 __global__ void __launch_bounds__(kThreads)
     lean_kernel(int64_t n, LeanColors<S> p, const S* __restrict__ means, const double* __restrict__ center,

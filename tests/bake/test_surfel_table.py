@@ -4,7 +4,6 @@ import torch
 
 from bitymi_ns.bake.ply import PlyError
 from bitymi_ns.bake.surfel_table import (
-    SH_C0,
     VIEW_COLORS,
     from_columns,
     mean_residuals,
@@ -12,6 +11,7 @@ from bitymi_ns.bake.surfel_table import (
     tile_extents,
     to_columns,
 )
+from bitymi_ns.ops.constants import SH_C0
 
 KINDS = ["sv", "sh", "sb", "sg"]
 TILES = np.arange(25, dtype=np.int32).reshape(5, 5)

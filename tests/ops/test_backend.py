@@ -40,7 +40,7 @@ def cpuinfo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def test_the_record_is_that_of_the_module() -> None:
-    assert _cpu_features.FEATURES[backend.cpu_module()] == backend.module(torch.device("cpu")).FEATURES
+    assert _cpu_features.FEATURES[backend.cpu_module()] == backend.module(torch.device("cpu")).CPU_FEATURES
 
 
 @pytest.mark.skipif(not _cpu_features.FEATURES["_cpu"], reason="compiled for every CPU of its kind")

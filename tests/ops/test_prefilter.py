@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,16 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
 from bitymi_ns.stability.sweeps import SWEEPS
 from tests.ops.golden import camera_of, dense, reference, traced
+
+
+def test_the_launch_chooses_the_kernel_and_not_the_row() -> None:
+    case = random_scene(40, 3, scale=0.25)
+    values = [case.params[name].double() for name in SURFEL_KEYS]
+    wanted, plain = traced(case, values)
+    _, filtered = traced(case, values, prefilter=True)
+    assert (filtered.geom[:, 15] > 0).any() and not (plain.geom[:, 15] > 0).any()
+    got = ops.trace(replace(plain, geom=filtered.geom), 0.0)
+    assert torch.equal(got.weight, wanted.weight) and torch.equal(got.sigma, wanted.sigma)
 
 
 @pytest.mark.parametrize("scale", [2.0, 0.25, 0.03, 0.002])

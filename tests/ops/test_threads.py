@@ -23,23 +23,49 @@ def cpu_seconds():
     return time.process_time() - start
 x * 2
 before = cpu_seconds()
-import bitymi_ns._cpu
+from bitymi_ns.ops.backend import module
+module(torch.device("cpu"))
 print(before, cpu_seconds())
+"""
+IMPORT = """
+import os, torch
+def threads():
+    return len(os.listdir("/proc/self/task"))
+before = threads()
+import bitymi_ns._cpu
+import bitymi_ns.ops
+imported = threads()
+from bitymi_ns.ops.backend import module
+module(torch.device("cpu"))
+print(before, imported, threads())
 """
 
 
-def processor_time(**environment: str) -> tuple[float, float]:
-    """CPU seconds of mostly idling, before and after the kernels are loaded, in a fresh process."""
+def printed(script: str, **environment: str) -> list[float]:
+    """The numbers that a script prints in a fresh process."""
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))}
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], env={**inherited, **environment}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", script], env={**inherited, **environment}, capture_output=True, text=True, check=True
     )
-    before, after = map(float, done.stdout.split())
+    return [float(word) for word in done.stdout.split()]
+
+
+def processor_time(**environment: str) -> tuple[float, float]:
+    """CPU seconds of mostly idling, before and after the kernels are made ready, in a fresh process."""
+    before, after = printed(SCRIPT, **environment)
     return before, after
 
 
 @spinning
-def test_threads_do_not_spin_once_the_kernels_are_loaded() -> None:
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
+def test_the_import_starts_no_threads() -> None:
+    before, imported, ready = printed(IMPORT)
+    assert imported == before
+    assert ready > imported  # the first kernel does
+
+
+@spinning
+def test_threads_do_not_spin_once_the_kernels_are_ready() -> None:
     before, after = processor_time()
     if before < 0.1:
         pytest.skip("this OpenMP does not spin")

@@ -19,7 +19,7 @@ Array = npt.NDArray[np.clongdouble]
 
 @dataclass
 class Extended:
-    """Sums over the blended fragments a pixel; P = H W pixels, row major."""
+    """Sums over the blended fragments per pixel; P = H W pixels, row major."""
 
     weight: Array  # [P, N]
     alpha: Array  # [P]

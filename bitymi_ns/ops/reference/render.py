@@ -56,7 +56,7 @@ def render(
         rim, prefilter: see `trace`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
         background: [3], black if not given.
-        tiles: one texture tile [r_v, r_u, 3] a surfel.
+        tiles: one texture tile [r_v, r_u, 3] per surfel.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
     """
     p = project(means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near)

@@ -48,7 +48,7 @@ def texel_image(
     bound: float,
     pixels: int,
 ) -> Tensor:
-    """Sum over the fragments of w ReLU(ReLU(base + 0.5) + texel(u, v)) a pixel, [pixels, 3].
+    """Sum over the fragments of w ReLU(ReLU(base + 0.5) + texel(u, v)) per pixel, [pixels, 3].
 
     Args:
         weight, uv, surfel, pixel: [F], [2, F] in scale units, [F], [F] of the fragments.

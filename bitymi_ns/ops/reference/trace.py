@@ -52,7 +52,7 @@ def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tens
 
     J = d pixel / d (u, v) at the centre; at a pixel with offset d the affine coordinate is a = J^-1 d, and the disc's
     perspective there is omega = z / depth = 1 - e.a, with the disc's depth z (1 + e.(u, v)). Outside of the disc's
-    image, omega is taken at the rim in the direction of a. Then Sigma = omega^2 J J^T + c, c = 2 (beta + 2) / 9 / 12.
+    image, omega is taken at the rim in the direction of a. Then Sigma = omega^2 J J^T + c, c = 2 (beta + 2) / 9 / 4.
     """
     M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
     J = (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None]  # [N, 2, 2]

@@ -1,0 +1,115 @@
+// Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel) with a
+// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel, of which
+// core/prefilter.h has the formulas.
+#pragma once
+
+#include "core/blend.h"
+#include "core/prefilter.h"
+
+namespace bt {
+
+template <class T>
+BT_HD MaskOf<T> near_centre(T dx, T dy) {
+  return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
+}
+
+// The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the
+// projected centre.
+template <class T>
+struct Planes {
+  T U, V, W;
+};
+template <class S, class T>
+BT_HD Planes<T> planes(const S* g, T dx, T dy) {
+  return {T(g[kU1]) * dx + T(g[kU2]) * dy, T(g[kV1]) * dx + T(g[kV2]) * dy,
+          T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy};
+}
+// u^2 + v^2 < r2 without a division, on either side of the camera.
+template <class T>
+BT_HD MaskOf<T> within(const Planes<T>& p, T r2) {
+  return p.U * p.U + p.V * p.V < r2 * p.W * p.W;
+}
+
+// Where a ray meets a surfel's plane.
+template <class T>
+struct Hit {
+  MaskOf<T> ok;  // in front of the camera, behind `near`
+  T inv;         // 1 / W; 1 without a hit
+  T u, v;        // 0 without a hit
+  T rest;        // 1 - (u^2 + v^2) / 9
+};
+template <class S, class T>
+BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
+  const T zero = T(S(0)), one = T(S(1));
+  const Planes<T> p = planes(g, dx, dy);
+  Hit<T> h;
+  h.ok = (p.W > zero) & (T(g[kW0] * g[kZ]) > T(near) * p.W);
+  h.inv = one / select(h.ok, p.W, one);
+  h.u = select(h.ok, p.U * h.inv, zero);
+  h.v = select(h.ok, p.V * h.inv, zero);
+  h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / (kSupport * kSupport)));
+  return h;
+}
+
+// Without kBlur the low pass is left out, for pixels that are not near the centre.
+template <class Kernel, bool kBlur = true, class S, class T>
+BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
+  const T zero = T(S(0)), one = T(S(1));
+  if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_place<S, T>(g, dx, dy));
+  const Hit<T> h = hit(g, near, dx, dy);
+  const auto inside = h.ok & (h.rest > zero);
+  const T kernel = select(inside, power_(select(inside, h.rest, one), T(g[kBeta])), zero);
+  Fragment<T> f;
+  f.u = h.u, f.v = h.v, f.depth = T(g[kW0] * g[kZ]) * h.inv, f.low_pass = zero;
+  T most = kernel;
+  if (kBlur) {
+    const T blur = exp_(-(dx * dx + dy * dy));
+    const auto low = blur > kernel;
+    const T r = T(S(kSupport));
+    f.u = clamp_(h.u, -r, r), f.v = clamp_(h.v, -r, r);
+    f.depth = select(low, T(g[kZ]), f.depth);
+    f.low_pass = select(low, one, zero);
+    most = select(low, blur, kernel);
+  }
+  f.sigma = min_(T(S(kAlphaMax)), T(g[kOpacity]) * most);
+  return f;
+}
+
+// Gradients towards a row of geom, added to d[kGeom]; ddx, ddy is the gradient with respect to the pixel's offset.
+// `rim` bounds 1 - x from below in the kernel's derivative, which diverges at the rim for beta < 1.
+template <class Kernel, class S, class T>
+BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
+                        T& ddy) {
+  if (filtered<Kernel>(g)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
+  const T zero = T(S(0)), two = T(S(2));
+  const Hit<T> h = hit(g, near, dx, dy);
+  const T u = h.u, v = h.v, inv = h.inv, rest = h.rest, q = T(g[kW0] * g[kZ]);
+  const auto low = low_pass > zero;
+  const T log_rest = log_(max_(rest, T(S(1e-30))));
+  const T kernel = select(low, exp_(-(dx * dx + dy * dy)), exp_(T(g[kBeta]) * log_rest));
+  const auto open = T(g[kOpacity]) * kernel < T(S(kAlphaMax));  // the clamp passes no gradient
+  const T gs = select(open, dsigma, zero);
+  d[kOpacity] += gs * kernel;
+  const T gk = gs * T(g[kOpacity]) * kernel;  // d sigma / d log kernel
+  const T gk3 = select(low, zero, gk);
+  d[kBeta] += gk3 * log_rest;
+  const T drho = -gk3 * T(g[kBeta]) / max_(rest, T(rim)) * T(S(1.0 / (kSupport * kSupport)));
+  const T r = T(S(kSupport));
+  // the clamp of the low-pass branch passes gradient only inside the support
+  const T gu = select(h.ok & (u * u < r * r), du + two * u * drho, zero);
+  const T gv = select(h.ok & (v * v < r * r), dv + two * v * drho, zero);
+  const T gz = select(low, zero, ddepth);
+  d[kZ] += select(low, ddepth, gz * inv * T(g[kW0]));
+  const T dU = gu * inv, dV = gv * inv;
+  const T dW = -(gu * u + gv * v + gz * q * inv) * inv;
+  d[kU1] += dU * dx, d[kU2] += dU * dy;
+  d[kV1] += dV * dx, d[kV2] += dV * dy;
+  d[kW0] += dW + gz * inv * T(g[kZ]);
+  d[kW1] += dW * dx, d[kW2] += dW * dy;
+  const T blur_gradient = select(low, two * gk, zero);
+  ddx = dU * T(g[kU1]) + dV * T(g[kV1]) + dW * T(g[kW1]) - blur_gradient * dx;
+  ddy = dU * T(g[kU2]) + dV * T(g[kV2]) + dW * T(g[kW2]) - blur_gradient * dy;
+  d[kCx] -= ddx, d[kCy] -= ddy;
+}
+
+}  // namespace bt

@@ -139,9 +139,7 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
     rows = {name: len(value) for name, value in parameters.items() if name.startswith("_model." + SURFELS)}
     if len(set(rows.values())) > 1:
         counts = ", ".join(f"{count} {name.rpartition('.')[2]}" for name, count in rows.items())
-        fail(
-            f"the checkpoint {path} was altered: its parameters differ in their number of surfels ({counts}). Train again."
-        )
+        fail(f"the checkpoint {path} was altered: its surfels differ in number ({counts}). Train again.")
 
 
 def _first_line(error: BaseException) -> str:

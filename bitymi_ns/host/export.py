@@ -159,7 +159,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
         fail(f"the checkpoint of {load_config} cannot be loaded: {detail}", error)
     if not isinstance(pipeline.model, BitymiModel):
         fail(
-            f"{load_config} is of the method {config.method_name} and not a scene that can be baked; "
+            f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
             "give the config.yml of a bitymi training run"
         )
     return config, pipeline

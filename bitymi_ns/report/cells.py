@@ -146,7 +146,7 @@ def read_cells(numbered: Sequence[tuple[int, Any]], path: Path, records: Records
         try:
             _add_cell(run, key, value)
         except (KeyError, TypeError, AttributeError) as error:
-            raise ReportError(f"{path}, line {number}: a {key.get('cell')} cell without {error}.") from error
+            raise ReportError(f"{path}, line {number}: the {key.get('cell')} cell lacks {error}.") from error
     _name_lengths(list(runs.values()))
     seeds: dict[str, set[int | None]] = {}
     for run in runs.values():

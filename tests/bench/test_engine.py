@@ -189,7 +189,7 @@ def test_several_writers_share_a_file(tmp_path: Path) -> None:
 
 
 def test_empty_matrix_and_missing_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BenchError, match="the matrix is empty"):
+    with pytest.raises(BenchError, match="nothing to run"):
         run_chains(tmp_path, [])
     with pytest.raises(BenchError, match="there is no ns-nothing"):
         tool("ns-nothing")

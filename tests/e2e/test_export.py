@@ -342,7 +342,7 @@ def test_a_damaged_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> N
 
 
 def test_a_bundle_cannot_be_baked_again(bundle: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not a scene that can be baked"):
+    with pytest.raises(InputError, match="which cannot be baked"):
         ExportAtlas(load_config=bundle / "config.yml", output_dir=tmp_path / "b").main()
 
 

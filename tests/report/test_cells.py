@@ -164,10 +164,10 @@ def test_cells_of_an_earlier_form(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("{}", r"line 2, is no cell of a benchmark"),
-        ('{"key": {"cell": "eval"}, "value": {}}', r"line 2: a eval cell without .*psnr"),
-        ('{"key": {"cell": "knobs"}, "value": {}}', r"line 2: a knobs cell without 'points'"),
-        ('{"key": {"cell": "pictures"}, "value": {}}', r"line 2: a pictures cell without 'folder'"),
+        ("{}", r"line 2, is not a cell of a benchmark"),
+        ('{"key": {"cell": "eval"}, "value": {}}', r"line 2: the eval cell lacks .*psnr"),
+        ('{"key": {"cell": "knobs"}, "value": {}}', r"line 2: the knobs cell lacks 'points'"),
+        ('{"key": {"cell": "pictures"}, "value": {}}', r"line 2: the pictures cell lacks 'folder'"),
         ("nonsense", r"line 2, is not valid JSON"),
     ],
 )

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from bitymi_ns.bake import ktx2, ply
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
-from bitymi_ns.bake.manifest import ATLAS, MANIFEST, SUPPORT, SURFELS, BundleError, FileEntry, Manifest, parse
+from bitymi_ns.bake.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileEntry, Manifest, parse
 from bitymi_ns.bake.quantise import decode_pages
 from bitymi_ns.bake.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
+from bitymi_ns.ops.constants import SUPPORT
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """What to do about a damaged bundle."""

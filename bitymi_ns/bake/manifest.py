@@ -14,6 +14,7 @@ from bitymi_ns.bake import strict_json
 from bitymi_ns.bake.ktx2 import Format
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 
 FORMAT = "bitymi-bundle"
 VERSION = (2, 1)
@@ -22,8 +23,6 @@ FULL_VERSION = (1, 2)
 """Version of a bundle whose surfels have all parameters."""
 _DIGEST_SINCE = {1: 2, 2: 1}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
-SUPPORT = 3.0
-"""Radius of the kernel in scale units."""
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 _MOST_PROBLEMS = 3  # in one message
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -128,9 +127,9 @@ class Atlas(_Part):
 class Render(_Part):
     """What the renderers draw with."""
 
-    alpha_max: _only(0.99) = 0.99  # type: ignore[valid-type]
-    alpha_min: _only(1.0 / 255.0) = 1.0 / 255.0  # type: ignore[valid-type]
-    t_min: _only(1e-4) = 1e-4  # type: ignore[valid-type]
+    alpha_max: _only(ALPHA_MAX) = ALPHA_MAX  # type: ignore[valid-type]
+    alpha_min: _only(ALPHA_MIN) = ALPHA_MIN  # type: ignore[valid-type]
+    t_min: _only(TRANSMITTANCE_MIN) = TRANSMITTANCE_MIN  # type: ignore[valid-type]
     near: Annotated[float, Field(ge=1e-9, le=1e6)]
     weight_bound: Share
     low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
@@ -235,7 +234,7 @@ class Manifest(_Part):
     generator: str = "an unnamed program"
     surfels: Surfels
     atlas: Atlas | None
-    color_bias: _only(0.5) = 0.5  # type: ignore[valid-type]
+    color_bias: _only(COLOR_BIAS) = COLOR_BIAS  # type: ignore[valid-type]
     render: Render
     world: Place
     bounds: Bounds

@@ -178,7 +178,7 @@ def test_ctrl_c_says_how_to_go_on(
 
     monkeypatch.setattr("bitymi_ns.bench.engine.run_measured", interrupted)
     assert run("local", "--data", capture("fox"), "--steps", 10, "--work", tmp_path / "w") == 130
-    assert "0 finished cells are in" in capsys.readouterr().err
+    assert "interrupted; no cell was finished. The same command goes on" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

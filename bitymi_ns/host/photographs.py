@@ -18,6 +18,8 @@ from bitymi_ns.train.memory import Room
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the photographs of a capture, training and held-out views together."""
+AT_ONCE = 4
+"""So many are read together at the start."""
 RECENT = 2
 """So many that do not fit are kept until the next ones are read: one step asks for a view more than once."""
 
@@ -49,12 +51,14 @@ class Photographs(Sequence):
         self._image_type, self._config = image_type, config
         self._read_recently = lru_cache(maxsize=RECENT)(self._read)
         self._kept: dict[int, dict[str, Any]] = {}
+        starts = range(0, len(dataset), AT_ONCE)
         with ThreadPoolExecutor(max_workers=2) as readers:
-            found = readers.map(self._read, range(len(dataset)))
-            for index, (batch, K) in enumerate(track(found, description, len(dataset), transient=True)):
-                _set_camera(dataset, index, batch["image"], K)
-                if room.take(sum(value.nbytes for value in batch.values() if isinstance(value, torch.Tensor))):
-                    self._kept[index] = batch
+            for start in track(starts, description, transient=True):
+                indices = range(len(dataset))[start : start + AT_ONCE]
+                for index, (batch, K) in zip(indices, list(readers.map(self._read, indices)), strict=True):
+                    _set_camera(dataset, index, batch["image"], K)
+                    if room.take(sum(value.nbytes for value in batch.values() if isinstance(value, torch.Tensor))):
+                        self._kept[index] = batch
 
     def __len__(self) -> int:
         return len(self._files)

@@ -11,6 +11,7 @@
 #include "core/field.h"
 #include "core/surfel.h"
 #include "core/view_color.h"
+#include "cpu/memory.h"
 
 namespace bt {
 
@@ -46,7 +47,8 @@ struct FragmentList {
   // freed goes back to the operating system. A tile's fragments lie in one block.
   struct Block {
     static constexpr int64_t kSize = int64_t(1) << 21;
-    std::unique_ptr<unsigned char[]> memory{new unsigned char[kSize * (2 * sizeof(int32_t) + 5 * sizeof(S))]};
+    explicit Block(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}
+    Memory memory;  // small views, which use a part of the first block, do without large pages
     int32_t* surfel = reinterpret_cast<int32_t*>(memory.get());
     int32_t* pixel = surfel + kSize;
     S *weight = reinterpret_cast<S*>(pixel + kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,

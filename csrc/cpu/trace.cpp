@@ -42,7 +42,7 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
     auto& own = list.blocks[thread];
     int& at_block = current[thread];
     if (at_block < int(own.size()) && own[at_block].used + kTileMost > Block::kSize) ++at_block;
-    if (at_block == int(own.size())) own.emplace_back();
+    if (at_block == int(own.size())) own.emplace_back(own.empty());
     Block& a = own[at_block];
     const int64_t from = a.used;
     int64_t count = 0;

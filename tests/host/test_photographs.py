@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import weakref
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,11 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from bitymi_ns.host import datamanager as module
+from bitymi_ns.host import photographs
 from bitymi_ns.host.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.host.dataset import BitymiDataset
 from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.photographs import RECENT
+from bitymi_ns.host.photographs import AT_ONCE, RECENT
 from bitymi_ns.sample import generate
 
 WIDTH, HEIGHT = 48, 36
@@ -71,6 +73,20 @@ def test_only_so_many_pictures_are_held(many: Path, alive: Any, monkeypatch: pyt
     pictures, _ = alive
     # what is kept, the latest of both sets, and the one in the caller's hand
     assert look_at_all(load(many), pictures) <= 6 + 2 * RECENT + 1
+
+
+def test_reading_does_not_run_ahead_of_what_is_kept(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 6 * PICTURE)
+    pictures, _ = alive
+    held = []
+
+    def slowly(*args: Any) -> None:
+        time.sleep(0.01)
+        held.append(len(pictures))
+
+    monkeypatch.setattr(photographs, "_set_camera", slowly)
+    _ = load(many).cached_train
+    assert len(held) == TRAIN and max(held) <= 6 + 2 * AT_ONCE
 
 
 def test_a_small_capture_is_read_once(many: Path, alive: Any) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from bitymi_ns import KernelsUnavailable
 from bitymi_ns.bench.cli import BenchRun
 from bitymi_ns.bench.process import BenchError
 from bitymi_ns.files import explained
@@ -221,7 +222,7 @@ def main(args: Sequence[str] | None = None) -> int:
     )
     try:
         return command.run() or 0
-    except (ValueError, OSError, BenchError) as error:
+    except (ValueError, OSError, BenchError, KernelsUnavailable) as error:
         print(f"bitymi: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

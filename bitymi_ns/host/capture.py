@@ -116,10 +116,12 @@ def _check_colmap(data: Path, dataparser: ColmapDataParserConfig) -> int:
             )
         others = "" if len(models) == 1 else f" ({listed(models[1:])} would do, too)"
         fail(f"the COLMAP model {model} {what}. Give `{_colmap_options(data, models[0])}`{others}.")
-    if not (data / dataparser.images_path).is_dir():
+    photographs = data / dataparser.images_path
+    reduced = photographs.with_name(f"{photographs.name}_{dataparser.downscale_factor}")
+    if not photographs.is_dir() and not reduced.is_dir():  # nerfstudio reads the reduced ones where they are asked for
         fail(
-            f"the folder of photographs {data / dataparser.images_path} does not exist. Give it, seen from the "
-            "capture, with `--images-path` after `colmap`."
+            f"the folder of photographs {photographs} does not exist. Give it, seen from the capture, with "
+            "`--images-path` after `colmap`."
         )
     counts = (point_count(model / name) for name in ("points3D.bin", "points3D.txt"))
     return next((count for count in counts if count), 0) if dataparser.load_3D_points else 0

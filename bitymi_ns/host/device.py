@@ -8,8 +8,7 @@ from functools import cache, lru_cache
 
 import torch
 
-from bitymi_ns.host.errors import fail, warn
-from bitymi_ns.ops.backend import cpu_module
+from bitymi_ns.host.errors import warn
 
 
 def has_cuda_kernels() -> bool:
@@ -42,21 +41,13 @@ def default_device_type() -> str:
 
 
 def kernel_device(device: torch.device | str) -> torch.device:
-    """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one).
-
-    Raises:
-        InputError: they cannot run on this CPU either.
-    """
+    """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one)."""
     device = torch.device(device)
     if device.type != "cpu":
         problem = why_not_cuda() if device.type == "cuda" else f"there are no kernels for the device '{device}'"
         if problem is None:
             return device
         _say_once(f"The scene stays on the CPU: {problem}.")
-    try:
-        cpu_module()
-    except RuntimeError as error:
-        fail(str(error), error)
     return torch.device("cpu")
 
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from bitymi_ns import KernelsUnavailable
+
 
 @dataclass
 class UnavailableConfig(TrainerConfig):
@@ -31,7 +33,7 @@ def _specification(name: str) -> MethodSpecification:
 
         return method_config(name)
     except Exception as error:  # noqa: BLE001 - see the module's docstring
-        reason = f"{type(error).__name__}: {error}"
+        reason = str(error) if isinstance(error, KernelsUnavailable) else f"{type(error).__name__}: {error}"
         _warn_once(f"bitymi-ns: its methods are not available: {reason}")
         return MethodSpecification(
             config=UnavailableConfig(method_name=name, reason=reason), description=f"not available: {reason}"

@@ -6,13 +6,14 @@ import functools
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from bitymi_ns import KernelsUnavailable
 
 SUFFIX = {torch.float32: "_f32", torch.float64: "_f64"}
 
@@ -41,7 +42,7 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
         _emulated = before
 
 
-@cache
+@functools.cache
 def cpu_module() -> str:
     """Name of the module of CPU kernels: of those that were built, the last for which this CPU has all that it needs.
 
@@ -49,7 +50,7 @@ def cpu_module() -> str:
     has; elsewhere the first module is taken to run.
 
     Raises:
-        RuntimeError: this CPU has not what any of them needs; says what to do.
+        KernelsUnavailable: this CPU has not what any of them needs; says what to do.
     """
     try:
         needs = importlib.import_module("bitymi_ns._cpu_features").FEATURES
@@ -62,7 +63,7 @@ def cpu_module() -> str:
     lacking = {name: [flag for flag in needed.split() if flag not in flags] for name, needed in needs.items()}
     usable = [name for name, missing in lacking.items() if not missing]
     if not usable:
-        raise RuntimeError(
+        raise KernelsUnavailable(
             f"the CPU kernels were compiled for a CPU with {', '.join(lacking['_cpu'])}, which this one lacks: install "
             "bitymi-ns again on this machine from its source, with `pip install . -Ccmake.define.BITYMI_MARCH=native` "
             "(in a checkout: `make clean setup`)"
@@ -74,7 +75,7 @@ def load(name: str) -> ModuleType:
     """The compiled module of that name: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
 
     Raises:
-        RuntimeError: it is missing, or not for this CPU.
+        KernelsUnavailable: it is missing, or not for this CPU.
     """
     try:
         return importlib.import_module(f"bitymi_ns.{cpu_module() if name == '_cpu' else name}")
@@ -84,7 +85,7 @@ def load(name: str) -> ModuleType:
             "_cuda": "install the package again where the CUDA toolkit's nvcc is found, or move the tensors to the CPU",
             "_emulated": "install the package with -Ccmake.define.BITYMI_EMULATED_CUDA=ON",
         }[name]
-        raise RuntimeError(
+        raise KernelsUnavailable(
             f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
         ) from (error)
 

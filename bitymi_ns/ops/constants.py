@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from bitymi_ns import KernelsUnavailable
+
 from .backend import load
 
 
@@ -14,7 +16,7 @@ def _compiled(name: str) -> Any:
     try:
         return getattr(load("_cpu"), name)
     except AttributeError as error:
-        raise RuntimeError(
+        raise KernelsUnavailable(
             f"the compiled module bitymi_ns._cpu does not know {name}: it is older than the package. Install the "
             "package again (`pip install .`, or `make setup` in a checkout)"
         ) from error

@@ -173,7 +173,7 @@ def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix,
 def test_broken_cells_are_named(tmp_path: Path) -> None:
     path = tmp_path / "cells.jsonl"
     path.write_text('{"key": {"cell": "train"}, "value": {}}\nhello\n{"key": {}, "value": {}}\n')
-    with pytest.raises(BenchError, match=r"cells\.jsonl, line 2, is no finished cell"):
+    with pytest.raises(BenchError, match=r"cells\.jsonl, line 2, is not a finished cell"):
         Cells(path)
     path.write_text('{"key": {"cell": "train"}, "value": {}}\n{"key": {"cel')
     assert len(Cells(path)) == 1

@@ -69,7 +69,7 @@ def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
     first, second = local_scenes([capture("fox"), lego])
     assert first.parser == () and first.hold_out == 8
     assert second.parser == ("blender-data", "--ply-path", "hull_pc.ply")
-    with pytest.raises(BenchError, match="is no capture"):
+    with pytest.raises(BenchError, match="is not a capture"):
         local_scenes([tmp_path / "captures"])
     with pytest.raises(BenchError, match="different names"):
         local_scenes([lego, lego])
@@ -106,7 +106,7 @@ def test_a_plan_of_ones_own(tmp_path: Path) -> None:
         ("rows: {a: {method: bitymi, option: []}}", "row a: it must be"),
         ("rows: {a: {method: bitymi, options: --x}}", "options must be a list"),
         ("rows: {a: {method: bitymi}}\nbundle: {}", "unknown entry bundle"),
-        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "names of bundles"),
+        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "a bundle's name"),
         ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "'bundles' must map names"),
     ],
 )
@@ -184,7 +184,7 @@ def test_ctrl_c_says_how_to_go_on(
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (("local", "--data", "/nowhere"), "is no capture"),
+        (("local", "--data", "/nowhere"), "is not a capture"),
         (("mipnerf360", "--data", "/nowhere"), "not Mip-NeRF 360's bicycle"),
         (("mipnerf360", "--data", "/a", "/b"), "--data is one folder"),
         (("local", "--data", "/a", "--scenes", "x"), "--scenes chooses"),

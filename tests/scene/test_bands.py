@@ -40,7 +40,7 @@ def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.Mo
 
 def test_a_row_of_tiles_with_too_many_is_an_error_with_the_number() -> None:
     scene, camera = bands.make(CPU, 50)
-    with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments, \d+ a pixel.*room for 50"):
+    with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments, \d+ per pixel.*room for 50"):
         scene.render(camera)
 
 

@@ -24,8 +24,8 @@ REMARKS = re.compile(
 
 @contextmanager
 def quiet_host() -> Iterator[None]:
-    """Drop these lines, the box in which the viewer's server states its address, and nerfstudio's warnings that it was
-    written for an older torch. Afterwards all is as before: other methods are not concerned."""
+    """Drop these lines, the box in which the viewer's server states its address, and torch's
+    warnings about nerfstudio's code. Afterwards all is as before: other methods are not concerned."""
 
     def remark(said: Any) -> bool:
         return isinstance(said, str) and REMARKS.match(said) is not None
@@ -34,12 +34,20 @@ def quiet_host() -> Iterator[None]:
         return isinstance(said, Panel) and "viser" in str(said.title)
 
     with (
-        warnings.catch_warnings(),
+        quiet_warnings(),
         _dropping(CONSOLE, "print", remark),
         _dropping(CONSOLE, "log", remark, _stack_offset=2),  # it states its caller
         _dropping(rich, "print", box),
     ):
+        yield
+
+
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Ignore torch's warnings about nerfstudio's code: nobody can heed them here."""
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
+        warnings.filterwarnings("ignore", "Converting a tensor with requires_grad", UserWarning, module="nerfstudio")
         yield
 
 

@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.host import checkpoints
 from bitymi_ns.host.errors import fail
-from bitymi_ns.host.quiet import quiet_host, step_bar
+from bitymi_ns.host.quiet import quiet_host, quiet_warnings, step_bar
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the convention of shells."""
@@ -87,7 +87,7 @@ class BitymiTrainer(Trainer):
         restore_handler = self._catch_interrupt()
         self.config.max_num_iterations = total - self._start_step
         try:
-            with step_bar(self._start_step, total) as self._show_step:
+            with quiet_warnings(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
         except _StopAfterStep:
             self.save_checkpoint(self.step)

@@ -41,8 +41,11 @@ FIRST = """
 import sys
 from pathlib import Path
 import pytest
+read_text = Path.read_text
+Path.read_text = lambda path, *words, **options: (
+    "" if str(path) == "/proc/cpuinfo" else read_text(path, *words, **options)
+)
 from bitymi_ns.ops import backend
-backend.CPUINFO = Path("/dev/null")
 assert backend.cpu_module() == "_cpu"
 sys.exit(pytest.main(sys.argv[1:]))
 """

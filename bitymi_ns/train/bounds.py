@@ -22,7 +22,8 @@ def short_run(schedule: Schedule, views: int) -> list[str]:
         apart = f", {densify[1] - densify[0]} steps apart" if len(densify) > 1 else ""
         parts.append(f"{_count(len(densify), 'densification')}{apart}, {_count(resets, 'opacity reset')}")
         if schedule.freeze_every < schedule.config.freeze_every:
-            parts.append(f"the texture field learns on 1 of {schedule.freeze_every} steps once it is frozen")
+            rare = f"learns on 1 of {schedule.freeze_every} steps once it is frozen"
+            parts.append(f"the texture field {rare if schedule.freeze_every > 1 else 'is never frozen'}")
         found.append(f"Rules for runs of fewer than {REFERENCE_STEPS:,} steps: {'; '.join(parts)}.")
     if schedule.max_steps < views:
         found.append(

@@ -24,7 +24,7 @@ def test_a_short_run_says_which_rules_are_in_force() -> None:
 
 def test_a_run_that_does_not_see_every_photograph_says_so() -> None:
     rules, views = bounds.short_run(Schedule(TrainConfig(), 80), views=263)
-    assert "no densifications" in rules
+    assert "no densifications" in rules and "the texture field is never frozen" in rules
     assert "80 of the 263" in views and "--max-num-iterations" in views
 
 

@@ -199,6 +199,13 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             "install the system's package of it; if a module, install it with pip.",
             error,
         )
+    except EOFError as error:
+        fail(
+            f"the capture {_folder_of(config)} has no reduced photographs, and nerfstudio's question whether to make "
+            "them found nobody to answer it. Give `--downscale-factor 1` after the parser's name (`colmap`) to read "
+            "the photographs as they are, or run once in a terminal and answer.",
+            error,
+        )
     except (
         AssertionError,
         OSError,
@@ -210,10 +217,13 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
         RuntimeError,
         struct.error,
     ) as error:
-        data = config.data if config.data is not None else config.dataparser.data
         detail = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         if isinstance(error, KeyError):
             detail = f"the entry {detail} is missing"
         if isinstance(error, UnidentifiedImageError):
             detail += ". Save the photographs as PNG or JPEG"
-        fail(f"the capture {data} cannot be loaded: {detail}", error)
+        fail(f"the capture {_folder_of(config)} cannot be loaded: {detail}", error)
+
+
+def _folder_of(config: Any) -> Any:
+    return config.data if config.data is not None else config.dataparser.data

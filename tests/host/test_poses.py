@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -209,3 +210,10 @@ def test_the_photographs_of_a_scaled_capture_are_those_of_its_frames(capture: Pa
     change_poses(edit, capture, lambda part: 3.0 * part)
     data = load(capture).train_view(0)[1]["image"]
     assert np.array_equal(data.numpy(), np.asarray(Image.open(images_of(capture)[1])))
+
+
+def test_reduced_photographs_that_nobody_can_be_asked_for(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    colmap_model(capture, capture / "sparse/0")
+    monkeypatch.setattr("sys.stdin", io.StringIO())  # a batch job: the host's question meets the end of its input
+    with expect("has no reduced photographs.*Give `--downscale-factor 1` after the parser's name"):
+        load_with(capture, ColmapDataParserConfig(colmap_path=Path("sparse/0"), downscale_factor=2))

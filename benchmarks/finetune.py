@@ -24,12 +24,11 @@ from common import number, page, publish, say, table
 
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, export, read_bundle, tune_atlas
 from bitymi_ns.bench.tables import difference
-from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.export import load_trained, photographs
+from bitymi_ns.host.export import load_trained
 from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.train.views import View, as_float, over_background
+from bitymi_ns.train.views import View
 
 METRICS = ("psnr", "ssim", "flip")
 HEADER = (
@@ -45,8 +44,7 @@ def quality(baked: Baked, views: list[View], background: torch.Tensor) -> dict[s
     rows = []
     for view in views:
         rgb = scene.render(view.camera, background).rgb.clamp(0.0, 1.0)
-        target = over_background(as_float(view.image), background)
-        rows.append(image_metrics(rgb, target, view.mask))
+        rows.append(image_metrics(rgb, view.target(background, "cpu"), view.mask))
     return {name: sum(row[name] for row in rows) / len(rows) for name in METRICS}
 
 
@@ -55,10 +53,7 @@ def measure(run: Path, formats: list[str], bake_options: BakeOptions, tune_optio
     _, pipeline = load_trained(run)
     model, data = pipeline.model, pipeline.datamanager
     background = model.background.cpu()
-    cameras = data.undistorted_train_cameras()
-    train = photographs([to_camera(cameras[i : i + 1]) for i in range(len(cameras))], data.train_view)
-    held_out = [to_camera(data.eval_view(i)[0]) for i in range(len(data.eval_dataset))]
-    evaluation = photographs(held_out, data.eval_view)
+    train, evaluation = data.train_views, data.eval_views
     plain = bake(model.scene, [view.camera for view in train], replace(bake_options, format="uint8"))
     tuned = tune_atlas(plain, train, background, tune_options)
     cost: dict[str, Any] = tuned.statistics["finetune"]

@@ -32,7 +32,7 @@ from bitymi_ns import ops
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.trainer import make_optimizers
+from bitymi_ns.train.optimizers import make_optimizers
 
 LEVELS = 4
 LOOK_UP = 1550

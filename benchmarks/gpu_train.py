@@ -27,7 +27,8 @@ from bitymi_ns.host.preset import Preset, build, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene
-from bitymi_ns.train.trainer import Trainer, evaluate
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import background_color, over_background
 
 
@@ -110,7 +111,7 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
             torch.cuda.synchronize(device)
         seconds += time.perf_counter() - start
         if trainer.step in due:
-            trainer.watch.finish(scene)
+            trainer.training.watch.finish(scene)
             psnr, _ = evaluate(scene, capture.held_out, preset.train)
             curve.append(Point(trainer.step, seconds, len(scene), psnr))
             say(f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {psnr:.2f} dB, {len(scene):,} surfels")

@@ -27,7 +27,8 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import LearningRates, TrainConfig
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
-from bitymi_ns.train.trainer import Trainer, evaluate
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 
 HOLD_OUT = 7
@@ -84,7 +85,7 @@ def run(seed: int, options: argparse.Namespace) -> Result:
     except TrainingDiverged as error:
         note = str(error)
     psnr, _ = evaluate(scene, held_out, config)
-    rollbacks = trainer.guard.rollbacks
+    rollbacks = trainer.training.guard.rollbacks
     finite = not describe_broken(scene) and math.isfinite(psnr)
     return Result(seed, psnr, len(scene), finite, rollbacks, time.process_time() - start, note)
 

@@ -43,6 +43,6 @@ def test_a_layer_imports_only_what_stands_below(layer: str) -> None:
 
 
 def test_a_scene_can_be_built_and_trained_without_nerfstudio() -> None:
-    modules = "bitymi_ns.train.domain, bitymi_ns.train.trainer, bitymi_ns.bake, bitymi_ns.scene.baked"
+    modules = "bitymi_ns.train.domain, bitymi_ns.train.fit, bitymi_ns.bake, bitymi_ns.scene.baked"
     code = f"import sys; sys.modules['nerfstudio'] = None; import {modules}"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

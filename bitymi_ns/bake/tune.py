@@ -28,7 +28,7 @@ from bitymi_ns.ops import (
 )
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room
-from bitymi_ns.train.views import View, as_float, over_background, training_order
+from bitymi_ns.train.views import View, training_order
 
 FEWEST_VIEWS = 4
 """With fewer views none can be set aside: an atlas is then not tuned."""
@@ -158,7 +158,7 @@ class TexelScene:
         without = texel_image(chosen, base, self.texels, self.tiles, bound=math.inf)  # their colours without residual
         rest = plain[:, :3] - without + (1 - plain[:, 3:4]) * self._background
         size = (camera.height, camera.width)
-        target = over_background(as_float(view.image.cpu()), self._background)
+        target = view.target(self._background, "cpu")
         mask = None if view.mask is None else view.mask.cpu().reshape(*size, 1)
         return TexelView(chosen, base, rest.view(*size, 3), target.contiguous(), mask)
 

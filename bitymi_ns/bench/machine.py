@@ -53,13 +53,21 @@ def versions() -> dict[str, str]:
 
 
 @functools.cache
-def machine() -> str:
-    """One line about the machine: processor, cores, memory, GPUs, and a limit on threads."""
+def processor() -> str:
+    """Model of the processor."""
     model = platform.processor() or platform.machine()
-    memory = ""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf8").splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+    except OSError:
+        return model
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+
+
+@functools.cache
+def machine() -> str:
+    """One line about the machine: processor, cores, memory, GPUs, and a limit on threads."""
+    memory = ""
+    try:
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
     except (OSError, ValueError):
         pass
@@ -67,7 +75,7 @@ def machine() -> str:
     cards = f", {len(names)} x {names[0]}" if names else ""
     threads = os.environ.get("OMP_NUM_THREADS")
     limit = f", OMP_NUM_THREADS={threads}" if threads else ""
-    return f"{model}, {cores()} cores{memory}{cards}{limit}"
+    return f"{processor()}, {cores()} cores{memory}{cards}{limit}"
 
 
 def software() -> str:

@@ -10,33 +10,14 @@ import atexit
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from nerfstudio.models.base_model import ModelConfig
 
+from bitymi_ns.host.bundle_model import BakedModelConfig  # noqa: F401 - the config.yml of earlier bundles name it here
 from bitymi_ns.host.errors import fail
 
 MANIFEST = "bundle.json"
-
-
-def _model_class() -> type:
-    from bitymi_ns.host.bundle_model import BakedModel
-
-    return BakedModel
-
-
-@dataclass
-class BakedModelConfig(ModelConfig):
-    """A scene baked into a bundle."""
-
-    _target: type = field(default_factory=_model_class)
-    enable_collider: bool = False
-    bundle: Path = Path()
-    """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind the scene."""
 
 
 def find_bundle(recorded: Path) -> Path:

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 
-from bitymi_ns.host.bundle_config import BakedModelConfig
+from bitymi_ns.bake import REMEDY, BundleError, read_bundle
+from bitymi_ns.bake.manifest import ATLAS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+
+
+@dataclass
+class BakedModelConfig(ModelConfig):
+    """A scene baked into a bundle."""
+
+    _target: type = field(default_factory=lambda: BakedModel)
+    enable_collider: bool = False
+    bundle: Path = Path()
+    """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour behind the scene."""
 
 
 class BakedModel(SurfelModel):
@@ -21,21 +37,17 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        from bitymi_ns.bake import REMEDY, BundleError, read_bundle
-        from bitymi_ns.bake.manifest import ATLAS
-        from bitymi_ns.scene.baked import BakedScene
-
         folder = Path(self.config.bundle)
         try:
             bundle = read_bundle(folder)
         except BundleError as error:
             fail(f"{error}. {REMEDY}", error)
         self._atlas_bytes = bundle.info.files[ATLAS].bytes if ATLAS in bundle.info.files else 0
-        self._scene = [BakedScene.from_bundle(bundle)]  # in a list: it has no parameters to register
+        self._scene = BakedScene.from_bundle(bundle)
         self._count = len(bundle)
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        return self._scene[0].render(camera.to(self.device), background=background.to(self.device), maps=maps)
+        return self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
 
     def surfel_count(self) -> int:
         return self._count
@@ -49,8 +61,8 @@ class BakedModel(SurfelModel):
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)
-        if self._scene[0].tiles.device != self.device:
-            self._scene[0] = self._scene[0].to(self.device)
+        if self._scene.tiles.device != self.device:
+            self._scene = self._scene.to(self.device)
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:

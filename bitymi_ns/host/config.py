@@ -19,7 +19,8 @@ from rich.markup import escape
 
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host import checkpoints, run_folder
-from bitymi_ns.host.bundle_config import BakedModelConfig, find_bundle, folder_being_evaluated, stub_checkpoint_dir
+from bitymi_ns.host.bundle_config import find_bundle, folder_being_evaluated, stub_checkpoint_dir
+from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels, why_not_cuda

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +10,6 @@ from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.errors import fail, warn
 
 FILE = "training_curve.jsonl"
-
-
-class Stopwatch:
-    """Wall-clock and CPU seconds of the training steps alone: evaluation, saving and loading are not counted."""
-
-    def __init__(self, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
-        self.seconds = seconds
-        self.cpu_seconds = cpu_seconds
-        self._started: tuple[float, float] | None = None
-
-    def start(self) -> None:
-        self._started = (time.perf_counter(), time.process_time())
-
-    def stop(self) -> None:
-        if self._started is not None:
-            self.seconds += time.perf_counter() - self._started[0]
-            self.cpu_seconds += time.process_time() - self._started[1]
-            self._started = None
 
 
 class TrainingCurve:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 
 from bitymi_ns.host import duplicates
-from bitymi_ns.host.cameras import check_cameras
+from bitymi_ns.host.cameras import check_cameras, to_camera
 from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
 from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
 from bitymi_ns.host.errors import fail, listed, warn
@@ -26,7 +26,7 @@ from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.host.poses import check_places, warn_of_mirrored
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import OnDemand, Room
-from bitymi_ns.train.views import training_order
+from bitymi_ns.train.views import View, training_order
 
 FEW_VIEWS = 10
 """With fewer training views than this the multi-view scores rest on little."""
@@ -54,6 +54,10 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
 class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     """Full images and their cameras.
 
+    Attributes:
+        step_view: gives a training view by its number in the size that the current step wants; a run replaces it, which
+            else gives the full size.
+
     The view of a training step is a function of the seed and the step alone, so that a resumed run sees the views that
     the uninterrupted one would have seen: each epoch of n steps is a permutation of the n views.
     """
@@ -70,6 +74,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         **kwargs: Any,
     ) -> None:
         self._room = Room(PHOTOGRAPH_BYTES)
+        self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         points = check_capture(config, images=test_mode != "inference")
         with (
             reporting_input_errors(config),
@@ -191,8 +196,21 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         """The training view of a step."""
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, step)
 
-    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        return self.train_view(self.train_index(step))
+    def next_train(self, step: int) -> tuple[View, dict[str, Any]]:  # type: ignore[override]
+        """The view of a step, as training wants it (`step_view`)."""
+        index = self.train_index(step)
+        view = self.step_view(index)
+        return view, {"image_idx": index, "image": view.image, "mask": view.mask}
+
+    @property
+    def train_views(self) -> OnDemand[View]:
+        """All training views at full size, each read when it is asked for."""
+        return OnDemand(len(self.train_dataset), lambda i: _view(*self.train_view(i)))
+
+    @property
+    def eval_views(self) -> OnDemand[View]:
+        """All held-out views at full size, each read when it is asked for."""
+        return OnDemand(len(self.eval_dataset), lambda i: _view(*self.eval_view(i)))
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """The held-out views in turn, without drawing from a shared random generator."""
@@ -221,3 +239,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if distortion is not None and bool((distortion != 0).any()):
             _ = self.cached_train  # undistorts, which changes the intrinsics
         return self.train_dataset.cameras
+
+
+def _view(cameras: Cameras, batch: dict[str, Any]) -> View:
+    return View(to_camera(cameras), batch["image"], batch.get("mask"))

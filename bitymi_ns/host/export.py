@@ -27,7 +27,7 @@ from bitymi_ns.bake.bundle import World
 from bitymi_ns.bake.manifest import MANIFEST, SURFELS, HeldOut, dump
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import reason, write_file
-from bitymi_ns.host.bundle_config import BakedModelConfig
+from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.memory import state_export
@@ -36,8 +36,6 @@ from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
-from bitymi_ns.train.memory import OnDemand
-from bitymi_ns.train.views import View, as_float, over_background
 
 INTERRUPTED = 130
 
@@ -100,17 +98,9 @@ class ExportAtlas(BakeOptions):
             with rich_progress() as progress:
                 baked = bake(model.scene, views, options, progress)
                 if finetunes and baked.atlas is not None:
-                    photos = photographs(views, datamanager.train_view)
-                    shown = range(len(datamanager.eval_dataset) if self.compare else 0)
-                    held_out = [to_camera(datamanager.eval_view(i)[0]) for i in shown]
-                    baked = tune_atlas(
-                        baked,
-                        photos,
-                        model.background.cpu(),
-                        tune,
-                        progress,
-                        photographs(held_out, datamanager.eval_view),
-                    )
+                    held_out = datamanager.eval_views if self.compare else ()
+                    background = model.background.cpu()
+                    baked = tune_atlas(baked, datamanager.train_views, background, tune, progress, held_out)
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
@@ -165,22 +155,12 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
     return config, pipeline
 
 
-def photographs(cameras: list[Camera], view: Callable[[int], tuple[Any, dict[str, Any]]]) -> OnDemand[View]:
-    """The cameras with their images and masks, which `view` gives by index whenever they are asked for."""
-
-    def photograph(index: int) -> View:
-        batch = view(index)[1]
-        return View(cameras[index], batch["image"], batch.get("mask"))
-
-    return OnDemand(len(cameras), photograph)
-
-
 @torch.no_grad()
 def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera]) -> bytes:
     """A PNG of the first held-out view, or of the first training view where none is held out."""
     camera = train_views[0]
     if len(datamanager.eval_dataset):
-        camera = to_camera(datamanager.eval_view(0)[0], model.device)
+        camera = datamanager.eval_views[0].camera
     rgb = model.render(camera, model.background, maps=False).rgb
     pixels = (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
@@ -207,14 +187,12 @@ def held_out_psnr(
     bundle against photograph."""
     rows = []
     background = model.background
-    for index in range(min(views, len(datamanager.eval_dataset))):
-        cameras, batch = datamanager.eval_view(index)
-        camera = to_camera(cameras, model.device)
-        neural = model.render(camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
-        baked = render_baked(camera.to("cpu")).clamp(0.0, 1.0)
-        photo = over_background(as_float(batch["image"].cpu()), background.cpu())
-        mask = batch.get("mask")
-        mask = None if mask is None else mask.cpu()
+    for index in range(min(views, len(datamanager.eval_views))):
+        view = datamanager.eval_views[index]
+        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
+        baked = render_baked(view.camera.to("cpu")).clamp(0.0, 1.0)
+        photo = view.target(background.cpu(), "cpu")
+        mask = None if view.mask is None else view.mask.cpu()
         rows.append([psnr(baked, neural, mask), psnr(neural, photo, mask), psnr(baked, photo, mask)])
     return rows
 

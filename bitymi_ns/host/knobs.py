@@ -26,8 +26,8 @@ from bitymi_ns.host.target import see_writable
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.evaluate import evenly_spaced
 from bitymi_ns.train.losses import psnr
-from bitymi_ns.train.views import as_float, over_background
 
 WEIGHT_BOUNDS = (0.0, ALPHA_MIN, 0.01, 0.02, 0.05, 0.1)
 TRANSMITTANCES = (0.0, TRANSMITTANCE_MIN, 1e-3, 1e-2, 5e-2)
@@ -99,16 +99,14 @@ class HeldOut:
         count = len(datamanager.eval_dataset)
         if count == 0:
             fail("the run has no held-out views; knobs are measured on them")
-        used = count if views <= 0 else min(count, views)
         self.background: Tensor = model.background.cpu()
         self.cameras: list[Camera] = []
         self.photos: list[Tensor] = []
         self.masks: list[Tensor | None] = []
-        for index in sorted({round(i * (count - 1) / max(1, used - 1)) for i in range(used)}):
-            camera, batch = datamanager.eval_view(index)
-            self.cameras.append(to_camera(camera, model.device))
-            self.photos.append(over_background(as_float(batch["image"].cpu()), self.background))
-            mask = batch.get("mask")
+        for index in evenly_spaced(count, views):
+            camera, _, mask = view = datamanager.eval_views[index]
+            self.cameras.append(camera)
+            self.photos.append(view.target(self.background, "cpu"))
             self.masks.append(None if mask is None else mask.cpu().bool().reshape(*mask.shape[:2], 1))
 
     def psnr(self, images: Sequence[Tensor]) -> float:

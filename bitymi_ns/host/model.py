@@ -13,12 +13,15 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.host.callbacks import TrainingRun
 from bitymi_ns.host.checkpoints import STATE_VERSION, SURFELS
 from bitymi_ns.host.errors import fail
+from bitymi_ns.host.scene_setup import new_scene
 from bitymi_ns.host.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.views import View
 
 SURFEL_PARAMETERS = (
     "means",
@@ -76,15 +79,13 @@ class BitymiModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        from bitymi_ns.host.scene_setup import new_scene
-
         self.metadata: dict[str, Any] = self.kwargs.get("metadata") or {}
         self.train_config = train_config_for(self.config.train, self.metadata.get("alpha_color"))
         points = self.kwargs.pop("seed_points", None)
         self.scene = new_scene(points, self.scene_box, self.config.scene, self.train_config, self.metadata)
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
-        self._run: list[Any] = []  # in a list: not a module of this one
+        self._run: TrainingRun | None = None
 
     # rendering
 
@@ -104,8 +105,11 @@ class BitymiModel(SurfelModel):
         return len(self.scene)
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        if self.training and self._run:
-            return {"cameras": ray_bundle}  # rendered together with its photograph, in get_loss_dict
+        """Of a training view the terms of its loss, of cameras the pictures."""
+        if isinstance(ray_bundle, View):
+            if self._run is None:
+                raise RuntimeError("losses exist in training only")
+            return {"losses": self._run.losses(ray_bundle)}
         return super().get_outputs(ray_bundle)
 
     # training
@@ -121,18 +125,23 @@ class BitymiModel(SurfelModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        from bitymi_ns.host.training import TrainingRun
-
         self.measure_time = False
-        self._run = [TrainingRun(self, training_callback_attributes)]
-        return self._run[0].callbacks()
+        self._run = TrainingRun(
+            self.scene,
+            self.train_config,
+            training_callback_attributes,
+            self.metadata,
+            self.background,
+            self.resume_state,
+            self.config.curve_points,
+            self.config.curve_views,
+        )
+        return self._run.callbacks()
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        if not self._run:
-            raise RuntimeError("losses exist in training only")
-        return self._run[0].losses(outputs["cameras"], batch)
+        return outputs["losses"]
 
     # checkpoints
 
@@ -140,9 +149,9 @@ class BitymiModel(SurfelModel):
         """Tensors, numbers and text only, so that torch loads it in its safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
         state["near"] = self.scene.near
-        if self._run:
-            state["trained_for"] = self._run[0].total
-            state["run"] = self._run[0].state()
+        if self._run is not None:
+            state["trained_for"] = self._run.total
+            state["run"] = self._run.state()
         elif self.trained_for is not None:
             state["trained_for"] = self.trained_for
         return state

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.files import reason
-from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.metrics import image_metrics
@@ -22,7 +21,6 @@ from bitymi_ns.host.target import see_writable
 from bitymi_ns.ops import composite
 from bitymi_ns.report.views import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.scene import RenderOutput, Scene
-from bitymi_ns.train.views import as_float, over_background
 
 OVERDRAW_SCALE = 64
 """Blended surfels at which the overdraw map ends: the same in every picture, so that runs compare."""
@@ -117,12 +115,10 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
         fail("the run has no held-out views to choose the worst of")
     background = model.background
     ranked = []
-    for index in range(count):
-        cameras, batch = datamanager.eval_view(index)
-        camera = to_camera(cameras, model.device)
-        photo = over_background(as_float(batch["image"].to(model.device)), background)
-        rgb = model.render(camera, background, maps=False).rgb.clamp(0.0, 1.0)
-        ranked.append((image_metrics(rgb, photo, batch.get("mask")), index, camera, photo))
+    for index, view in enumerate(datamanager.eval_views):
+        photo = view.target(background, model.device)
+        rgb = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
+        ranked.append((image_metrics(rgb, photo, view.mask), index, view.camera, photo))
     ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
     try:
         output_dir.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import ReducedViews, as_float, background_color, over_background
+from bitymi_ns.train.views import ReducedViews, background_color
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -141,13 +141,13 @@ class Guard:
         kind = "white" if self.config.background == "white" else "black"
         device = self.scene.surfels["means"].device
         background = background_color(kind, self.config.seed, 0, device)
-        for camera, image, mask in (views.at(i * len(views) // count, factor) for i in range(count)):
-            target = over_background(as_float(image.to(device)), background)
+        for view in (views.at(i * len(views) // count, factor) for i in range(count)):
+            target = view.target(background, device)
             if blank:
                 drawn = target.mean((0, 1)).expand_as(target).contiguous()
             else:
-                drawn = self.scene.render(camera.to(device), background=background, field_mode="frozen").rgb
-            losses.append(photometric(drawn, target, self.config.loss.ssim_weight, mask))
+                drawn = self.scene.render(view.camera.to(device), background=background, field_mode="frozen").rgb
+            losses.append(photometric(drawn, target, self.config.loss.ssim_weight, view.mask))
         return float(torch.stack(losses).mean())
 
     def _convert(self, step: int) -> None:

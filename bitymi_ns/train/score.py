@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
-from bitymi_ns.train.views import View, as_float, background_color, over_background
+from bitymi_ns.train.views import View, background_color
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -76,10 +76,10 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
     # a random background would make the score depend on the draw: judge over black
     kind = "black" if config.background == "random" else config.background
     background = background_color(kind, config.seed, 0, device)
-    for camera, image, mask in views:
-        target = over_background(as_float(image.to(device)), background)
-        mask = None if mask is None else mask.to(device)
-        output = scene.render(camera.to(device), background=background, field_mode="frozen")
+    for view in views:
+        target = view.target(background, device)
+        mask = None if view.mask is None else view.mask.to(device)
+        output = scene.render(view.camera.to(device), background=background, field_mode="frozen")
         bad = bad_pixels(output.rgb, target, config.densify.error_threshold, mask)
         counts = output.fragments.masked_counts(bad.flatten(), n)  # [N]
         loss = photometric(output.rgb, target, config.loss.ssim_weight, mask)

@@ -35,6 +35,10 @@ class View(NamedTuple):
         """Memory of the picture and its mask."""
         return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
+    def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
+        """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
+        return over_background(as_float(self.image.to(device)), background)
+
 
 def as_float(image: Tensor) -> Tensor:
     """The image as float32 in [0, 1]."""

@@ -16,8 +16,8 @@ from bitymi_ns.ops import bands as bands_module
 from bitymi_ns.ops import trace as whole_trace
 from bitymi_ns.scene import scene as scene_module
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.score import multi_view_scores
-from bitymi_ns.train.trainer import evaluate
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, cameras
 from tests.scene import bands

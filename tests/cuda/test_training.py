@@ -10,7 +10,8 @@ import torch
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged
-from bitymi_ns.train.trainer import Trainer, evaluate
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 from tests.ops.golden import random_scene
 
@@ -39,7 +40,7 @@ def train(device: torch.device) -> tuple[list[float], float, dict[str, torch.Ten
     for _ in range(STEPS):
         trainer.advance()
         losses.append(trainer.loss)
-    trainer.watch.finish(scene)
+    trainer.training.watch.finish(scene)
     psnr, _ = evaluate(scene, views, config)
     return losses, psnr, {name: p.detach().cpu() for name, p in scene.named_parameters()}
 
@@ -62,4 +63,4 @@ def test_a_loss_that_is_not_finite_ends_the_run(device: torch.device) -> None:
     trainer = Trainer(scene.to(device), broken, TrainConfig(resolution_schedule=0), 10)
     with pytest.raises(TrainingDiverged, match="loss is nan at step 0"):
         trainer.advance()
-        trainer.watch.finish(scene)
+        trainer.training.watch.finish(scene)

@@ -13,9 +13,10 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from bitymi_ns.host import metrics
-from bitymi_ns.host.curve import Stopwatch, TrainingCurve, points
+from bitymi_ns.host.curve import TrainingCurve, points
 from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.pipeline import BitymiPipeline
+from bitymi_ns.train.clock import Stopwatch
 
 
 def pair() -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,7 +9,7 @@ from bitymi_ns import ops
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene import scene as scene_module
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.trainer import Trainer
+from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 from tests.scene import bands
 

@@ -10,7 +10,8 @@ import torch
 
 from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
-from bitymi_ns.train.trainer import Trainer, evaluate
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer
 
 
 def config_of(factor: float = 1.0, **guard: float) -> TrainConfig:
@@ -32,7 +33,7 @@ def test_a_healthy_run_is_left_alone(make_scene, views):
         scene = make_scene()
         trainer = Trainer(scene, views, config_of(rollbacks=rollbacks), 60)
         run(trainer, 60)
-        assert trainer.guard.rollbacks == 0 and trainer.guard.factor == 1.0
+        assert trainer.training.guard.rollbacks == 0 and trainer.training.guard.factor == 1.0
         log[rollbacks] = scene.surfels["means"].detach().clone()
     torch.testing.assert_close(log[5], log[0], rtol=0, atol=0)
 
@@ -50,7 +51,7 @@ def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scen
     assert not describe_broken(scene)
     psnr, _ = evaluate(scene, views, config)
     assert math.isfinite(psnr) and psnr > start - 3.0
-    assert sum("rolled_back" in report for report in reports) == trainer.guard.rollbacks or not reports
+    assert sum("rolled_back" in report for report in reports) == trainer.training.guard.rollbacks or not reports
 
 
 def test_a_field_that_breaks_on_the_way_is_restored(make_scene, views):
@@ -65,8 +66,10 @@ def test_a_field_that_breaks_on_the_way_is_restored(make_scene, views):
     ):
         for _ in range(20):
             trainer.advance()
-    assert trainer.guard.rollbacks == 1 and not describe_broken(scene)
-    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(0.3 * trainer.schedule.lr("means", 69))
+    assert trainer.training.guard.rollbacks == 1 and not describe_broken(scene)
+    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(
+        0.3 * trainer.training.schedule.lr("means", 69)
+    )
     assert (scene.field.field_table - good).abs().max() < 0.5
     run(trainer, 50)
     assert evaluate(scene, views, trainer.config)[0] > 15
@@ -77,7 +80,7 @@ def test_views_drawn_worse_than_before_take_the_run_back(make_scene, views):
     trainer = Trainer(scene, views, config_of(), 120)
     run(trainer, 96)
     good, _ = evaluate(scene, views, trainer.config)
-    assert trainer.guard.window == 24  # four epochs; the windows end with the run
+    assert trainer.training.guard.window == 24  # four epochs; the windows end with the run
     with torch.no_grad():
         scene.surfels["sv_rgb"] += 0.3
     damaged, _ = evaluate(scene, views, trainer.config)
@@ -85,7 +88,7 @@ def test_views_drawn_worse_than_before_take_the_run_back(make_scene, views):
         for _ in range(24):
             trainer.advance()
     assert evaluate(scene, views, trainer.config)[0] > damaged + 3 and damaged < good - 3
-    assert trainer.guard.rollbacks == 1
+    assert trainer.training.guard.rollbacks == 1
 
 
 def test_losses_are_compared_across_resolutions(make_scene, views):
@@ -94,9 +97,9 @@ def test_losses_are_compared_across_resolutions(make_scene, views):
     config.resolution_schedule, config.num_downscales = 12_000, 3
     trainer = Trainer(scene, views, config, 120)
     run(trainer, 119)
-    assert trainer.guard.rollbacks == 0 and math.isfinite(trainer.guard._best)
-    at_full_size = trainer.guard._loss_of(trainer.views, 1.0)
-    assert 0.5 * at_full_size < trainer.guard._best < 2 * at_full_size
+    assert trainer.training.guard.rollbacks == 0 and math.isfinite(trainer.training.guard._best)
+    at_full_size = trainer.training.guard._loss_of(trainer.training.views, 1.0)
+    assert 0.5 * at_full_size < trainer.training.guard._best < 2 * at_full_size
 
 
 def test_nothing_is_compared_with_before_where_the_resolution_changes_in_a_faded_scene(make_scene, views):
@@ -104,11 +107,11 @@ def test_nothing_is_compared_with_before_where_the_resolution_changes_in_a_faded
     config.resolution_schedule, config.num_downscales = 12_500, 1
     config.densify.min_reset_interval = 1  # resets after steps 12, 24, ...
     trainer = Trainer(scene, views, config, 120)
-    assert trainer.schedule.is_reset_step(48) and trainer.schedule.recovering(50)
-    trainer.guard.before(0, trainer.views)
-    trainer.guard._best = 0.1
-    trainer.guard._convert(49)
-    assert trainer.guard._best == math.inf
+    assert trainer.training.schedule.is_reset_step(48) and trainer.training.schedule.recovering(50)
+    trainer.training.guard.before(0, trainer.training.views)
+    trainer.training.guard._best = 0.1
+    trainer.training.guard._convert(49)
+    assert trainer.training.guard._best == math.inf
 
 
 def test_a_few_broken_surfels_are_dropped_and_counted(make_scene, views):
@@ -121,7 +124,7 @@ def test_a_few_broken_surfels_are_dropped_and_counted(make_scene, views):
         scene.surfels["quats"][7] = math.inf  # not drawn, no loss
     with pytest.warns(UserWarning, match="2 surfels were no longer finite and were dropped"):
         trainer.advance()
-    assert len(scene) == before - 2 and not describe_broken(scene) and trainer.guard.rollbacks == 0
+    assert len(scene) == before - 2 and not describe_broken(scene) and trainer.training.guard.rollbacks == 0
     run(trainer, 20)
 
 
@@ -154,7 +157,7 @@ def test_images_that_are_not_finite_are_named_and_nothing_goes_back(make_scene, 
     trainer = Trainer(scene, broken, config_of(), 120)
     with pytest.raises(TrainingDiverged, match="look for NaN in the images"):
         trainer.advance()
-    assert trainer.guard.rollbacks == 0
+    assert trainer.training.guard.rollbacks == 0
 
 
 def test_a_resumed_run_keeps_its_lowered_rates(make_scene, views):
@@ -166,7 +169,7 @@ def test_a_resumed_run_keeps_its_lowered_rates(make_scene, views):
     run(trainer, 2)
     resumed = Trainer(make_scene(every=5), views, config, 120)
     resumed.load_state_dict(trainer.state_dict())
-    assert (resumed.guard.factor, resumed.guard.rollbacks) == (pytest.approx(0.3), 1)
+    assert (resumed.training.guard.factor, resumed.training.guard.rollbacks) == (pytest.approx(0.3), 1)
     run(resumed, 10)
     run(trainer, 10)
     torch.testing.assert_close(resumed.scene.surfels["means"], trainer.scene.surfels["means"], rtol=1e-4, atol=1e-6)

@@ -7,8 +7,8 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig, TrainConfig
+from bitymi_ns.train.fit import fit
 from bitymi_ns.train.losses import error_weight, mean_psnr, mean_where_right, objective, photometric, psnr
-from bitymi_ns.train.trainer import fit
 
 
 @pytest.fixture

@@ -14,10 +14,10 @@ from bitymi_ns.train import strategy as module
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.init import surfels_from_points
+from bitymi_ns.train.optimizers import make_optimizers
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.score import Scores
 from bitymi_ns.train.strategy import Strategy, most_surfels
-from bitymi_ns.train.trainer import make_optimizers
 
 DENSIFY, RESET, FINAL, LATE_DENSIFY = 1000, 3000, 18_000, 4000
 LARGE, SMALL = math.log(0.01), math.log(0.0001)  # against dense * extent = 0.001

@@ -12,9 +12,11 @@ import torch
 import bitymi_ns.train
 from bitymi_ns.train.config import DensifyConfig, LossConfig, TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.trainer import Trainer, evaluate, fit, training_step
-from bitymi_ns.train.views import View
+from bitymi_ns.train.step import view_losses
+from bitymi_ns.train.views import View, at_size
 
 
 def test_a_short_run_is_a_proper_run(make_scene, views):
@@ -64,7 +66,7 @@ def test_the_field_learns_on_its_steps_only(make_scene, views):
     schedule = Schedule(config, 600)
     for step, learns in ((0, True), (99, True), (101, False), (110, True)):
         scene.zero_grad(set_to_none=True)
-        terms, output = training_step(scene, *views[0], schedule, step, config)
+        terms, output = view_losses(scene, views[0], schedule, step, config)
         sum(terms.values()).backward()
         assert (scene.field.field_w3.grad is not None) == learns
         assert scene.surfels["means"].grad is not None
@@ -76,7 +78,7 @@ def test_the_falloff_loss_moves_what_the_option_says(make_scene, views):
     for gradient in ("full", "beta_only"):
         scene = make_scene(texture=False)
         config = TrainConfig(resolution_schedule=0, loss=LossConfig(falloff_gradient=gradient))
-        terms, _ = training_step(scene, *views[0], Schedule(config, 100), 3, config)
+        terms, _ = view_losses(scene, views[0], Schedule(config, 100), 3, config)
         terms["falloff"].backward()
         falloff[gradient] = terms["falloff"]
         moved[gradient] = {n for n, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()}
@@ -88,10 +90,11 @@ def test_low_resolution_steps_take_either_picture(make_scene, views):
     scene, config = make_scene(texture=False), TrainConfig()
     schedule = Schedule(config, 3000)
     camera, image, _ = views[0]
-    terms, output = training_step(scene, camera, image, None, schedule, 0, config)
+    reduced = camera.scaled(schedule.resolution_factor(0))
+    terms, output = view_losses(scene, at_size(views[0], reduced, "cpu"), schedule, 0, config)
     assert output.rgb.shape == (12, 12, 3)
-    small = image.reshape(12, 4, 12, 4, 3).mean((1, 3))
-    again, _ = training_step(scene, camera, small, None, schedule, 0, config)
+    small = View(camera, image.reshape(12, 4, 12, 4, 3).mean((1, 3)))
+    again, _ = view_losses(scene, at_size(small, reduced, "cpu"), schedule, 0, config)
     torch.testing.assert_close(again["photometric"], terms["photometric"])
 
 
@@ -107,7 +110,7 @@ def test_images_with_alpha_and_bytes_and_masks(make_scene, views):
     mask[10:] = True
     results = []
     for picture in (rgba, white, (rgba * 255).round().to(torch.uint8)):
-        terms, _ = training_step(scene, camera, picture, mask, schedule, 3, config)
+        terms, _ = view_losses(scene, View(camera, picture, mask), schedule, 3, config)
         results.append(terms["photometric"].item())
     assert results[0] == pytest.approx(results[1], abs=1e-6)
     assert results[0] == pytest.approx(results[2], abs=2e-3)

@@ -1,0 +1,68 @@
+"""How well a scene shows views that it was not trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.losses import mean_psnr, psnr
+from bitymi_ns.train.views import View
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import RenderOutput, Scene
+
+
+class Quality(NamedTuple):
+    """Means over views; NaN without views that count.
+
+    Attributes:
+        psnr: dB, over the views of which any pixel counts.
+        fragments: blended fragments per view.
+    """
+
+    psnr: float
+    fragments: float
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """At most `most` (0 = all) of the numbers below `count`, evenly spaced, the first and the last among them."""
+    used = count if most <= 0 else min(count, most)
+    return sorted({round(i * (count - 1) / max(1, used - 1)) for i in range(used)})
+
+
+@torch.no_grad()
+def held_out_quality(
+    render: Callable[[Camera], RenderOutput], views: Sequence[View], background: Tensor | None, device: torch.device
+) -> Quality:
+    """Compare renders with photographs, one view after the other: only one fragment list is there at a time.
+
+    Args:
+        render: draws a camera over the background.
+        views: at full size; each is asked for once.
+        background: [3] colour behind the scene; None = black.
+        device: of the renders.
+    """
+    values, fragments = [], []
+    for view in views:
+        output = render(view.camera.to(device))
+        target = view.target(background, device)
+        values.append(psnr(output.rgb.clamp(0.0, 1.0), target, None if view.mask is None else view.mask.to(device)))
+        fragments.append(len(output.fragments))
+        del output  # with its fragments, before the next view makes its own
+    return Quality(mean_psnr(values), sum(fragments) / len(fragments) if fragments else math.nan)
+
+
+def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Quality:
+    """`held_out_quality` of a trained scene over the background of evaluation: white where training has it, else black,
+    also where training draws a new one at each step."""
+    device = scene.surfels["means"].device
+    background = torch.ones(3, device=device) if config.background == "white" else None
+    return held_out_quality(
+        lambda camera: scene.render(camera, background=background, field_mode="frozen"), views, background, device
+    )

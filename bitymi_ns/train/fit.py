@@ -1,0 +1,165 @@
+"""Training with torch alone, for benchmarks and tests; nerfstudio's loop makes the same steps."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.optimizers import make_optimizers
+from bitymi_ns.train.step import Training
+from bitymi_ns.train.views import View, training_order
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import RenderOutput, Scene
+
+
+@dataclass
+class LogEntry:
+    """The state of a run after `step` steps."""
+
+    step: int
+    seconds: float
+    """Wall-clock time of training, without evaluation."""
+    cpu_seconds: float
+    """Processor time of training over all threads, without evaluation."""
+    surfels: int
+    fragments: float
+    """Blended fragments per view, mean over the evaluation views."""
+    loss: float
+    """Of the last training step."""
+    psnr: float
+    """dB, mean over the evaluation views at full size; NaN without such views."""
+
+
+@dataclass
+class TrainLog:
+    """What happened in a run."""
+
+    entries: list[LogEntry] = field(default_factory=list)
+    events: list[dict[str, float]] = field(default_factory=list)
+    """Reports of the strategy, each with its `step`."""
+
+
+class Trainer:
+    """One training run, step by step.
+
+    Attributes:
+        training: the run.
+        step: number of steps done.
+        loss: objective of the last step; on a CUDA device, reading it waits for the step to end.
+    """
+
+    def __init__(
+        self, scene: Scene, views: Sequence[View], config: TrainConfig, max_steps: int, extent: float | None = None
+    ) -> None:
+        """
+        Args:
+            scene: changed in place.
+            views: training views at full size.
+            config: training options.
+            max_steps: length of the run; the schedules depend on it.
+            extent: scene extent in world units; default: from the cameras.
+        """
+        if not views:
+            raise ValueError("there is nothing to train on: no views")
+        if extent is None:
+            centers = torch.stack([view.camera.center for view in views])
+            extent = scene_extent(centers, scene.surfels["means"])
+        self.scene, self.config = scene, config
+        self.optimizers = make_optimizers(scene)
+        pixels = sum(view.camera.width * view.camera.height for view in views)
+        self.training = Training(scene, views, self.optimizers, config, max_steps, extent, pixels)
+        self.step = 0
+        self._views = len(views)
+        self._loss = torch.tensor(math.nan)
+
+    def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
+        """Do one step: the terms of its loss, the rendered view, and what the strategy did after it."""
+        self.training.begin(self.step)
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        view = self.training.view(training_order(self._views, self.config.seed, self.step))
+        terms, output = self.training.losses(view)
+        total = torch.stack(list(terms.values())).sum()
+        if total.requires_grad:
+            total.backward()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+        report = self.training.finish()
+        self._loss = total.detach()
+        self.step += 1
+        return terms, output, report
+
+    @property
+    def loss(self) -> float:
+        return self._loss.item()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that an exact resume needs: tensors, numbers and text only."""
+        return {
+            "step": self.step,
+            "max_steps": self.training.schedule.max_steps,
+            "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
+            "optimizers": {name: copy.deepcopy(optimizer.state_dict()) for name, optimizer in self.optimizers.items()},
+            "training": self.training.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was taken; the run has the same options, views and length."""
+        max_steps = self.training.schedule.max_steps
+        if state["max_steps"] != max_steps:
+            raise ValueError(f"the run had {state['max_steps']} steps, this one has {max_steps}")
+        self.scene.resize(len(state["scene"]["surfels.means"]))
+        self.scene.load_state_dict(state["scene"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
+        self.training.load_state_dict(state["training"])
+        self.step = state["step"]
+
+
+def fit(
+    scene: Scene,
+    views: Sequence[View],
+    eval_views: Sequence[View],
+    config: TrainConfig,
+    max_steps: int,
+    callback: Callable[[Trainer, dict[str, Tensor], RenderOutput, dict[str, float]], None] | None = None,
+    eval_steps: Sequence[int] = (),
+    extent: float | None = None,
+) -> TrainLog:
+    """Train a scene in place.
+
+    Args:
+        scene: what is learned.
+        views: training views at full size.
+        eval_views: held-out views for the log.
+        config: training options.
+        max_steps: length of the run.
+        callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
+        eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.
+        extent: scene extent in world units; default: from the cameras.
+    """
+    trainer = Trainer(scene, views, config, max_steps, extent)
+    clock, log = trainer.training.clock, TrainLog()
+    due = {*eval_steps, max_steps}
+    while trainer.step < max_steps:
+        terms, output, report = trainer.advance()
+        if report:
+            log.events.append({"step": trainer.step - 1, **report})
+        if trainer.step in due:
+            trainer.training.watch.finish(scene)
+            quality, fragments = evaluate(scene, eval_views, config)
+            times = (clock.seconds, clock.cpu_seconds)
+            log.entries.append(LogEntry(trainer.step, *times, len(scene), fragments, trainer.loss, quality))
+        if callback is not None:
+            callback(trainer, terms, output, report)
+    return log

@@ -6,6 +6,8 @@
 #              [METHODS="bitymi bitymi-quality"] [PLANS="atlas overdraw"]
 # make sanitize  the kernels' tests under the address and undefined-behaviour sanitizers (minutes)
 # make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
+# make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
+#              with the committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
@@ -32,7 +34,7 @@ CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test wheel-test sanitize bench lint format clean
+.PHONY: setup demo test gate gate-accept wheel-test sanitize bench lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -82,6 +84,9 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -q
+
+gate gate-accept: setup
+	$(BIN)/python benchmarks/gate.py $(if $(DATA),--capture "$(DATA)") $(if $(filter %-accept,$@),--accept)
 
 wheel-test: setup
 	$(BIN)/python scripts/wheel_test.py

@@ -37,6 +37,11 @@ class Capture:
     points: Tensor
     colours: Tensor
 
+    @property
+    def views(self) -> list[View]:
+        """All of them."""
+        return [*self.train, *self.held_out]
+
 
 def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture:
     """Reads an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and

@@ -1,0 +1,101 @@
+"""The gate: what it lets pass and what it does not."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+GOOD = {
+    "psnr_neural": 20.0, "psnr_baked": 21.0, "bundle_bytes": 1000.0, "surfels": 100.0, "fragments_per_pixel": 10.0,
+    "peak_mb": 500.0, "train": 80.0, "bake": 40.0, "frame": 0.5,
+}  # fmt: skip
+
+
+@pytest.fixture
+def gate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(FOLDER))
+    spec = importlib.util.spec_from_file_location("gate", FOLDER / "gate.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "gate", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *measured: Any, accept: bool = False) -> int:
+    """Runs the gate on measurements that are given, one after the other; how many of them it asked for."""
+    left = [{"room": {**GOOD, **change}} for change in measured]
+    monkeypatch.setattr(gate, "measure", lambda *_: left.pop(0))
+    monkeypatch.setattr(sys, "argv", ["gate.py", "--baseline", str(baseline), *(["--accept"] if accept else [])])
+    gate.main()
+    return len(measured) - len(left)
+
+
+def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    baseline = tmp_path / "gate.json"
+    run(gate, monkeypatch, baseline, {}, accept=True)
+    assert json.loads(baseline.read_text())["scenes"]["room"]["psnr_neural"] == 20.0
+    assert run(gate, monkeypatch, baseline, {}) == 1
+    assert run(gate, monkeypatch, baseline, {"psnr_neural": 25.0, "bundle_bytes": 10.0, "train": 1.0}) == 1
+
+
+@pytest.mark.parametrize(
+    ("figure", "passes", "fails"),
+    [
+        ("psnr_neural", 19.96, 19.94),
+        ("psnr_baked", 20.96, 20.94),
+        ("bundle_bytes", 1029.0, 1031.0),
+        ("surfels", 102.9, 103.1),
+        ("fragments_per_pixel", 10.29, 10.31),
+        ("peak_mb", 549.0, 551.0),
+        ("train", 91.0, 93.0),
+        ("bake", 45.0, 47.0),
+        ("frame", 0.57, 0.58),
+    ],
+)
+def test_each_limit(
+    gate: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    figure: str,
+    passes: float,
+    fails: float,
+    capsys: Any,
+) -> None:
+    baseline = tmp_path / "gate.json"
+    run(gate, monkeypatch, baseline, {}, accept=True)
+    run(gate, monkeypatch, baseline, {figure: passes})
+    with pytest.raises(SystemExit, match="1 of 9 figures are worse"):
+        run(gate, monkeypatch, baseline, {figure: fails}, {figure: fails})
+    assert capsys.readouterr().out.count("WORSE") == 1
+
+
+def test_times_are_taken_again_and_not_judged_elsewhere(
+    gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    baseline = tmp_path / "gate.json"
+    run(gate, monkeypatch, baseline, {}, accept=True)
+    assert run(gate, monkeypatch, baseline, {"train": 200.0}, {}) == 2
+    with pytest.raises(SystemExit, match="1 of 9"):
+        run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_neural": 21.0}, {"train": 120.0})
+    stated = json.loads(baseline.read_text())
+    baseline.write_text(json.dumps({**stated, "processor": "another one"}))
+    assert run(gate, monkeypatch, baseline, {"train": 200.0}) == 1
+    with pytest.raises(SystemExit, match="1 of 9"):
+        run(gate, monkeypatch, baseline, {"surfels": 200.0})
+
+
+def test_a_baseline_of_another_job_is_refused(
+    gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    baseline = tmp_path / "gate.json"
+    run(gate, monkeypatch, baseline, {}, accept=True)
+    stated = json.loads(baseline.read_text())
+    stated["settings"]["steps"] += 1
+    baseline.write_text(json.dumps(stated))
+    with pytest.raises(SystemExit, match="the baseline is of"):
+        run(gate, monkeypatch, baseline, {})

@@ -18,10 +18,13 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
     if not os.path.lexists(folder):
         return
     if not folder.is_dir():
-        raise BundleError(f"{folder} exists and is not a folder")
+        what = "a link to nothing" if folder.is_symlink() and not folder.exists() else "not a folder"
+        raise BundleError(f"{folder} is {what}; choose another place")
     if not any(folder.iterdir()):
         return
-    if not overwrite:
-        raise BundleError(f"{folder} exists; choose another folder, or overwrite it (overwrite=True)")
     if not (folder / MANIFEST).is_file():
-        raise BundleError(f"{folder} is not a bundle (it has no {MANIFEST}); it is not overwritten")
+        raise BundleError(
+            f"{folder} is not a bundle (it has no {MANIFEST}) and is not overwritten; choose another place"
+        )
+    if not overwrite:
+        raise BundleError(f"{folder} is a bundle already; choose another place, or replace it (--overwrite True)")

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 from bitymi_ns.bake.ktx2 import Format
 from bitymi_ns.bake.limits import EXTENTS
+from bitymi_ns.bake.packing import check_page
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Profile, RangeRule, bc7_encoder
+from bitymi_ns.bake.resolution import check_sides
 from bitymi_ns.ops.constants import SUPPORT
 
 
@@ -65,6 +67,14 @@ class BakeOptions:
         for name in ("range_samples", "chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.seed < 0:
+            raise ValueError(f"the seed must not be negative, it is {self.seed}")
+        check_sides(self.r_min, self.r_max)
+        check_page(self.page_width, self.page_rows)
+        if self.r_max > self.page_width or self.page_rows % self.r_max:
+            raise ValueError(
+                f"tiles of r_max = {self.r_max} texels do not fit pages of {self.page_width} x {self.page_rows} texels"
+            )
         if self.format not in BYTES_PER_TEXEL:
             raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {self.format!r}")
         if self.format == "bc7":

@@ -119,11 +119,20 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
     return Packing(tiles, width, height, -(-rows // height), area / (width * height * -(-rows // height)))
 
 
-def _check_sizes(sizes: npt.NDArray[np.int64], page_width: int, max_rows: int) -> None:
+def check_page(page_width: int, max_rows: int) -> None:
+    """Refuse sizes that no page can have.
+
+    Raises:
+        ValueError: says which.
+    """
     if page_width < GRID or page_width & (page_width - 1):
         raise ValueError(f"the page width must be a power of two of at least {GRID}, not {page_width}")
     if max_rows < ROWS or max_rows % ROWS:
         raise ValueError(f"the page height must be a multiple of {ROWS}, not {max_rows}")
+
+
+def _check_sizes(sizes: npt.NDArray[np.int64], page_width: int, max_rows: int) -> None:
+    check_page(page_width, max_rows)
     tiled = sizes.any(axis=1)
     bad = tiled & ((sizes < GRID) | (sizes & (sizes - 1) != 0)).any(axis=1)
     if bad.any():

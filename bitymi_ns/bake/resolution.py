@@ -47,6 +47,19 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
     return (cos2 / radial.square() + (1 - cos2) / tangential.square()).rsqrt()
 
 
+def check_sides(r_min: int, r_max: int) -> None:
+    """Refuse smallest and largest sides of tiles that are not powers of two >= 4, or the wrong way round.
+
+    Raises:
+        ValueError: says which.
+    """
+    for name, value in (("r_min", r_min), ("r_max", r_max)):
+        if value < 4 or value & (value - 1):
+            raise ValueError(f"{name} must be a power of two of at least 4 (a BC7 block is 4 x 4 texels), not {value}")
+    if r_min > r_max:
+        raise ValueError(f"r_min {r_min} is larger than r_max {r_max}")
+
+
 def nyquist_resolution(
     scales: Tensor,
     delta: Tensor,
@@ -70,11 +83,7 @@ def nyquist_resolution(
     Returns:
         [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
     """
-    for name, value in (("r_min", r_min), ("r_max", r_max)):
-        if value < 4 or value & (value - 1):
-            raise ValueError(f"{name} must be a power of two of at least 4 (a BC7 block is 4 x 4 texels), not {value}")
-    if r_min > r_max:
-        raise ValueError(f"r_min {r_min} is larger than r_max {r_max}")
+    check_sides(r_min, r_max)
     resolution = next_power_of_two(4.0 * extent * scales / delta)  # [N, 2]
     if max_pixels is not None:
         if max_pixels.dim() == 1:

@@ -94,7 +94,9 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         tail = "\n".join(log.read_text("utf8", "replace").splitlines()[-TAIL:])
-        raise CommandFailed(f"{shlex.join(command)} ended with status {process.returncode}; end of {log}:\n{tail}")
+        raise CommandFailed(
+            f"{shlex.join(command)} ended with status {process.returncode}; see {log}, whose end is:\n{tail}"
+        )
     kibibytes = usage.ru_maxrss if sys.platform != "darwin" else usage.ru_maxrss / 1024
     return Cost(time.perf_counter() - start, usage.ru_utime + usage.ru_stime, int(kibibytes * 1024))
 

@@ -178,5 +178,5 @@ def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[st
     if len(matrix.bundles) > 1:
         body += "\n\n" + bundles_table(matrix, cells)
         notes += BUNDLE_NOTES
-    failed = [f"Failed: {line.splitlines()[0]}" for line in failures]
+    failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
     return page(title, body, [*notes, *failed], commits)

@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.host.cameras import to_camera
+from bitymi_ns.host.capture_print import capture_print, warn_of_another
 from bitymi_ns.host.curve import FILE, TrainingCurve, points
-from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.memory import state_training
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import bounds
@@ -75,14 +76,17 @@ class TrainingRun:
                 extent,
                 metadata["train_pixels"],
                 self._on_resize,
-                self._announce,
+                warn,
             )
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
+        self.capture = capture_print(self.datamanager.train_dataset)
         self._random_state: Tensor | None = None
         if resume_state:
             self.training.load_state_dict(resume_state)
             self._random_state = resume_state["random"]
+            if "capture" in resume_state:  # checkpoints of earlier versions have none
+                warn_of_another(resume_state["capture"], self.capture)
         self.curve_steps = points(self.total, curve_points)
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
@@ -96,7 +100,7 @@ class TrainingRun:
         }
         self._held_back = False  # whether it was said that densification meets its bound
         for sentence in bounds.short_run(self.training.schedule, len(self.datamanager.train_dataset)):
-            CONSOLE.print(sentence, soft_wrap=True)
+            say(sentence)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
         if self.curve_steps:
             _ = self.datamanager.cached_eval
@@ -134,7 +138,7 @@ class TrainingRun:
 
     def state(self) -> dict[str, Any]:
         """Everything beside parameters and optimisers that decides how the run goes on."""
-        return {**self.training.state_dict(), "random": torch.get_rng_state()}
+        return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
 
     # a step
 
@@ -163,7 +167,7 @@ class TrainingRun:
         if report.get("held_back") and not self._held_back:
             self._held_back = True
             most = self.training.strategy.most
-            self._announce(bounds.held_back(int(report["held_back"]), most, self.config))
+            warn(bounds.held_back(int(report["held_back"]), most, self.config))
         if report:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
         if step in self.curve_steps:
@@ -175,9 +179,6 @@ class TrainingRun:
             "learning rates (--pipeline.model.train.lr.*) may help.",
             error,
         )
-
-    def _announce(self, text: str) -> None:
-        CONSOLE.print(f"[bold yellow]{text}", soft_wrap=True)
 
     def _on_resize(self, name: str, parameter: Parameter) -> None:
         self._parameters[name] = [parameter]  # used by gradient clipping

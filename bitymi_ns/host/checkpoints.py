@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from bitymi_ns.files import complete_file, reason
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.scene.config import SceneConfig
 
 EXTRA_STATE = "_extra_state"
@@ -77,6 +77,9 @@ def newest_step(folder: Path) -> int:
             "Give the nerfstudio_models folder of a run: --load-dir outputs/.../nerfstudio_models"
         )
     steps = [int(p.stem[5:]) for p in folder.glob("step-*.ckpt") if p.stem[5:].isdigit()]
+    deeper = next((p.parent for p in sorted(folder.glob("*/step-*.ckpt"))), None)
+    if not steps and deeper is not None:
+        fail(f"{folder} holds no checkpoint itself; they are in {deeper}: --load-dir {deeper}")
     if not steps:
         fail(f"{folder} holds no checkpoint (step-*.ckpt); the run was stopped before it saved one. Train again.")
     return max(steps)
@@ -89,6 +92,10 @@ def path_of(folder: Path, step: int) -> Path:
 
 def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     """Read a checkpoint of a run whose scene is of this kind."""
+    if path.is_dir():
+        fail(
+            f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or a folder with --load-dir"
+        )
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
     try:
@@ -107,7 +114,11 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
             f"{_first_line(error)}. {way_out}.",
             error,
         )
-    if not isinstance(state, dict) or not {"step", "pipeline", "optimizers"} <= state.keys():
+    if (
+        not isinstance(state, dict)
+        or not {"step", "pipeline", "optimizers"} <= state.keys()
+        or not isinstance(state["step"], int)
+    ):
         fail(f"{path} is not a nerfstudio checkpoint")
     _check_scene(state["pipeline"], scene, path)
     return state
@@ -120,15 +131,18 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
         fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with the method it is from.")
     if extra.get("version", 0) > STATE_VERSION:
         fail(f"{path} is from a newer bitymi-ns; update it to load this checkpoint")
-    there, here = json.loads(extra["scene"]), dataclasses.asdict(scene)
+    try:
+        there, here = dict(json.loads(extra["scene"])), dataclasses.asdict(scene)
+    except (ValueError, TypeError, KeyError) as error:
+        fail(f"the checkpoint {path} was altered: it does not say what its scene is made of. Train again.", error)
     different = [k for k in there if k in here and k not in MAY_DIFFER and there[k] != here[k]]
     if different:
-        listed = "\n".join(
+        lines = "\n".join(
             f"  --pipeline.model.scene.{k.replace('_', '-')}: {there[k]} there, {here[k]} here" for k in different
         )
         fail(
             f"the checkpoint {path} was trained with another preset:\n"
-            f"{listed}\n"
+            f"{lines}\n"
             "Use the method that it was trained with (see the config.yml beside its nerfstudio_models folder)."
         )
     rows = {name: len(value) for name, value in parameters.items() if name.startswith("_model." + SURFELS)}
@@ -138,6 +152,15 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
             f"the checkpoint {path} was altered: its parameters differ in their number of surfels ({counts}). Train "
             "again."
         )
+    if not all(rows.values()):
+        fail(f"the checkpoint {path} holds no surfels. Train again.")
+    broken = [
+        name.removeprefix("_model.")
+        for name, value in parameters.items()
+        if isinstance(value, torch.Tensor) and value.is_floating_point() and not bool(value.isfinite().all())
+    ]
+    if broken:
+        warn(f"The checkpoint {path} holds numbers that are not finite, in {listed(broken)}: expect holes, or black.")
 
 
 def _first_line(error: BaseException) -> str:

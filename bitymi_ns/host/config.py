@@ -14,8 +14,6 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host import checkpoints, run_folder
@@ -24,13 +22,16 @@ from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels, why_not_cuda
-from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.host.pipeline import BitymiPipelineConfig
 from bitymi_ns.host.preset import Preset, load_preset
 from bitymi_ns.host.trainer import BitymiTrainer
 from bitymi_ns.host.viewer import LOOPBACK, adopt_viewer
 from bitymi_ns.train.config import AdamConfig
+
+SEEDS = 1 << 32
+"""numpy takes seeds below this."""
 
 
 @dataclass
@@ -68,6 +69,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
         super().set_timestamp()
+        if not 0 <= self.machine.seed < SEEDS:
+            fail(f"--machine.seed must be from 0 to {SEEDS - 1}, not {self.machine.seed}")
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
@@ -84,12 +87,14 @@ class BitymiTrainerConfig(TrainerConfig):
         folder that cannot be used shows here. What can be checked before anything is written is checked now."""
         check_capture(self.pipeline.datamanager)
         folder = self.get_base_dir()
+        if self.load_dir is None and self.load_checkpoint is None:
+            run_folder.check_unused(folder, self.get_checkpoint_dir())
         run_folder.take(folder)
         try:
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         except OSError as error:
             fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
-        CONSOLE.print(escape(self.summary()), soft_wrap=True)
+        say(self.summary())
 
     def summary(self) -> str:
         """Method, capture, length, device and output folder of the run, a line each."""

@@ -28,6 +28,11 @@ def fail(message: str, cause: BaseException | None = None) -> NoReturn:
     raise InputError(message) from cause
 
 
+def say(message: str) -> None:
+    """Tell the user something, in one line however long it is; brackets in it are no markup."""
+    CONSOLE.print(escape(message), soft_wrap=True)
+
+
 def warn(message: str) -> None:
     """Tell the user about something that goes on without what it should have had."""
     CONSOLE.print(f"[bold yellow]{escape(message)}", soft_wrap=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
+from rich.markup import escape
 from rich.table import Table
 
 from bitymi_ns.bake import BakeOptions, BundleError, TuneOptions, bake, export, read_bundle, rich_progress, tune_atlas
@@ -29,7 +31,7 @@ from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.preset import build, load_preset
@@ -68,29 +70,42 @@ class ExportAtlas(BakeOptions):
     def main(self) -> None:
         """Run the export."""
         earlier = None
+        bake_options, tune_options = self._options()
         try:
             with bundle_place(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 check_room(self.output_dir, self.load_config, self, self.exact)
-                self._run()
+                self._run(bake_options, tune_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
             state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
-            CONSOLE.print(f"[bold yellow]The export was interrupted; the bundle {self.output_dir} {state}.")
+            warn(f"The export was interrupted; the bundle {self.output_dir} {state}.")
             raise SystemExit(INTERRUPTED) from None
         except BundleError as error:
             fail(str(error), error)
 
-    def _run(self) -> None:
+    def _options(self) -> tuple[BakeOptions, TuneOptions]:
+        """Those of bake and fine-tuning; stops where one is out of its range, before anything is loaded."""
+        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
+        if self.exact:
+            options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
+        if self.finetune_steps < 0:
+            fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
+        if not 0 <= self.finetune_memory <= 1e6:
+            fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
+        tune = TuneOptions(steps=self.finetune_steps, cache_bytes=int(self.finetune_memory * 1e9))
+        try:
+            options.check()
+        except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
+            fail(f"the scene cannot be baked: {error}", error)
+        return options, tune
+
+    def _run(self, options: BakeOptions, tune: TuneOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         outputs = datamanager.train_dataparser_outputs
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
-        if self.exact:
-            options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
-        tune = TuneOptions(steps=self.finetune_steps, cache_bytes=int(self.finetune_memory * 1e9))
         finetunes = self.finetune_steps != 0 and not self.exact and model.scene.field is not None
         if model.device.type == "cpu":
             state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
@@ -101,7 +116,7 @@ class ExportAtlas(BakeOptions):
                     held_out = datamanager.eval_views if self.compare else ()
                     background = model.background.cpu()
                     baked = tune_atlas(baked, datamanager.train_views, background, tune, progress, held_out)
-        except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
+        except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
         export(
@@ -138,6 +153,11 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
         config.load_step = step
         return config
 
+    if (load_config.parent / MANIFEST).is_file():
+        fail(
+            f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
+            "it was made from."
+        )
     if not load_config.is_file():
         fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
     try:
@@ -145,8 +165,10 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
     except (yaml.YAMLError, AttributeError, KeyError) as error:
         fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
     except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
-        detail = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        fail(f"the checkpoint of {load_config} cannot be loaded: {detail}", error)
+        detail = (str(error).strip().splitlines() or [""])[0]
+        if isinstance(error, AssertionError) and not detail:  # the host's word for another kind of file
+            fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
+        fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
     if not isinstance(pipeline.model, BitymiModel):
         fail(
             f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
@@ -222,7 +244,7 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
     """What was written, what was left out, and what it cost."""
     statistics = info["statistics"]
     surfels, texels = statistics["surfels"], statistics.get("texels")
-    table = Table("", "", title=f"Bundle {folder}", show_header=False)
+    table = Table("", "", title=escape(f"Bundle {folder}"), show_header=False)
     table.add_row("Surfels", f"{surfels['trained']:,} -> {info['surfels']['count']:,}")
     left_out = {k: v for k, v in surfels["left_out"].items() if v}
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
@@ -264,7 +286,7 @@ def print_summary(folder: Path, info: dict[str, Any]) -> None:
         table.add_row("Trained scene against photographs", f"{held_out['psnr_neural_against_photos']:.2f} dB")
         table.add_row("Bundle against photographs", f"{held_out['psnr_baked_against_photos']:.2f} dB")
     CONSOLE.print(table)
-    CONSOLE.print(f"Evaluate it with: ns-eval --load-config {folder / 'config.yml'}", soft_wrap=True)
+    say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
 
 
 def print_savings(table: Table, info: dict[str, Any]) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -19,7 +18,7 @@ from bitymi_ns.bake import Baked, BakeOptions, bake, rich_progress
 from bitymi_ns.bake.quantise import decode_pages
 from bitymi_ns.bench.machine import commit, machine, versions
 from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.host.target import see_writable
@@ -320,8 +319,8 @@ def measure_to_file(load_config: Path, output: Path, knobs: Sequence[str], views
         for point in measure(held_out, settings, repeats):
             lines.append(json.dumps({**asdict(point), **about, "against": KNOBS[point.knob], "made": origin}))
         name = f"{settings[0].knob} ({settings[-1].renderer})"
-        CONSOLE.print(f"{name}: {len(settings)} settings on {len(held_out.cameras)} views")
+        say(f"{name}: {len(settings)} settings on {len(held_out.cameras)} views")
     if not lines:
         fail("none of these knobs applies to this run: it has no texture")
     replace_file(output, ("\n".join(lines) + "\n").encode("utf8"))
-    CONSOLE.print(f"Wrote {output}", soft_wrap=True)
+    say(f"Wrote {output}")

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 
 import psutil
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.host.errors import warn
+from bitymi_ns.host.errors import say, warn
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
@@ -85,7 +84,7 @@ def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float)
 def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> None:
     """One line, and a warning where the machine has less."""
     photographs = f"{len(cameras)} training photographs of {cameras[0].width} x {cameras[0].height}"
-    CONSOLE.print(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.", soft_wrap=True)
+    say(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.")
     # what this process has taken already is a part of what it needs
     available = psutil.virtual_memory().available + psutil.Process().memory_info().rss
     if needed > available:

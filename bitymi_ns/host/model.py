@@ -21,6 +21,7 @@ from bitymi_ns.host.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View
 
 SURFEL_PARAMETERS = (
@@ -141,7 +142,12 @@ class BitymiModel(SurfelModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        return outputs["losses"]
+        """Of a training view what `get_outputs` found; of a held-out one, which nerfstudio asks for where
+        --steps-per-eval-batch is given, the photometric loss."""
+        if "losses" in outputs:
+            return outputs["losses"]
+        target, mask = self.photograph(batch, outputs["rgb"])
+        return {"photometric": photometric(outputs["rgb"], target, self.train_config.loss.ssim_weight, mask)}
 
     # checkpoints
 

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
 from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.files import reason
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.export import load_trained, replace_file
 from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.host.target import see_writable
@@ -135,4 +134,4 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     about = {"scene": config.experiment_name, "method": config.method_name}
     text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": listed}, indent=1)
     replace_file(output_dir / FILE, text.encode("utf8"))
-    CONSOLE.print(f"Wrote {len(listed)} views to {output_dir}", soft_wrap=True)
+    say(f"Wrote {len(listed)} views to {output_dir}")

@@ -10,6 +10,8 @@ from typing import Any
 
 import rich
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.errors import MarkupError
+from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -57,8 +59,12 @@ def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: A
     write = getattr(owner, name)
 
     def filtered(*said: Any, **options: Any) -> None:
-        if not (said and dropped(said[0])):
+        if said and dropped(said[0]):
+            return
+        try:
             write(*said, **{**always, **options})
+        except MarkupError:  # brackets in a path
+            write(*map(escape, map(str, said)), **{**always, **options})
 
     setattr(owner, name, filtered)
     try:

@@ -34,6 +34,21 @@ def take(folder: Path) -> None:
     files.remove_unfinished(folder)
 
 
+def check_unused(folder: Path, checkpoints: Path) -> None:
+    """Stop where a new run would mix with, and in time replace, the checkpoints of an earlier one.
+
+    Args:
+        folder: the run's.
+        checkpoints: the folder of its checkpoints.
+    """
+    there = sorted(checkpoints.glob("step-*.ckpt"))
+    if there:
+        fail(
+            f"{folder} holds a run already, its newest checkpoint is {there[-1].name}. To go on with it give "
+            f"--load-dir {checkpoints}; for a new run give another --timestamp, --experiment-name or --output-dir."
+        )
+
+
 def leave(folder: Path) -> None:
     """Let other processes train into the folder."""
     files.release(folder / LOCK)

@@ -6,10 +6,9 @@ from typing import Any
 
 import torch
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
@@ -60,9 +59,9 @@ def new_scene(
     for sentence in bounds.start(
         report, train.densify.max_surfels, metadata.get("train_pixels", 0), config.log2_table_size
     ):
-        CONSOLE.print(sentence, soft_wrap=True)
+        say(sentence)
     if report.random:
-        CONSOLE.print(f"The capture has no points: training starts from {report.random:,} random ones.")
+        say(f"The capture has no points: training starts from {report.random:,} random ones.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
         warn(

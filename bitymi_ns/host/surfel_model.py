@@ -96,16 +96,21 @@ class SurfelModel(Model):
         outputs = self.get_outputs(camera)
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
 
+    def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
+        """[H, W, 3] the batch's photograph over the background, and [H, W, 1] its mask, at the size of a render."""
+        height, width = rgb.shape[:2]
+        target = reduce_image(as_float(batch["image"].to(rgb.device)), width, height)
+        mask = batch.get("mask")
+        mask = None if mask is None else reduce_mask(mask.to(rgb.device), width, height)
+        return over_background(target, self.background), mask
+
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Quality of a held-out view, what it cost to draw, and photograph and render side by side."""
         rgb = outputs["rgb"]
         height, width = rgb.shape[:2]
-        target = reduce_image(as_float(batch["image"].to(rgb.device)), width, height)
-        target = over_background(target, self.background)
-        mask = batch.get("mask")
-        mask = None if mask is None else reduce_mask(mask.to(rgb.device), width, height)
+        target, mask = self.photograph(batch, rgb)
         metrics = image_metrics(rgb, target, mask)
         metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
         metrics.update(self.size_metrics())

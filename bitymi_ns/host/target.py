@@ -37,8 +37,7 @@ def bundle_place(folder: Path, overwrite: bool) -> Iterator[None]:
         except OSError as error:
             fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
         except BundleError as error:
-            hint = " Use --overwrite True to replace it." if not overwrite else ""
-            fail(f"{error}.{hint}", error)
+            fail(f"{error}.", error)
         yield
 
 

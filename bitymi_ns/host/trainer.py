@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import files
 from bitymi_ns.host import checkpoints, run_folder
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.quiet import quiet_host, quiet_warnings, step_bar
 
 INTERRUPTED = 130
@@ -61,7 +61,7 @@ class BitymiTrainer(Trainer):
                 path = Path(config.load_checkpoint)
             files.remove_unfinished(path.parent.parent)  # of the run that was killed
             self._restore(checkpoints.load(path, config.pipeline.model.scene), path)
-            CONSOLE.print(f"Resuming after step {self._start_step - 1} from {path}")
+            say(f"Resuming after step {self._start_step - 1} from {path}")
         config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
 
     def _restore(self, state: dict[str, Any], path: Path) -> None:
@@ -85,15 +85,15 @@ class BitymiTrainer(Trainer):
     def _train_to_the_end(self) -> None:
         total = self.config.max_num_iterations
         if self._start_step >= total:
-            CONSOLE.print(
-                f"[bold yellow]Nothing to do: the checkpoint has {self._start_step:,} of {total:,} steps. "
-                "For a longer run give a larger --max-num-iterations."
+            warn(
+                f"Nothing to do: the checkpoint has {self._start_step:,} of {total:,} steps. For a longer run give a "
+                "larger --max-num-iterations."
             )
             return
         # of every parameter a checkpoint holds the value and Adam's two moments
         run_folder.check_space(self.base_dir, 3 * sum(p.nbytes for p in self.pipeline.parameters() if p.requires_grad))
         if self._start_step > 0:
-            CONSOLE.print(f"{self.config.length()}, {total - self._start_step:,} of them left", soft_wrap=True)
+            say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         restore_handler = self._catch_interrupt()
         self.config.max_num_iterations = total - self._start_step
         try:
@@ -110,10 +110,11 @@ class BitymiTrainer(Trainer):
             restore_handler()
 
     def _catch_interrupt(self) -> Callable[[], None]:
-        """Let the first Ctrl-C end the run after the current step; returns what undoes that."""
+        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; returns what
+        undoes that."""
         if threading.current_thread() is not threading.main_thread():
             return lambda: None
-        previous = signal.getsignal(signal.SIGINT)
+        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
         def on_interrupt(number: int, frame: Any) -> None:
             if self._stop_requested or self.training_state == "completed":
@@ -121,8 +122,14 @@ class BitymiTrainer(Trainer):
             self._stop_requested = True
             CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
 
-        signal.signal(signal.SIGINT, on_interrupt)
-        return lambda: signal.signal(signal.SIGINT, previous)
+        for number in previous:
+            signal.signal(number, on_interrupt)
+
+        def restore() -> None:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+        return restore
 
     def _report_interruption(self) -> None:
         saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
@@ -130,7 +137,7 @@ class BitymiTrainer(Trainer):
             hint = f"The newest checkpoint is {saved[-1]}; resume with\n  --load-dir {self.checkpoint_dir}"
         else:
             hint = "No checkpoint had been written yet."
-        CONSOLE.print(f"[bold yellow]Training was interrupted.[/bold yellow] {hint}", soft_wrap=True)
+        warn(f"Training was interrupted. {hint}")
         raise SystemExit(INTERRUPTED)
 
     @check_main_thread
@@ -147,6 +154,6 @@ class BitymiTrainer(Trainer):
         }
         checkpoints.save(state, path, scratch=self.base_dir)
         if self.config.save_only_latest_checkpoint:
-            for other in self.checkpoint_dir.glob("*.ckpt"):
-                if other != path:
+            for other in self.checkpoint_dir.glob("step-*.ckpt"):
+                if other.name < path.name:  # later ones are of a run that this one branched off from
                     other.unlink(missing_ok=True)

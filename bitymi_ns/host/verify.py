@@ -24,6 +24,8 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         run: config.yml of the run, its folder, or one of its checkpoints.
         views: held-out views to render.
     """
+    if views < 1:
+        fail(f"--views must be at least 1, not {views}")
     config, step = find_run(run)
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
         _, pipeline = load_trained(config, step)
@@ -52,4 +54,6 @@ def find_run(run: Path) -> tuple[Path, int | None]:
         if not run.is_file() or not step.isdecimal():
             fail(f"there is no checkpoint {run}")
         return run.parent.parent / "config.yml", int(step)
+    if run.is_dir() and not (run / "config.yml").is_file() and (run.parent / "config.yml").is_file():
+        run = run.parent  # the folder of its checkpoints
     return (run / "config.yml" if run.is_dir() else run), None

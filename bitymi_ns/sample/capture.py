@@ -18,6 +18,7 @@ from bitymi_ns.sample.room import Hits, Room
 FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])
 BAND = 1 << 16  # rays traced at a time
+MADE_BY = "bitymi sample"  # in transforms.json: only such a folder is overwritten
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ def generate(
 
     Raises ValueError for sizes that make no picture, FileExistsError for a folder that already holds something.
     """
-    for name, value, least in (("views", views, 1), ("width", width, 8), ("height", height, 8), ("points", points, 0)):
+    limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
+    for name, (value, least) in limits.items():
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}")
     output_dir = Path(output_dir).absolute()
@@ -143,10 +145,20 @@ def generate(
             raise FileExistsError(f"{output_dir} is a file; choose another output folder")
         if output_dir.exists() and any(output_dir.iterdir()) and not overwrite:
             raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
+        if output_dir.exists() and any(output_dir.iterdir()) and not _is_sample(output_dir):
+            raise FileExistsError(f"{output_dir} is not a sample capture and is not replaced; choose another folder")
 
     with complete_folder(output_dir, check) as new:
         _write(new, views, width, height, seed, points, progress)
     return output_dir
+
+
+def _is_sample(folder: Path) -> bool:
+    """Whether the folder is one that `generate` wrote."""
+    try:
+        return json.loads((folder / "transforms.json").read_bytes()).get("made_by") == MADE_BY
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def _write(folder: Path, views: int, width: int, height: int, seed: int, points: int, progress: bool) -> None:
@@ -172,6 +184,7 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
                 raise
     write_ply(folder / "sparse_pc.ply", *sparse_points(room, path, images, points, seed))
     meta = {
+        "made_by": MADE_BY,
         "camera_model": "OPENCV",
         "w": width,
         "h": height,

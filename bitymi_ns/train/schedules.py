@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
+from bitymi_ns.train.options import check_ranges
 
 VIEW_COLOR = ("sv_rgb", "sh_dc", "sb_base", "sg_base")
 VIEW_SHAPE = ("sv_sites", "sv_log_tau", "sb_lobes", "sg_lobes")
@@ -39,8 +40,7 @@ class Schedule:
         self.max_steps = max_steps
         self.extent = float(extent)
         densify = config.densify
-        if densify.interval < 1 or densify.reset_interval < 1 or config.freeze_every < 1:
-            raise ValueError("densify.interval, densify.reset_interval and freeze_every must be at least 1")
+        check_ranges(config)
         # short runs leave events out, so that about the least number of steps lies between two
         reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)

@@ -179,7 +179,7 @@ def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainer
 
 def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerConfig, copied: Path) -> None:
     before = (copied / "bundle.json").read_bytes()
-    with pytest.raises(InputError, match="exists.*--overwrite True"):
+    with pytest.raises(InputError, match="is a bundle already.*--overwrite True"):
         run_export(trained, copied)
     assert (copied / "bundle.json").read_bytes() == before
     run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)
@@ -191,7 +191,49 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
     (tmp_path / "precious.txt").write_text("x")
     with pytest.raises(InputError, match="is not a bundle"):
         run_export(trained, tmp_path, overwrite=True)
-    assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
+    with pytest.raises(InputError, match="is not a bundle") as stop:
+        run_export(trained, tmp_path)
+    assert "--overwrite" not in str(stop.value)  # which would not help
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="link is a link to nothing"):
+        run_export(trained, tmp_path / "link")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "precious.txt"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"finetune_steps": -1}, "--finetune-steps must not be negative"),
+        ({"finetune_memory": math.inf}, "--finetune-memory must be from 0 to"),
+        ({"finetune_memory": math.nan}, "--finetune-memory must be from 0 to"),
+        ({"page_width": 100}, "page width must be a power of two"),
+        ({"r_max": 48}, "r_max must be a power of two"),
+        ({"r_max": 8192}, "do not fit pages"),
+        ({"seed": -1}, "seed must not be negative"),
+    ],
+)
+def test_options_out_of_range_are_found_before_the_work(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: Any, message: str
+) -> None:
+    monkeypatch.setattr(host_export, "load_trained", None)  # is not called
+    with pytest.raises(InputError, match=message):
+        run_export(trained, tmp_path / "b", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_brackets_in_a_path_are_no_markup(
+    trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "b [bold]" / "[" / "x]"
+    run_export(trained, folder, finetune_steps=0, compare=False)
+    said = "".join(capsys.readouterr().out.split())
+    assert f"--load-config'{folder}/config.yml'".replace(" ", "") in said
+
+
+def test_a_config_of_another_kind(tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_text("just text")
+    with pytest.raises(InputError, match="is not the configuration of a trained scene"):
+        host_export.load_trained(tmp_path / "config.yml")
 
 
 def test_ctrl_c_in_the_export_leaves_nothing(
@@ -342,7 +384,7 @@ def test_a_damaged_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> N
 
 
 def test_a_bundle_cannot_be_baked_again(bundle: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="which cannot be baked"):
+    with pytest.raises(InputError, match="which is baked already"):
         ExportAtlas(load_config=bundle / "config.yml", output_dir=tmp_path / "b").main()
 
 

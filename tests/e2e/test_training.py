@@ -88,28 +88,33 @@ def test_a_finished_run_is_not_touched_when_it_is_resumed(trained: BitymiTrainer
     assert not config.get_checkpoint_dir().exists()
 
 
-def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int, how: signal.Signals = signal.SIGINT) -> None:
     iterate = BitymiTrainer.train_iteration
 
     def train_iteration(self: BitymiTrainer, current: int) -> Any:
         if current == step:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), how)
         return iterate(self, current)
 
     monkeypatch.setattr(BitymiTrainer, "train_iteration", train_iteration)
 
 
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_saves_what_was_learned_and_says_how_to_go_on(
-    trained: BitymiTrainerConfig, start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    trained: BitymiTrainerConfig,
+    start: Start,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    how: signal.Signals,
 ) -> None:
     config = start(name="interrupted")
-    handler = signal.getsignal(signal.SIGINT)
+    handler = signal.getsignal(how)
     with monkeypatch.context() as patch:
-        interrupt_at(patch, 27)
+        interrupt_at(patch, 27, how)
         with pytest.raises(SystemExit) as stop:
             ns_train.main(config)
     assert stop.value.code == 130
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(how) is handler
     assert "--load-dir" in capsys.readouterr().out
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000027.ckpt"]
     resumed = start(name="resumed")
@@ -391,4 +396,64 @@ def test_no_points_and_an_empty_scene_box(room: Path, start: Start, tmp_path: Pa
     config = start(data=without_points(room, tmp_path))
     config.pipeline.datamanager.dataparser.scene_scale = 0.0
     with pytest.raises(InputError, match="scene box of the capture, .*, is empty. .*--scene-scale"):
+        ns_train.main(config)
+
+
+def test_a_new_run_keeps_out_of_the_folder_of_an_earlier_one(trained: BitymiTrainerConfig, start: Start) -> None:
+    config = start(name="run")
+    config.output_dir = trained.output_dir
+    with pytest.raises(
+        InputError, match="holds a run already, its newest checkpoint is step-000000059.ckpt.*--load-dir"
+    ):
+        ns_train.main(config)
+    assert len(list(trained.get_checkpoint_dir().glob("*.ckpt"))) == 3
+
+
+def test_a_run_that_branches_off_earlier_keeps_the_later_checkpoints(
+    trained: BitymiTrainerConfig, start: Start, tmp_path: Path
+) -> None:
+    config = start(name="branch")
+    shutil.copytree(trained.get_checkpoint_dir(), config.get_checkpoint_dir())
+    config.load_dir, config.load_step, config.max_num_iterations = config.get_checkpoint_dir(), 20, 41
+    config.steps_per_save = 100
+    ns_train.main(config)
+    assert [p.name for p in sorted(config.get_checkpoint_dir().iterdir())] == [
+        "step-000000040.ckpt", "step-000000059.ckpt"
+    ]  # fmt: skip
+
+
+def test_going_on_with_another_capture_is_said(
+    trained: BitymiTrainerConfig, room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def resumed(change: Callable[[dict[str, Any]], None], name: str) -> str:
+        data = tmp_path / name
+        shutil.copytree(room, data)
+        meta = json.loads((data / "transforms.json").read_text())
+        change(meta)
+        (data / "transforms.json").write_text(json.dumps(meta))
+        config = start(name=name, data=data)
+        config.load_dir, config.load_step, config.max_num_iterations = trained.get_checkpoint_dir(), 59, 61
+        capsys.readouterr()
+        ns_train.main(config)
+        return " ".join(capsys.readouterr().out.split())
+
+    def moved(meta: dict[str, Any]) -> None:
+        meta["frames"][3]["transform_matrix"][0][3] += 0.5
+
+    assert "another capture" not in resumed(lambda meta: None, "same")
+    assert "it had 10 training photographs, this one has 9" in resumed(lambda meta: meta["frames"].pop(), "fewer")
+    assert "its cameras stand elsewhere" in resumed(moved, "moved")
+
+
+def test_evaluation_of_batches_while_training(start: Start) -> None:
+    config = start(name="batches")
+    config.max_num_iterations, config.steps_per_eval_batch = 6, 2
+    ns_train.main(config)
+    assert config.get_checkpoint_dir().is_dir()
+
+
+def test_a_seed_that_numpy_does_not_take(start: Start) -> None:
+    config = start(name="seed")
+    config.machine.seed = -1
+    with pytest.raises(InputError, match="--machine.seed must be from 0 to 4294967295, not -1"):
         ns_train.main(config)

@@ -122,3 +122,32 @@ def test_a_full_disk(
         checkpoints.save({}, checkpoints.path_of(saved.parent, 9), scratch=saved.parent)
     assert [p.name for p in saved.parent.iterdir()] == ([saved.name] if earlier else [])
     assert not earlier or saved.read_bytes() == whole
+
+
+def test_the_folder_above_or_a_folder_for_a_file(saved: Path) -> None:
+    run = saved.parent / "run"
+    (run / "nerfstudio_models").mkdir(parents=True)
+    saved.rename(run / "nerfstudio_models" / saved.name)
+    with pytest.raises(InputError, match="they are in .*nerfstudio_models: --load-dir .*/run/nerfstudio_models"):
+        checkpoints.newest_step(run)
+    with pytest.raises(InputError, match=r"is a folder: give one of the files step-\*.ckpt with --load-checkpoint"):
+        checkpoints.load(saved.parent, SceneConfig())
+
+
+def test_altered_contents(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for change, message in (
+        ({"step": "seven"}, "is not a nerfstudio checkpoint"),
+        ({"pipeline": state(SceneConfig(), rows=0)["pipeline"]}, "holds no surfels"),
+    ):
+        torch.save(state(SceneConfig()) | change, saved)
+        refused(saved, message)
+    for scene in ("{", "[1]", "3"):
+        altered = state(SceneConfig())
+        altered["pipeline"]["_model._extra_state"]["scene"] = scene
+        torch.save(altered, saved)
+        refused(saved, "was altered: it does not say what its scene is made of")
+    broken = state(SceneConfig())
+    broken["pipeline"]["_model.scene.surfels.quats"][2, 1] = torch.nan
+    torch.save(broken, saved)
+    checkpoints.load(saved, SceneConfig())
+    assert "numbers that are not finite, in scene.surfels.quats" in " ".join(capsys.readouterr().out.split())

@@ -92,3 +92,9 @@ def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatc
         show_step(19)
         quiet.CONSOLE.print("a report")
     assert "20/40" in screen.getvalue() and "a report\n" in screen.getvalue()
+
+
+def test_brackets_in_what_the_host_says_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    with quiet.quiet_host():
+        CONSOLE.print("logging events to: o[/b]/run")
+    assert "o[/b]/run" in capsys.readouterr().out

@@ -161,13 +161,15 @@ def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
         generate(tmp_path, views=1)
     with pytest.raises(FileExistsError, match="is a file"):
         generate(tmp_path / "mine.txt", views=1)
+    with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
+        generate(tmp_path, views=1, width=16, height=12, overwrite=True)
     assert (tmp_path / "mine.txt").read_text() == "precious"
     folder = generate(tmp_path / "room", views=1, width=16, height=12, points=0)
     generate(folder, views=2, width=16, height=12, points=5, overwrite=True)
     assert len(list((folder / "images").iterdir())) == 2
 
 
-@pytest.mark.parametrize("bad", [{"views": 0}, {"width": 0}, {"height": -5}, {"points": -1}])
+@pytest.mark.parametrize("bad", [{"views": 0}, {"width": 0}, {"height": -5}, {"points": -1}, {"seed": -1}])
 def test_bad_sizes(tmp_path: Path, bad: dict) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be at least"):
         generate(tmp_path / "room", **bad)

@@ -9,9 +9,10 @@ from pathlib import Path
 if importlib.util.find_spec("bitymi_ns") is None:  # not installed, or not yet: gpu.py builds it
     sys.path.append(str(Path(__file__).resolve().parent.parent))
 
-from bitymi_ns.bench.commands import read_curve
-from bitymi_ns.bench.process import CommandFailed, say
-from bitymi_ns.bench.tables import difference, number, page, table
+from bitymi_ns.measure.bench.commands import read_curve
+from bitymi_ns.measure.bench.process import CommandFailed, say
+from bitymi_ns.measure.bench.tables import difference, number, page
+from bitymi_ns.measure.markdown import table
 
 __all__ = ["CommandFailed", "difference", "number", "page", "publish", "read_curve", "say", "table"]
 

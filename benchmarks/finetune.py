@@ -23,11 +23,10 @@ import yaml
 from common import number, page, publish, say, table
 
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, export, read_bundle, tune_atlas
-from bitymi_ns.bench.tables import difference
 from bitymi_ns.host.export import load_trained
 from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.host.preset import build, load_preset
-from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.measure.bench.tables import difference
 from bitymi_ns.train.views import View
 
 METRICS = ("psnr", "ssim", "flip")
@@ -40,7 +39,7 @@ def quality(baked: Baked, views: list[View], background: torch.Tensor) -> dict[s
     """Mean metrics of a bundle's pictures of the views."""
     with tempfile.TemporaryDirectory() as folder:
         export(baked, Path(folder) / "bundle", background=background.tolist())
-        scene = BakedScene.from_bundle(read_bundle(Path(folder) / "bundle"))
+        scene = read_bundle(Path(folder) / "bundle").scene
     rows = []
     for view in views:
         rgb = scene.render(view.camera, background).rgb.clamp(0.0, 1.0)
@@ -90,7 +89,7 @@ def main() -> int:
     rows = []
     for run in options.runs:
         rows += measure(run, options.formats, bake_options, TuneOptions(steps=options.finetune_steps))
-    publish(page("Fine-tuning the texels", table(HEADER, rows, 2)), options.output)
+    publish(page("Fine-tuning the texels", table(HEADER, rows, (0, 1))), options.output)
     return 0
 
 

@@ -144,7 +144,6 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     import torch
 
     from bitymi_ns.bake import BakeOptions, TuneOptions, bake, export, read_bundle, tune_atlas
-    from bitymi_ns.scene.baked import BakedScene
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
     from bitymi_ns.train.domain import build_scene
@@ -171,7 +170,7 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
         bundle = Path(folder) / "bundle"
         export(baked, bundle)
         size = sum(path.stat().st_size for path in bundle.iterdir())
-        drawn = BakedScene.from_bundle(read_bundle(bundle))
+        drawn = read_bundle(bundle).scene
     quality, units = [], []
     for view in capture.views:
         image, unit = calibration.timed(partial(drawn.render, view.camera, background))
@@ -298,8 +297,8 @@ def main() -> None:
         return
     from common import say, table
 
-    from bitymi_ns.bench.machine import processor
     from bitymi_ns.files import write_file
+    from bitymi_ns.measure.bench.machine import processor
 
     settings = Settings(options.steps, options.tuning, options.seeds)
     empty = {"settings": asdict(settings), "processor": processor(), "scenes": {}}
@@ -316,7 +315,7 @@ def main() -> None:
         lines = judge(found, baseline["scenes"], same_cpu)
         worse = [line for line in lines if line.verdict == "WORSE"]
     rows = [line.cells() for line in lines]
-    print(table(("scene", "figure", "baseline", "now", "change", "may be worse by", ""), rows, 2))
+    print(table(("scene", "figure", "baseline", "now", "change", "may be worse by", ""), rows, (0, 1, 6)))
     if not same_cpu:
         print(f"\nTimes are not judged: the baseline is of {baseline['processor']}, this is {processor()}.")
     if options.accept:

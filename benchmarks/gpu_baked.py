@@ -63,7 +63,7 @@ def frames(options: Options) -> str:
             rows.append(row)
         for folder in options.bundles:
             bundle = read_bundle(folder, decode=options.device.type != "cuda")
-            scene = BakedScene.from_bundle(bundle).to(options.device)
+            scene = bundle.scene.to(options.device)
             rows.append(
                 _row(f"{Path(folder).name}, {len(bundle):,}", scene, _around(bundle, width, height), options, rate)[0]
             )
@@ -153,7 +153,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
 
 def _around(bundle, width: int, height: int) -> list[Camera]:
     """Three cameras around the middle of a bundle, which training places in the ball of the cameras, of radius 1."""
-    middle = bundle.surfels["means"].median(dim=0).values
+    middle = bundle.scene.surfels["means"].median(dim=0).values
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     cameras = []
     for angle in (0.0, 2.1, 4.2):

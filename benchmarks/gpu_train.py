@@ -126,7 +126,7 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
     bake_seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         bake.export(made, Path(folder) / "bundle")
-        baked = BakedScene.from_bundle(bake.read_bundle(Path(folder) / "bundle"))
+        baked = bake.read_bundle(Path(folder) / "bundle").scene
     if cuda:
         baked = baked.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)

@@ -370,7 +370,7 @@ def main() -> int:
             f"({sizes.f / sizes.p:.1f} a pixel), {100 * sizes.t / sizes.f:.0f} % of them textured, {sizes.b:,} pairs "
             f"of surfel and tile ({sizes.r:,} with a fragment)\n"
         )
-        parts.append(title + "\n" + table(header, rows, 2))
+        parts.append(title + "\n" + table(header, rows, (0, 1)))
     notes = [
         f"Ceilings: {options.gflops:,.0f} GFLOP/s, {options.gbytes:,.0f} GB/s, {options.mloads:,.0f} M random loads/s, "
         f"of all cores (--gflops, --gbytes, --mloads); median of {options.runs} runs; {torch.get_num_threads()} "

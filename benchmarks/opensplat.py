@@ -109,7 +109,7 @@ def levels_table(runs: list[Run]) -> str:
                 number(reached.surfels, 0),
             ]
         rows.append(row)
-    return table(header, rows, 0)
+    return table(header, rows, ())
 
 
 def final_table(runs: list[Run]) -> str:

@@ -10,9 +10,9 @@ from typing import Annotated
 import tyro
 
 from bitymi_ns import KernelsUnavailable
-from bitymi_ns.bench.cli import BenchRun
-from bitymi_ns.bench.process import BenchError
 from bitymi_ns.files import explained
+from bitymi_ns.measure.bench.cli import BenchRun
+from bitymi_ns.measure.bench.process import BenchError
 
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
@@ -69,7 +69,7 @@ class Report:
     """Show the paper's tables with its published figures even when no scene of its data sets is in the input."""
 
     def run(self) -> None:
-        from bitymi_ns import report
+        from bitymi_ns.measure import report
 
         if not self.inputs:
             raise ValueError("nothing to report: name at least one JSON file that ns-eval wrote")
@@ -90,8 +90,8 @@ class Stability:
     """Kernels to measure."""
 
     def run(self) -> None:
-        from bitymi_ns.stability import page
-        from bitymi_ns.stability.backends import BACKENDS, missing
+        from bitymi_ns.measure.stability import page
+        from bitymi_ns.measure.stability.backends import BACKENDS, missing
 
         if self.backend not in BACKENDS:
             raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")
@@ -119,7 +119,7 @@ class BenchKnobs:
     """Timed renderings of each view; the median counts."""
 
     def run(self) -> int:
-        from bitymi_ns.host.knobs import measure_to_file
+        from bitymi_ns.measure.knobs import measure_to_file
 
         measure_to_file(self.load_config, self.output, self.knobs, self.views, self.repeats)
         return 0
@@ -137,7 +137,7 @@ class BenchPictures:
     """How many of the worst views."""
 
     def run(self) -> int:
-        from bitymi_ns.host.pictures import draw_worst
+        from bitymi_ns.measure.pictures import draw_worst
 
         draw_worst(self.load_config, self.output_dir, self.views)
         return 0

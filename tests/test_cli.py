@@ -50,7 +50,7 @@ def test_a_full_disk_is_named(
 
 
 def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import bitymi_ns.report
+    import bitymi_ns.measure.report
 
     seen = {}
 
@@ -58,7 +58,7 @@ def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         seen.update(inputs=inputs, output_dir=output_dir, title=title, published=published)
         return output_dir / "index.html"
 
-    monkeypatch.setattr(bitymi_ns.report, "build", build, raising=False)
+    monkeypatch.setattr(bitymi_ns.measure.report, "build", build, raising=False)
     assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
     expected = {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two", "published": False}
     assert seen == expected

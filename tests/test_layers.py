@@ -1,4 +1,5 @@
-"""A layer imports only what stands below it, and nerfstudio is known to the outermost one alone."""
+"""A layer imports only what stands below it, no two modules import each other, and nerfstudio is known to `host` and to
+what measures it alone."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -13,33 +15,94 @@ import pytest
 import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
-ORDER = ["ops", "scene", "stability", "train", "bake", "report", "bench", "host"]
-"""Innermost first. `report` reads files alone, `bench` runs commands; `host` takes the name of the machine from it."""
+ORDER = ["ops", "scene", "train", "bake", "host", "measure"]
+"""Innermost first. Beside them stand `files`, `presets` and `sample`, which import none of these."""
+KNOW_NERFSTUDIO = ("host", "measure/knobs.py", "measure/pictures.py")
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Modules that a file imports when it runs; those for the type checker alone are left out."""
-    pending: list[ast.AST] = [ast.parse(path.read_text("utf8"))]
+def name_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path): path for path in PACKAGE.rglob("*.py")}
+
+
+def imports(path: Path, text: str | None = None) -> Iterator[tuple[str, bool]]:
+    """Full names of what a module imports, relative ones and those for the type checker included, and whether it does
+    so when it is loaded itself: not within a function, and not for the type checker alone."""
+    name = name_of(path)
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    pending: list[tuple[ast.AST, bool]] = [(ast.parse(path.read_text("utf8") if text is None else text), True)]
     while pending:
-        node = pending.pop()
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            pending += node.orelse
-            continue
+        node, loads = pending.pop()
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        pending += ast.iter_child_nodes(node)
+            yield from ((alias.name, loads) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            start = ".".join([*above, *([node.module] if node.module else [])])
+            yield from ((f"{start}.{alias.name}", loads) for alias in node.names)
+        later = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        typed = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        pending += ((child, loads and not later and not typed) for child in ast.iter_child_nodes(node))
+
+
+def module_of(name: str) -> str | None:
+    """The module of this package that an imported name is, or stands in."""
+    while name and name not in MODULES:
+        name = name.rpartition(".")[0]
+    return name or None
 
 
 @pytest.mark.parametrize("layer", ORDER)
 def test_a_layer_imports_only_what_stands_below(layer: str) -> None:
-    above = {f"bitymi_ns.{name}" for name in ORDER[ORDER.index(layer) + 1 :]}
+    above = {f"bitymi_ns.{name}" for name in [*ORDER[ORDER.index(layer) + 1 :], "cli"]}
     for path in (PACKAGE / layer).rglob("*.py"):
-        for name in imports(path):
-            parts = name.split(".")
-            assert ".".join(parts[:2]) not in above, f"{path} imports {name}"
-            assert layer == "host" or parts[0] != "nerfstudio", f"{path} imports {name}"
+        for name, _ in imports(path):
+            assert ".".join(name.split(".")[:2]) not in above, f"{path} imports {name}"
+
+
+def test_nerfstudio_is_known_to_the_host_and_to_what_measures_it_alone() -> None:
+    for path in PACKAGE.rglob("*.py"):
+        knows = path.relative_to(PACKAGE).as_posix().startswith(KNOW_NERFSTUDIO)
+        names = [name for name, _ in imports(path) if name.split(".")[0] == "nerfstudio"]
+        assert knows or not names, f"{path} imports {names}"
+
+
+def test_no_two_modules_import_each_other() -> None:
+    """Also not through others. Imports within functions and for the type checker count, but for a package's own."""
+    graph = {}
+    for name, path in MODULES.items():
+        found = {module_of(imported) for imported, _ in imports(path)} - {None, name}
+        if path.name == "__init__.py":  # re-exports its modules, which know one another and not it
+            found = {other for other in found if not other.startswith(name + ".")}
+        graph[name] = {other for other in found if not name.startswith(f"{other}.")}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(error.args[1]))
+
+
+def test_the_guard_sees_every_kind_of_import() -> None:
+    path = PACKAGE / "ops" / "project.py"
+    text = """
+from typing import TYPE_CHECKING
+from . import blend
+from .. import scene
+from ..bake.plan import Plan
+if TYPE_CHECKING:
+    from bitymi_ns.host import model
+def late():
+    import bitymi_ns.train.fit
+"""
+    assert set(imports(path, text)) == {
+        ("typing.TYPE_CHECKING", True),
+        ("bitymi_ns.ops.blend", True),
+        ("bitymi_ns.scene", True),
+        ("bitymi_ns.bake.plan.Plan", True),
+        ("bitymi_ns.host.model", False),
+        ("bitymi_ns.train.fit", False),
+    }
 
 
 def test_a_scene_can_be_built_and_trained_without_nerfstudio() -> None:

@@ -19,6 +19,7 @@ from bitymi_ns.bake.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileE
 from bitymi_ns.bake.quantise import decode_pages
 from bitymi_ns.bake.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.baked import BakedScene
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """What to do about a damaged bundle."""
@@ -32,40 +33,15 @@ class Bundle:
     """A loaded bundle.
 
     Attributes:
-        surfels: per-surfel parameters as in docs/architecture.md, float32 on the CPU; the view colour may be lean
-            (`ops.view_color.LEAN`).
-        view_color: sv, sh, sb or sg.
-        tiles: [N, 5] int32 (x, y, layer, r_u, r_v), zeros for a surfel without a tile.
-        atlas: [layers, height, width, 4] uint8 (bc7, uint8) or float32 (fp16); None when the scene has no texture, or
-            its blocks were not decoded.
-        blocks: [layers, height / 4, width / 4, 16] uint8, the atlas as it is in the file; None unless it is BC7.
-        offset, scale: residual colour = offset + scale * value, value = stored / 255 for uint8, stored for float32.
-        extent: [N] float32 half side of the tile in scale units.
-        mean_residual: [N, 3] float32 mean of the tile; the residual of a surfel without a tile.
+        scene: what it holds, on the CPU; the view colours may be lean (`ops.view_color.LEAN`).
         info: bundle.json.
     """
 
-    surfels: dict[str, Tensor]
-    view_color: str
-    tiles: Tensor
-    atlas: Tensor | None
-    blocks: Tensor | None
-    offset: float
-    scale: float
-    extent: Tensor
-    mean_residual: Tensor
+    scene: BakedScene
     info: Manifest
 
     def __len__(self) -> int:
-        return len(self.tiles)
-
-    def residuals(self) -> Tensor:
-        """Residual colours of the atlas: [layers, height, width, 3] float32."""
-        if self.atlas is None:
-            raise BundleError("the bundle has no atlas" if self.blocks is None else "the atlas was not decoded")
-        rgb = self.atlas[..., :3].float()
-        unorm = rgb / 255.0 if self.atlas.dtype == torch.uint8 else rgb
-        return unorm * self.scale + self.offset
+        return len(self.scene)
 
 
 def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) -> Bundle:
@@ -154,15 +130,26 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
     except ply.PlyError as error:
         raise BundleError(f"{path}: {error}") from error
     _check_tiles(tiles, info, path)
+    scene = BakedScene(
+        surfels,
+        kind,
+        tiles.contiguous(),
+        None,
+        extent=extent,
+        mean_residual=mean_residual,
+        near=info.render.near,
+        weight_bound=info.render.weight_bound,
+        prefilter=info.render.prefilter,
+    )
     if info.atlas is None:
-        return Bundle(surfels, kind, tiles, None, None, 0.0, 1.0, extent, mean_residual, info)
+        return Bundle(scene, info)
     try:
         image = ktx2.parse_ktx2(files[ATLAS])
     except ktx2.Ktx2Error as error:
         raise BundleError(f"{folder / ATLAS}: {error}") from error
-    atlas, blocks = _texels(image, decode, folder / ATLAS)
-    offset, scale = info.atlas.offset, info.atlas.scale
-    return Bundle(surfels, kind, tiles, atlas, blocks, offset, scale, extent, mean_residual, info)
+    scene.atlas, scene.blocks = _texels(image, decode, folder / ATLAS)
+    scene.offset, scene.scale = info.atlas.offset, info.atlas.scale
+    return Bundle(scene, info)
 
 
 @contextmanager

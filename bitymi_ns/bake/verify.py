@@ -85,12 +85,12 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     near, weight_bound = render.near, render.weight_bound
     transmittance = None
     if cameras and options.looks_at_views:
-        transmittance = visibility(bundle.surfels, cameras, near, render.prefilter).in_front
-    plan = make_plan(bundle.surfels, field, options, cameras, transmittance, near, weight_bound)
-    tiled = bundle.tiles[:, 3] > 0
-    plan.extent = torch.where(tiled, bundle.extent, plan.extent)
-    residuals = None if bundle.atlas is None else bundle.residuals().numpy()
-    found = tile_errors(field, plan, bundle.tiles.numpy(), bundle.mean_residual, residuals).summary()
+        transmittance = visibility(bundle.scene.surfels, cameras, near, render.prefilter).in_front
+    plan = make_plan(bundle.scene.surfels, field, options, cameras, transmittance, near, weight_bound)
+    tiled = bundle.scene.tiles[:, 3] > 0
+    plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
+    residuals = None if bundle.scene.atlas is None else bundle.scene.residuals().numpy()
+    found = tile_errors(field, plan, bundle.scene.tiles.numpy(), bundle.scene.mean_residual, residuals).summary()
     lines, ok = [], True
     for what, bound in (("rms", stated.rms.p100), ("largest", stated.largest.p100)):
         measured = found[what]["p100"]
@@ -108,25 +108,25 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
         cameras: its training views.
     """
     name = "error of the view colours"
-    if "view_terms" not in bundle.surfels:
+    if "view_terms" not in bundle.scene.surfels:
         return Check(name, True, "none: all of them are kept")
     stated = bundle.info.statistics.view_color
     if stated is None:
         return Check(name, True, "not stated")
     trained = {name: value.detach().float().cpu() for name, value in surfels.items()}
     places = {key: row for row, key in enumerate(_keys(trained))}
-    rows = [places.get(key) for key in _keys(bundle.surfels)]
+    rows = [places.get(key) for key in _keys(bundle.scene.surfels)]
     if None in rows:
         return Check(name, False, f"surfel {rows.index(None)} is none of the trained scene")
     trained = {name: value[torch.tensor(rows)] for name, value in trained.items()}
-    means, render = bundle.surfels["means"], bundle.info.render
+    means, render = bundle.scene.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
         views = visibility(trained, cameras, render.near, render.prefilter)
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)
-    found = float(view_color_errors(bundle.view_color, trained, bundle.surfels, *at).amax())
+    found = float(view_color_errors(bundle.scene.view_color, trained, bundle.scene.surfels, *at).amax())
     bound = stated.error.p100
     ok = bound is not None and found <= bound * _SLACK + _SLACK_STEPS
     return Check(name, ok, f"largest {found:.3f} (stated {_steps(bound)}, tolerance {stated.tolerance:g}) steps")
@@ -144,14 +144,14 @@ def _steps(error: float | None) -> str:
 
 def _tiles(bundle: Bundle) -> Check:
     """Sides are powers of two on the grid of 4 x 4 blocks, and no texel belongs to two tiles."""
-    tiled = bundle.tiles[bundle.tiles[:, 3] > 0].long()
+    tiled = bundle.scene.tiles[bundle.scene.tiles[:, 3] > 0].long()
     if len(tiled) == 0:
         return Check("tiles", True, "none")
     sides = tiled[:, 3:]
     if ((sides & (sides - 1)) != 0).any() or (tiled[:, [0, 1, 3, 4]] % 4 != 0).any():
         return Check("tiles", False, "a tile is not a power of two on the grid of 4 x 4 blocks")
     blocks = int((sides // 4).prod(1).sum())
-    owned = _blocks(tiled, bundle.atlas)
+    owned = _blocks(tiled, bundle.scene.atlas)
     if int((owned > 0).sum()) != blocks:
         return Check("tiles", False, f"{blocks - int((owned > 0).sum()):,} blocks belong to more than one tile")
     return Check("tiles", True, f"{len(tiled):,} of {len(bundle):,} surfels, {16 * blocks:,} texels, no two overlap")
@@ -172,17 +172,17 @@ def _statements(bundle: Bundle) -> Check:
     """What bundle.json states about the bake agrees with the files."""
     statistics = bundle.info.statistics
     surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
-    found = {"surfels kept": len(bundle), "texels kept": int(bundle.tiles[:, 3:].long().prod(1).sum())}
-    found["surfels without_tile"] = int((bundle.tiles[:, 3] == 0).sum())
+    found = {"surfels kept": len(bundle), "texels kept": int(bundle.scene.tiles[:, 3:].long().prod(1).sum())}
+    found["surfels without_tile"] = int((bundle.scene.tiles[:, 3] == 0).sum())
     stated = {
         "surfels kept": surfels and surfels.kept,
         "texels kept": texels and texels.kept,
         "surfels without_tile": surfels and surfels.without_tile,
     }
-    if lean is not None and "view_terms" in bundle.surfels:
+    if lean is not None and "view_terms" in bundle.scene.surfels:
         stated |= {"view colour sites": lean.sites.after, "surfels of one colour": lean.one_color}
-        found["view colour sites"] = len(bundle) + len(bundle.surfels["view_terms"])
-        found["surfels of one colour"] = int((bundle.surfels["view_span"][:, 1] == 0).sum())
+        found["view colour sites"] = len(bundle) + len(bundle.scene.surfels["view_terms"])
+        found["surfels of one colour"] = int((bundle.scene.surfels["view_span"][:, 1] == 0).sum())
     for name, value in stated.items():
         if value is not None and value != found[name]:
             return Check("statistics", False, f"{name}: {value:,} stated, {found[name]:,} found")

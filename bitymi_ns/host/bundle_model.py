@@ -14,7 +14,6 @@ from bitymi_ns.bake import REMEDY, BundleError, read_bundle
 from bitymi_ns.bake.manifest import ATLAS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
-from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 
 
@@ -43,7 +42,7 @@ class BakedModel(SurfelModel):
         except BundleError as error:
             fail(f"{error}. {REMEDY}", error)
         self._atlas_bytes = bundle.info.files[ATLAS].bytes if ATLAS in bundle.info.files else 0
-        self._scene = BakedScene.from_bundle(bundle)
+        self._scene = bundle.scene
         self._count = len(bundle)
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:

@@ -131,9 +131,7 @@ class ExportAtlas(BakeOptions):
         )
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
-            from bitymi_ns.scene.baked import BakedScene
-
-            scene = BakedScene.from_bundle(bundle)
+            scene = bundle.scene
             held_out = compare(model, datamanager, lambda c: scene.render(c, background=torch.tensor(background)).rgb)
             bundle.info.statistics.held_out = HeldOut(**held_out)
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))

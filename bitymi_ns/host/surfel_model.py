@@ -20,8 +20,8 @@ from bitymi_ns.host.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import as_float, over_background, reduce_image, reduce_mask
 
-OVERDRAW_SCALE = 32.0
-"""Blended surfels at a pixel that the end of a colour map stands for."""
+OVERDRAW_SCALE = 64.0
+"""Blended surfels at a pixel at which colour maps of overdraw end: the same in every picture, so that runs compare."""
 
 
 @dataclass

@@ -11,7 +11,6 @@ from bitymi_ns.bake import Bundle, Check, check_field, check_view_color
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import held_out_psnr, load_trained
-from bitymi_ns.scene.baked import BakedScene
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -36,7 +35,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     if model.scene.field is not None:
         checks.append(check_field(bundle, model.scene.field.cpu(), train))
     if len(datamanager.eval_dataset):
-        scene, background = BakedScene.from_bundle(bundle), model.background.cpu()
+        scene, background = bundle.scene, model.background.cpu()
         rows = held_out_psnr(model, datamanager, lambda c: scene.render(c, background=background).rgb, views)
         worst, photos = min(row[0] for row in rows), sum(row[2] - row[1] for row in rows) / len(rows)
         stated = bundle.info.statistics.held_out and bundle.info.statistics.held_out.psnr_baked_against_neural_worst

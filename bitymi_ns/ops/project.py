@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -11,8 +11,24 @@ from torch import Tensor
 from .backend import dense, kernel, on_same_device
 from .constants import FRAME, GEOM
 
-if TYPE_CHECKING:
-    from bitymi_ns.scene.camera import Camera
+
+class Camera(Protocol):
+    """A pinhole camera (`scene.camera.Camera`).
+
+    Attributes:
+        viewmat: [4, 4] world to camera, OpenCV axes.
+        K: [3, 3] intrinsics in pixels.
+        width, height: of the image in pixels.
+        skewed: whether K[0, 1] is not 0, which the kernels do not take.
+    """
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+    @property
+    def skewed(self) -> bool: ...
 
 
 @dataclass

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,9 +14,6 @@ from bitymi_ns.ops.baked import AtlasTexture, BakedArrays, WorkspacePool, draw, 
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 
 from .camera import Camera
-
-if TYPE_CHECKING:
-    from bitymi_ns.bake.bundle_reader import Bundle
 
 
 @dataclass
@@ -73,24 +69,17 @@ class BakedScene:
     )
     _workspaces: WorkspacePool = field(default_factory=WorkspacePool, init=False, repr=False, compare=False)
 
-    @classmethod
-    def from_bundle(cls, bundle: Bundle) -> BakedScene:
-        """The scene of a loaded bundle."""
-        info = bundle.info
-        return cls(
-            surfels=bundle.surfels,
-            view_color=bundle.view_color,
-            tiles=bundle.tiles.contiguous(),
-            atlas=None if bundle.atlas is None else bundle.atlas.contiguous(),
-            offset=bundle.offset,
-            scale=bundle.scale,
-            extent=bundle.extent,
-            mean_residual=bundle.mean_residual,
-            near=info.render.near,
-            weight_bound=info.render.weight_bound,
-            prefilter=info.render.prefilter,
-            blocks=bundle.blocks,
-        )
+    def residuals(self) -> Tensor:
+        """Residual colours of the atlas: [layers, height, width, 3] float32.
+
+        Raises:
+            ValueError: there is no atlas, or only its BC7 blocks.
+        """
+        if self.atlas is None:
+            raise ValueError("the scene has no atlas" if self.blocks is None else "the atlas was not decoded")
+        rgb = self.atlas[..., :3].float()
+        unorm = rgb / 255.0 if self.atlas.dtype == torch.uint8 else rgb
+        return unorm * self.scale + self.offset
 
     def to(self, device: torch.device | str) -> BakedScene:
         """The scene with its surfels on another device; texels go there, as textures, when it is first drawn."""

@@ -52,10 +52,10 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         surfels, tmp_path / "b", kind, format, near=0.3, weight_bound=0.02, background=(1, 0.5, 0)
     )
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.view_color == kind and len(loaded) == 6
-    np.testing.assert_array_equal(loaded.tiles.numpy(), tiles)
-    assert loaded.tiles.dtype == torch.int32
-    torch.testing.assert_close(loaded.surfels["log_scales"], params["log_scales"], rtol=0, atol=0)
+    assert loaded.scene.view_color == kind and len(loaded) == 6
+    np.testing.assert_array_equal(loaded.scene.tiles.numpy(), tiles)
+    assert loaded.scene.tiles.dtype == torch.int32
+    torch.testing.assert_close(loaded.scene.surfels["log_scales"], params["log_scales"], rtol=0, atol=0)
     assert loaded.info.render.model_dump() == {
         "alpha_max": 0.99,
         "alpha_min": 1 / 255,
@@ -67,13 +67,13 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         "background": (1, 0.5, 0),
     }
     if format is None:
-        assert loaded.atlas is None and loaded.info.atlas is None
+        assert loaded.scene.atlas is None and loaded.info.atlas is None
         assert sorted(os.listdir(tmp_path / "b")) == ["bundle.json", "surfels.ply"]
         return
-    assert loaded.atlas.shape == (*texels.shape[:3], 4)
-    assert loaded.atlas.dtype == (torch.float32 if format == "fp16" else torch.uint8)
-    assert (loaded.offset, loaded.scale) == ((0, 1) if format == "fp16" else (-0.5, 2.0))
-    error = float((loaded.residuals() - torch.from_numpy(texels)).square().mean())
+    assert loaded.scene.atlas.shape == (*texels.shape[:3], 4)
+    assert loaded.scene.atlas.dtype == (torch.float32 if format == "fp16" else torch.uint8)
+    assert (loaded.scene.offset, loaded.scene.scale) == ((0, 1) if format == "fp16" else (-0.5, 2.0))
+    error = float((loaded.scene.residuals() - torch.from_numpy(texels)).square().mean())
     if format != "bc7":  # random texels are what block compression cannot hold
         assert error < (1e-6 if format == "fp16" else (2.0 / 255) ** 2 / 11)
     assert error == pytest.approx(atlas.mse, rel=0.2)
@@ -84,11 +84,11 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
 def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
     params = make_lean(surfels, tmp_path / "b", kind)
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.view_color == kind and loaded.info.version == "2.1"
-    assert set(loaded.surfels) == set(params)
+    assert loaded.scene.view_color == kind and loaded.info.version == "2.1"
+    assert set(loaded.scene.surfels) == set(params)
     d = torch.nn.functional.normalize(params["means"], dim=1)
     want = reference.lean(kind, params["view_base"], params["view_span"], params["view_terms"], d)
-    got = reference.lean(kind, *(loaded.surfels[name] for name in ("view_base", "view_span", "view_terms")), d)
+    got = reference.lean(kind, *(loaded.scene.surfels[name] for name in ("view_base", "view_span", "view_terms")), d)
     assert torch.equal(got, want)  # the terms are in the order of the surfels now
 
 
@@ -152,9 +152,9 @@ def test_an_existing_folder_is_refused_unless_it_is_a_bundle_to_overwrite(surfel
     make(surfels, target)  # an empty folder is no loss
     with pytest.raises(BundleError, match="is a bundle already"):
         make(surfels, target, "sh")
-    assert read_bundle(target).view_color == "sv"
+    assert read_bundle(target).scene.view_color == "sv"
     make(surfels, target, "sh", overwrite=True)
-    assert read_bundle(target).view_color == "sh"
+    assert read_bundle(target).scene.view_color == "sh"
     assert names_beside(target) == ["b"]
     home = tmp_path / "home"
     home.mkdir()
@@ -186,7 +186,7 @@ def test_a_full_disk_leaves_nothing_behind(surfels, tmp_path, monkeypatch, step,
         make(surfels, target, overwrite=overwrite)
     assert names_beside(target) == (["b"] if overwrite else [])
     if overwrite:
-        assert read_bundle(target).view_color == "sg"
+        assert read_bundle(target).scene.view_color == "sg"
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), RuntimeError("bug")])
@@ -211,7 +211,7 @@ def test_a_failed_swap_puts_the_old_bundle_back(surfels, tmp_path, monkeypatch):
     with pytest.raises(BundleError, match="Input/output error"):
         make(surfels, target, overwrite=True)
     monkeypatch.undo()
-    assert read_bundle(target).view_color == "sg" and names_beside(target) == ["b"]
+    assert read_bundle(target).scene.view_color == "sg" and names_beside(target) == ["b"]
 
 
 @pytest.mark.parametrize(

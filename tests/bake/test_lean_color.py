@@ -14,7 +14,6 @@ from bitymi_ns.bake.lean_color import reduce_view_color, view_color_errors
 from bitymi_ns.bake.voronoi_fit import fit_sites, site_vectors, site_weights
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import LEAN, VIEW_COLORS, check_lean
-from bitymi_ns.scene.baked import BakedScene
 
 KINDS = list(VIEW_COLORS)
 
@@ -135,13 +134,13 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     baked = bake(made, cameras, options)
     export(baked, tmp_path / "b", statistics={"options": vars(options)})
     bundle, checks = check_files(tmp_path / "b")
-    assert all(check.ok for check in checks) and bundle.view_color == kind
-    assert bundle.info.version == "2.1" and bundle.info.surfels.terms == len(bundle.surfels["view_terms"])
+    assert all(check.ok for check in checks) and bundle.scene.view_color == kind
+    assert bundle.info.version == "2.1" and bundle.info.surfels.terms == len(bundle.scene.surfels["view_terms"])
     for name in LEAN:
-        assert torch.equal(bundle.surfels[name], baked.surfels[name])
+        assert torch.equal(bundle.scene.surfels[name], baked.surfels[name])
     stated = bundle.info.statistics.view_color.model_dump()
     assert stated["error"]["p100"] <= 2.0 and stated["sites"]["after"] < stated["sites"]["before"]
-    assert stated["one_color"] == int((bundle.surfels["view_span"][:, 1] == 0).sum())
+    assert stated["one_color"] == int((bundle.scene.surfels["view_span"][:, 1] == 0).sum())
     check = check_view_color(bundle, made.surfels, cameras)
     assert check.ok and "stated" in check.detail
     full = bake(made, cameras, BakeOptions(format="uint8", tolerance=0.0))
@@ -152,7 +151,7 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     saved = stated["bytes"]["before"] - stated["bytes"]["after"]
     sizes = [(tmp_path / name / "surfels.ply").stat().st_size for name in ("full", "b")]
     assert abs(sizes[0] - sizes[1] - saved) < 2500  # the header names fewer columns
-    a, b = (BakedScene.from_bundle(each).render(cameras[0]).rgb for each in (whole, bundle))
+    a, b = (each.scene.render(cameras[0]).rgb for each in (whole, bundle))
     assert float((a - b).abs().amax()) < 6 * 2.0 / 255
 
 
@@ -160,9 +159,9 @@ def test_altered_colours_are_found(scene, camera, tmp_path):
     made, cameras = scene(60), [camera(3.0)]
     export(bake(made, cameras, BakeOptions(format="uint8")), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
-    bundle.surfels["view_base"][bundle.surfels["opacity_logits"].argmax()] += 0.3
+    bundle.scene.surfels["view_base"][bundle.scene.surfels["opacity_logits"].argmax()] += 0.3
     assert not check_view_color(bundle, made.surfels, cameras).ok
-    bundle.surfels["means"][3] += 1.0
+    bundle.scene.surfels["means"][3] += 1.0
     assert "surfel 3 is none" in check_view_color(bundle, made.surfels, cameras).detail
 
 

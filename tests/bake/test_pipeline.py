@@ -11,8 +11,8 @@ from bitymi_ns.bake.geometry import tangent_vectors
 
 def bilinear(bundle, surfel, u, v, extent=3.0):
     """The residual at (u, v) in [-3, 3]^2 of a surfel, clamped to the outer texel centres as in a renderer."""
-    x, y, layer, r_u, r_v = bundle.tiles[surfel].tolist()
-    texels = bundle.residuals()[layer, y : y + r_v, x : x + r_u].permute(2, 0, 1)[None]
+    x, y, layer, r_u, r_v = bundle.scene.tiles[surfel].tolist()
+    texels = bundle.scene.residuals()[layer, y : y + r_v, x : x + r_u].permute(2, 0, 1)[None]
     grid = torch.stack([u, v], dim=-1)[None, None] / extent
     sampled = torch.nn.functional.grid_sample(texels, grid, padding_mode="border", align_corners=False)
     return sampled[0, :, 0].T
@@ -25,12 +25,12 @@ def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format,
     made.field.voxel = 0.02  # well below the wavelength, so that interpolation is not what is measured
     export(bake(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
-    scales = bundle.surfels["log_scales"].exp()
-    axes = tangent_vectors(bundle.surfels["quats"]) * scales[:, None]
+    scales = bundle.scene.surfels["log_scales"].exp()
+    axes = tangent_vectors(bundle.scene.surfels["quats"]) * scales[:, None]
     errors = []
     for i in torch.nonzero(scales.amax(1) < 0.08).squeeze(1).tolist():
         uv = torch.rand(50, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2
-        x = bundle.surfels["means"][i] + uv @ axes[i].T
+        x = bundle.scene.surfels["means"][i] + uv @ axes[i].T
         errors.append(bilinear(bundle, i, uv[:, 0], uv[:, 1]) - made.field(x))
     errors = torch.cat(errors)
     assert len(errors) > 1000
@@ -123,7 +123,7 @@ def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
     assert baked.atlas is None and baked.texels is None and not baked.packing.tiles.any()
     export(baked, tmp_path / "b")
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.atlas is None and not loaded.tiles.any() and loaded.info.atlas is None
+    assert loaded.scene.atlas is None and not loaded.scene.tiles.any() and loaded.info.atlas is None
     with pytest.raises(ValueError):
         baked.with_texels(torch.zeros(1, 4, 4, 3))
 

@@ -31,8 +31,8 @@ def test_every_view_colour_reaches_the_bundle(surfels, camera, tmp_path, kind):
     scene = real_scene(surfels, kind=kind)
     export(bake(scene, [camera()], BakeOptions(tolerance=0.0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
-    assert set(bundle.surfels) == set(scene.surfels) and set(VIEW_COLORS[kind]) == set(PARAMETERS[kind])
-    Scene(scene.config, bundle.surfels, None)  # the parameters fit a scene again
+    assert set(bundle.scene.surfels) == set(scene.surfels) and set(VIEW_COLORS[kind]) == set(PARAMETERS[kind])
+    Scene(scene.config, bundle.scene.surfels, None)  # the parameters fit a scene again
 
 
 def test_tiles_at_the_nyquist_rate_hold_the_field(surfels, tmp_path):
@@ -40,14 +40,14 @@ def test_tiles_at_the_nyquist_rate_hold_the_field(surfels, tmp_path):
     baked = bake(scene, options=BakeOptions(format="fp16", tolerance=0))
     export(baked, tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
-    scales = bundle.surfels["log_scales"].exp()
-    axes = tangent_vectors(bundle.surfels["quats"]) * scales[:, None]
+    scales = bundle.scene.surfels["log_scales"].exp()
+    axes = tangent_vectors(bundle.scene.surfels["quats"]) * scales[:, None]
     errors, values = [], []
-    for i, (x, y, layer, r_u, r_v) in enumerate(bundle.tiles.tolist()):
+    for i, (x, y, layer, r_u, r_v) in enumerate(bundle.scene.tiles.tolist()):
         uv = torch.rand(100, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2
         with torch.no_grad():
-            expected = scene.field(bundle.surfels["means"][i] + uv @ axes[i].T)
-        tile = bundle.residuals()[layer, y : y + r_v, x : x + r_u]
+            expected = scene.field(bundle.scene.surfels["means"][i] + uv @ axes[i].T)
+        tile = bundle.scene.residuals()[layer, y : y + r_v, x : x + r_u]
         errors.append((texel(tile, uv) - expected).square().mean())
         values.append(expected.square().mean())
     assert torch.stack(errors).mean() < 0.02 * torch.stack(values).mean()

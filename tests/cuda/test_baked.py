@@ -158,14 +158,14 @@ def test_bundles(format: str, device: torch.device, cpu, tmp_path) -> None:
         export(bake(made, options=BakeOptions(format=format)), tmp_path / "b")
         bundle = read_bundle(tmp_path / "b")
         undecoded = read_bundle(tmp_path / "b", decode=False)
-    assert check(BakedScene.from_bundle(bundle), front(48, 40), device, cpu) < 3e-3
+    assert check(bundle.scene, front(48, 40), device, cpu) < 3e-3
     if format != "bc7":
-        assert bundle.blocks is None and torch.equal(undecoded.atlas, bundle.atlas)
+        assert bundle.scene.blocks is None and torch.equal(undecoded.scene.atlas, bundle.scene.atlas)
         return
-    assert undecoded.atlas is None and torch.equal(undecoded.blocks, bundle.blocks)
-    layers, height, width = bundle.atlas.shape[:3]
-    assert bundle.blocks.shape == (layers, height // 4, width // 4, 16)
-    scene = BakedScene.from_bundle(undecoded)
+    assert undecoded.scene.atlas is None and torch.equal(undecoded.scene.blocks, bundle.scene.blocks)
+    layers, height, width = bundle.scene.atlas.shape[:3]
+    assert bundle.scene.blocks.shape == (layers, height // 4, width // 4, 16)
+    scene = undecoded.scene
     with cpu(), pytest.raises(ValueError, match="decode=True"):
         scene.render(front(8, 8))
     if device.type == "cuda":  # decoded by the texture unit

@@ -13,7 +13,7 @@ import pytest
 from nerfstudio.scripts import train as ns_train
 from PIL import Image
 
-from bitymi_ns.host import training
+from bitymi_ns.host import callbacks
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.errors import InputError
@@ -86,7 +86,7 @@ def test_points_that_no_view_sees(start: Start, capture: Path) -> None:
 def test_a_view_that_sees_none_of_the_points(
     start: Start, room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(training, "views_without_surfels", lambda scene, cameras: [1])
+    monkeypatch.setattr(callbacks, "views_without_surfels", lambda scene, cameras: [1])
     config = start()
     config.max_num_iterations = 2
     ns_train.main(config)

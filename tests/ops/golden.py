@@ -1,4 +1,4 @@
-"""The golden renders and how a case is drawn; the scenes that they and other tests share are in bitymi_ns.stability."""
+"""The golden renders and how a case is drawn; scenes that other tests use, too, are in bitymi_ns.measure.stability."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, random_scene
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene import Camera
-from bitymi_ns.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, random_scene
 
 __all__ = [
     "GOLDEN_NAMES",

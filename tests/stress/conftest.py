@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bitymi_ns.stability.backends import BACKENDS, Backend, missing
+from bitymi_ns.measure.stability.backends import BACKENDS, Backend, missing
 
 
 @pytest.fixture(params=sorted(BACKENDS))

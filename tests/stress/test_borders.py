@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.backends import Backend
+from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, front_scene
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.scene import Camera, HashField, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.stability.backends import Backend
-from bitymi_ns.stability.scenes import SURFEL_KEYS, SV_KEYS, front_scene
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.backends import Backend
+from bitymi_ns.measure.stability.cases import STATED, Case, cases
+from bitymi_ns.measure.stability.errors import against_extended, measure
+from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE
+from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SceneCase, extreme_scenes, random_scene
+from bitymi_ns.measure.stability.sweeps import SWEEPS, Sweep
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
-from bitymi_ns.stability.backends import Backend
-from bitymi_ns.stability.cases import STATED, Case, cases
-from bitymi_ns.stability.measure import against_extended, measure
-from bitymi_ns.stability.page import ACCURATE, ALLOWANCE
-from bitymi_ns.stability.scenes import SURFEL_KEYS, SceneCase, extreme_scenes, random_scene
-from bitymi_ns.stability.sweeps import SWEEPS, Sweep
 
 CASES = cases()
 NAMES = [case.name for case in CASES]

@@ -21,10 +21,9 @@ from bitymi_ns.bake.manifest import parse
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.ply import parse_ply, write_ply
 from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
-from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.stability.scenes import random_scene
 from tests.bake.damage import signed
 from tests.ops.test_view_color import lean_parameters
 
@@ -58,7 +57,7 @@ def load_and_draw(folder: Path, verify: bool) -> bool:
         assert str(error) and "\n" not in str(error)
         return False
     K = torch.tensor([[20.0, 0, SIDE / 2], [0, 20.0, SIDE / 2], [0, 0, 1]])
-    output = BakedScene.from_bundle(loaded).render(Camera(torch.eye(4), K, SIDE, SIDE), torch.zeros(3), maps=True)
+    output = loaded.scene.render(Camera(torch.eye(4), K, SIDE, SIDE), torch.zeros(3), maps=True)
     assert output.rgb.shape == (SIDE, SIDE, 3)
     for image in (output.rgb, output.alpha, output.beta, output.depth, output.normal):
         assert image.isfinite().all()

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, random_scene
 from bitymi_ns.ops.field import FieldGeometry
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.stability.scenes import SURFEL_KEYS, SV_KEYS, random_scene
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 REFUSED = (ValueError, TypeError, RuntimeError, IndexError)

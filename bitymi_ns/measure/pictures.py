@@ -1,0 +1,136 @@
+"""Pictures of the worst held-out views: what is wrong, and what each part of the scene contributes."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from bitymi_ns.bake.geometry import tangent_vectors
+from bitymi_ns.files import reason
+from bitymi_ns.host.errors import fail, say
+from bitymi_ns.host.export import load_trained, replace_file
+from bitymi_ns.host.metrics import image_metrics
+from bitymi_ns.host.surfel_model import OVERDRAW_SCALE
+from bitymi_ns.host.target import see_writable
+from bitymi_ns.measure.report.views import ERROR_CAPTION, ERROR_SCALE, heat
+from bitymi_ns.ops import composite
+from bitymi_ns.scene import RenderOutput, Scene
+
+RESIDUAL_GAIN = 4.0
+"""Residuals are small; the pictures of them are brightened by this factor."""
+FILE = "pictures.json"
+
+KINDS = {
+    "photo": "photograph",
+    "final": "render",
+    "error": ERROR_CAPTION,
+    "view_color": "view colour alone (f_view)",
+    "residual_positive": f"positive residual, x{RESIDUAL_GAIN:g}",
+    "residual_negative": f"negative residual, x{RESIDUAL_GAIN:g}",
+    "overdraw": f"overdraw: surfels blended at a pixel, 0 (black) to {OVERDRAW_SCALE:g} (yellow)",
+}
+"""Pictures of a view in order, with their captions."""
+
+
+def heat_map(values: Tensor, scale: float) -> Tensor:
+    """[H, W] or [H, W, 1] values as colours [H, W, 3]: black at 0, yellow at `scale` and above."""
+    return torch.from_numpy(heat(values.reshape(*values.shape[:2]).float().cpu().numpy(), scale))
+
+
+@torch.no_grad()
+def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
+    """Blended positive and negative part of the residual: sum of w max(rho, 0) and of w max(-rho, 0), each [H, W, 3].
+
+    As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
+    of the two is the render wherever no colour had to be cut off at 0.
+    """
+    p = scene.surfels
+    bands = []
+    for fragments in output.fragments.lists():
+        rho = fragments.weight.new_zeros(len(fragments), 3)
+        if scene.field is not None:
+            textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
+            surfel = fragments.surfel[textured].long()
+            u, v = fragments.uv[:, textured]
+            axes = tangent_vectors(p["quats"][surfel])
+            size = p["log_scales"][surfel].exp()
+            x = p["means"][surfel] + (u * size[:, 0])[:, None] * axes[..., 0] + (v * size[:, 1])[:, None] * axes[..., 1]
+            rho[textured] = scene.field(x)
+        parts = composite(fragments, torch.cat([rho, -rho], 1).clamp(min=0.0))
+        bands.append(parts.view(fragments.height, fragments.width, 6))
+    positive, negative = torch.cat(bands).split(3, dim=-1)
+    return positive, negative
+
+
+@torch.no_grad()
+def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> dict[str, Tensor]:
+    """The pictures of one view, [H, W, 3] each; those of the residual are left out where there is no texture."""
+    output = scene.render(camera, background, "frozen")
+    final = output.rgb.clamp(0.0, 1.0)
+    pictures = {
+        "photo": photo,
+        "final": final,
+        "error": heat_map((final - photo).abs().mean(-1), ERROR_SCALE),
+    }
+    if scene.field is not None:
+        pictures["view_color"] = scene.render(camera, background, "off").rgb
+        positive, negative = residual_parts(scene, output)
+        pictures |= {"residual_positive": RESIDUAL_GAIN * positive, "residual_negative": RESIDUAL_GAIN * negative}
+    pictures["overdraw"] = heat_map(output.overdraw, OVERDRAW_SCALE)
+    return pictures
+
+
+def png(image: Tensor) -> bytes:
+    """[H, W, 3] in [0, 1] as a PNG file."""
+    pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+@torch.no_grad()
+def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
+    """Write the pictures of the held-out views with the lowest PSNR, and pictures.json, which says what they are.
+
+    Args:
+        load_config: config.yml of a trained run.
+        output_dir: folder for the files; made if needed.
+        views: how many views.
+    """
+    if views < 1:
+        fail(f"--views must be at least 1, not {views}")
+    see_writable(output_dir / FILE)
+    config, pipeline = load_trained(load_config)
+    model, datamanager = pipeline.model, pipeline.datamanager
+    count = len(datamanager.eval_dataset)
+    if count == 0:
+        fail("the run has no held-out views to choose the worst of")
+    background = model.background
+    ranked = []
+    for index, view in enumerate(datamanager.eval_views):
+        photo = view.target(background, model.device)
+        rgb = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
+        ranked.append((image_metrics(rgb, photo, view.mask), index, view.camera, photo))
+    ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
+    try:
+        output_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail(f"{output_dir} cannot be made: {reason(error, output_dir)}.", error)
+    listed = []
+    for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
+        files = {}
+        for kind, image in decompose(model.scene, camera, background, photo).items():
+            files[kind] = f"view{index:04d}-{kind}.png"
+            replace_file(output_dir / files[kind], png(image))
+        figures = {name: round(value, 4) for name, value in metrics.items()}
+        listed.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
+    about = {"scene": config.experiment_name, "method": config.method_name}
+    text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": listed}, indent=1)
+    replace_file(output_dir / FILE, text.encode("utf8"))
+    say(f"Wrote {len(listed)} views to {output_dir}")

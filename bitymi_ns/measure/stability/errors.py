@@ -1,0 +1,255 @@
+"""Errors of a backend against the float64 reference, and how much of them the rounding of the inputs alone explains."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.measure.stability.backends import Backend
+from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase
+from bitymi_ns.ops.reference import extended
+from bitymi_ns.ops.reference import render as reference_render
+from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.scene.camera import Camera
+
+IMAGES = ("rgb", "alpha", "depth", "normal", "beta_map")
+CHANNELS = {
+    "rgb": slice(0, 3),
+    "alpha": slice(3, 4),
+    "beta_map": slice(4, 5),
+    "depth": slice(5, 6),
+    "normal": slice(6, 9),
+}
+"""Where `ops.composite_image` puts them."""
+RIM = 1e-3
+"""Bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides."""
+ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
+NOTHING = 1e-15
+"""Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene
+they are rounding, of the reference too."""
+PROBES = 3
+"""Random roundings of the inputs from which `Errors.input_*` is taken."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one case, each the largest over all pixels or numbers, relative to the largest value of its kind.
+
+    Only pixels where both sides blend the same surfels, in the same branch of the kernel, are compared, and the
+    gradients are those of a loss over these pixels: elsewhere a threshold (1/255, the transmittance, which branch is
+    the larger) fell on the other side of a rounding, and what is then compared is a different sum. Their share is
+    stated on its own.
+    """
+
+    forward: float
+    """Largest error of rgb, alpha, depth, normal and Beta map."""
+    gradient: float
+    """Largest error of the gradients of a random linear loss of these images."""
+    worst: str
+    """The parameter with that error."""
+    flipped: float
+    """Share of the pixels that are not compared."""
+    input_forward: float
+    """How much the reference's images change when each input is moved by up to half a unit in its last place."""
+    input_gradient: float
+    """The same of its gradients."""
+    drawn: int
+    """Blended fragments of the reference."""
+    finite: bool
+    """Whether every image and gradient of the backend is finite, over all pixels."""
+
+
+@dataclass
+class _Result:
+    images: dict[str, Tensor]  # [P, C] each, with their graph
+    blended: Tensor  # [P, N] bool
+    low_pass: Tensor  # [P, N] bool
+    leaves: dict[str, Tensor]
+
+
+def measure(case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2) -> Errors:
+    """Draw a case with a backend and with the reference, and differentiate both.
+
+    The reference gets the numbers that the backend gets: rounded to `dtype` first.
+
+    Args:
+        case: scene and camera, float64.
+        backend: what to measure.
+        dtype: of its tensors.
+        near: nearest depth that is drawn, camera z.
+    """
+    rounded = _map(case, lambda t: t.to(dtype).double())
+    with backend.use():
+        got = _by_kernels(rounded, backend.device, dtype, near)
+        want = _by_reference(rounded, near)
+        same = ((got.blended == want.blended) & ((got.low_pass == want.low_pass) | ~want.blended)).all(1)  # [P]
+        weights = _loss_weights(want.images)
+        grads = _gradients(got, weights, same)
+        everywhere = _gradients(got, weights, torch.ones_like(same), keep=False)
+    wanted = _gradients(want, weights, same)
+    finite = all(bool(t.isfinite().all()) for t in (*got.images.values(), *grads.values(), *everywhere.values()))
+    gradient_errors = {key: _relative(grads[key], wanted[key]) for key in wanted}
+    worst = max(gradient_errors, key=lambda key: _order(gradient_errors[key])) if gradient_errors else ""
+    probe_forward, probe_gradient = [0.0], [0.0]
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(PROBES):
+        moved = _map(rounded, lambda t: t * (1 + ROUNDING[dtype] * _signs(t, generator)))
+        other = _by_reference(moved, near)
+        agree = ((other.blended == want.blended) & ((other.low_pass == want.low_pass) | ~want.blended)).all(1)
+        probe_forward.append(_image_error(other.images, want.images, agree))
+        here, there = (_gradients(result, weights, agree & same) for result in (want, other))
+        probe_gradient += [_relative(there[key], here[key]) for key in here]
+    return Errors(
+        forward=_image_error(got.images, want.images, same),
+        gradient=gradient_errors.get(worst, 0.0),
+        worst=worst,
+        flipped=1.0 - same.double().mean().item(),
+        input_forward=max(probe_forward),
+        input_gradient=max(probe_gradient),
+        drawn=int(want.blended.sum()),
+        finite=finite,
+    )
+
+
+def _map(case: SceneCase, function) -> SceneCase:
+    params = {key: function(value) for key, value in case.params.items()}
+    return replace(case, params=params, viewmat=function(case.viewmat), K=function(case.K))
+
+
+def _signs(like: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.randint(0, 2, like.shape, generator=generator).double() * 2 - 1
+
+
+def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, rim: float = RIM) -> _Result:
+    leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
+    camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
+    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near)
+    fragments = ops.trace(projection, rim)
+    base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
+    colors = ops.shade(fragments, base, projection.frames)
+    image = ops.composite_image(fragments, projection, colors, maps=True)
+    shape = (case.width * case.height, len(leaves["means"]))
+    blended, low_pass = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
+    pixel, surfel = fragments.pixel.cpu().long(), fragments.surfel.cpu().long()
+    blended[pixel, surfel] = True
+    low_pass[pixel, surfel] = fragments.sigma.cpu() < 0
+    return _Result({key: image[:, CHANNELS[key]] for key in IMAGES}, blended, low_pass, leaves)
+
+
+def _by_reference(case: SceneCase, near: float, rim: float = RIM) -> _Result:
+    leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
+    directions = reference_render.view_directions(leaves["means"], case.viewmat)
+    colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
+    geometry = [leaves[key] for key in SURFEL_KEYS]
+    result = reference_render.render(
+        *geometry, colors, case.viewmat, case.K, case.width, case.height, near=near, rim=rim
+    )
+    images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
+    return _Result(images, result.trace.blended, result.trace.low_pass, leaves)
+
+
+def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Random weights a pixel and channel; each image counts by its own size."""
+    generator = torch.Generator().manual_seed(1)
+    weights = {}
+    for key, image in images.items():
+        scale = image.detach().abs().max().item() if image.numel() else 0.0
+        random = torch.rand(image.shape, generator=generator, dtype=torch.float64) - 0.3
+        weights[key] = random / scale if scale > NOTHING else random
+    return weights
+
+
+def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep: bool = True) -> dict[str, Tensor]:
+    """d sum(weights * images over `pixels`) / d leaves, float64 on the CPU."""
+    leaves = result.leaves
+    loss = 0.0
+    for key, image in result.images.items():
+        weight = torch.where(pixels[:, None], weights[key], 0.0)
+        loss = loss + (image * weight.to(image)).sum()
+    grads = torch.autograd.grad(loss, list(leaves.values()), retain_graph=keep, allow_unused=True)
+    return {
+        key: torch.zeros_like(leaf, dtype=torch.float64, device="cpu") if grad is None else grad.detach().double().cpu()
+        for (key, leaf), grad in zip(leaves.items(), grads, strict=True)
+    }
+
+
+def _image_error(got: dict[str, Tensor], want: dict[str, Tensor], pixels: Tensor) -> float:
+    errors = [0.0]
+    for key, image in want.items():
+        values = image.detach()
+        error = (got[key].detach().double().cpu() - values).abs()[pixels]
+        scale = values.abs().max().item() if values.numel() else 0.0
+        if error.numel():
+            errors.append(error.max().item() / scale if scale > NOTHING else error.max().item())
+    return max(errors, key=_order)
+
+
+def _relative(got: Tensor, want: Tensor) -> float:
+    if not want.numel():
+        return 0.0
+    scale, error = want.abs().max().item(), (got - want).abs().max().item()
+    return error / scale if scale > NOTHING else error
+
+
+def _order(error: float) -> float:
+    """For comparisons: what is not a number is the largest error."""
+    return math.inf if math.isnan(error) else error
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Errors against extended precision (`ops.reference.extended`), where even float64 may lose figures."""
+
+    forward: float
+    """Largest error of alpha, depth, normal and Beta map over the pixels where both blend the same surfels."""
+    gradient: float
+    """Largest error of a directional derivative of the loss, one random direction a geometry parameter, relative to
+    the root of the sum of squares of the products that it sums."""
+
+
+def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> Trust:
+    """The float64 reference, or a backend in float64, against extended precision.
+
+    Args:
+        case: scene and camera; rounded to float32 as for `measure`.
+        backend: what to measure; None = the reference.
+        near: nearest depth that is drawn, camera z.
+    """
+    rounded = _map(case, lambda t: t.float().double())
+    if backend is None:
+        got = _by_reference(rounded, near, rim=0.0)
+    else:
+        with backend.use():
+            got = _by_kernels(rounded, backend.device, torch.float64, near, rim=1e-30)
+    names = ("alpha", "depth", "normal", "beta_map")
+    plain = {key: rounded.params[key].numpy() for key in SURFEL_KEYS}
+
+    def run(params: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], extended.Extended]:
+        view = (rounded.viewmat.numpy(), rounded.K.numpy(), case.width, case.height, near)
+        result = extended.render(*(params[key] for key in SURFEL_KEYS), *view)
+        arrays = (result.alpha[:, None], result.depth[:, None], result.normal, result.beta[:, None])
+        return dict(zip(names, arrays, strict=True)), result
+
+    images, result = run(plain)
+    same = (result.blended == got.blended.numpy()) & ((result.low_pass == got.low_pass.numpy()) | ~result.blended)
+    same = same.all(1)  # [P]
+    pixels = torch.from_numpy(same)
+    exact = {key: torch.from_numpy(value.real.astype(np.float64)) for key, value in images.items()}
+    forward = _image_error({key: got.images[key] for key in names}, exact, pixels)
+    weights = _loss_weights(exact)
+    grads = _gradients(replace(got, images={key: got.images[key] for key in names}), weights, pixels)
+    rng, worst, step = np.random.default_rng(0), 0.0, np.longdouble(1e-200)
+    for key in SURFEL_KEYS:
+        direction = rng.standard_normal(plain[key].shape)
+        moved, _ = run({**plain, key: plain[key] + 1j * step * direction.astype(np.clongdouble)})
+        terms = [np.where(same[:, None], weights[name].numpy(), 0.0) * moved[name].imag for name in names]
+        slope = float(sum(term.sum() for term in terms) / step)
+        products = grads[key].numpy() * direction
+        size, error = math.sqrt((products**2).sum()), abs(slope - products.sum())
+        worst = max(worst, error / size if size > NOTHING else error, key=_order)
+    return Trust(forward, worst)

@@ -1,0 +1,219 @@
+"""docs/stability.md: what float32 costs, case by case and along each kind of stiffness."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bitymi_ns.files import check_writable, write_file
+from bitymi_ns.measure import markdown
+from bitymi_ns.measure.stability.backends import BACKENDS, Backend
+from bitymi_ns.measure.stability.cases import cases
+from bitymi_ns.measure.stability.errors import PROBES, RIM, ROUNDING, Errors, Trust, against_extended, measure
+from bitymi_ns.measure.stability.scenes import SceneCase
+from bitymi_ns.measure.stability.sweeps import SWEEPS, Sweep
+
+ACCURATE = 1e-4
+"""Largest error that counts as accurate."""
+STEPS = round(1 / (255 * ACCURATE))
+"""So many times ACCURATE is an 8-bit step."""
+ALLOWANCE = 4.0
+"""A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
+EXTENDED_SIZE = 20_000
+"""Largest number of pixels times surfels for which extended precision is evaluated."""
+
+INTRODUCTION = """\
+# Numerical stability
+
+Written by `bitymi stability`; measured on backend `{backend}`. What the formulas do about each of these cases, and why,
+is in [numerics.md](numerics.md); `tests/stress` holds every backend to the figures that
+`bitymi_ns/measure/stability/cases.py` states.
+
+**Error**: largest error over all pixels of rgb, alpha, depth, normal and Beta map (forward), and over all gradients of
+a random linear loss of these images (gradient), each relative to the largest value of its kind. The reference is
+float64 (brute force, `ops/reference`) and gets the same inputs, rounded to float32. Pixels in which a threshold (1/255,
+the end of the transmittance, the branch of the kernel) falls to the other side are not compared; **flipped** is their
+share. Gradients use the same bound at the rim of the kernel on both sides (`scene.rim`, {rim:g}).
+
+**Inputs**: how much the float64 reference itself moves when every input number is moved by half a unit in its last
+float32 place (the worst of {probes} random draws). No formula in float32 can be asked to do better than that on inputs
+that were rounded once. Divided by 2^-24 it is the condition number of the case.
+
+**float64**: the same kernels in double against the reference. **Reference**: the float64 reference against a separate
+evaluation in extended precision (64 bits of mantissa; gradients by complex steps); a dash where it is too large for
+that.
+
+**Verdict**: *accurate*: both errors at most {accurate:g}, 1/{steps} of an 8-bit step; *as the inputs allow*: at
+most {allowance:g} times what rounding the inputs does; *nothing drawn*; else *loses figures*.
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured on one scene."""
+
+    label: str
+    single: Errors
+    double: Errors
+    trust: Trust | None
+
+    @property
+    def verdict(self) -> str:
+        """One of the verdicts that the page explains."""
+        e = self.single
+        if not e.finite:
+            return "**not finite**"
+        if e.drawn == 0:
+            return "nothing drawn"
+        pairs = ((e.forward, e.input_forward), (e.gradient, e.input_gradient))
+        if all(error <= ACCURATE for error, _ in pairs):
+            return "accurate"
+        if all(error <= max(ACCURATE, ALLOWANCE * allowed) for error, allowed in pairs):
+            return "as the inputs allow"
+        return "**loses figures**"
+
+
+def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2) -> Row:
+    """Everything that a line of a table shows."""
+    size = scene.width * scene.height * len(scene.params["means"])
+    trust = against_extended(scene, near=near) if size <= EXTENDED_SIZE else None
+    double = measure(scene, backend, torch.float64, near)
+    return Row(label, measure(scene, backend, torch.float32, near), double, trust)
+
+
+def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None) -> list[Row]:
+    """Measure all cases and sweeps and write the page and, beside it, the plot `<stem>.png`.
+
+    Args:
+        path: of the Markdown file.
+        backend: what to measure.
+        progress: told what is being measured.
+
+    Returns:
+        The rows of the cases and the sweeps.
+    """
+    tell = progress or (lambda text: None)
+    check_writable(path)
+    named = []
+    for case in cases():
+        tell(f"case {case.name}")
+        named.append(measure_row(case.name.replace("_", " "), case.scene, backend))
+    swept: dict[str, list[Row]] = {}
+    for sweep in SWEEPS:
+        tell(f"sweep {sweep.name}")
+        swept[sweep.name] = [
+            measure_row(f"{value:g}", sweep.make(value), backend, sweep.near(value)) for value in sweep.values
+        ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = path.with_suffix(".png")
+    write_file(picture, _plot(swept))
+    write_file(path, _page(backend, named, swept, picture.name).encode())
+    return named + [row for rows in swept.values() for row in rows]
+
+
+def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:
+    parts = [
+        INTRODUCTION.format(
+            backend=backend.name, rim=RIM, probes=PROBES, accurate=ACCURATE, steps=STEPS, allowance=ALLOWANCE
+        ),
+        "## Error against stiffness\n",
+        f"![Error against stiffness, eight kinds]({picture})\n",
+        "Solid: float32. Dashed: what rounding the inputs does. Dotted: float64. Errors below 1e-17 are drawn there.\n",
+    ]
+    for sweep in SWEEPS:
+        parts += [f"### {sweep.name}: {sweep.axis}\n", _table(sweep.name, swept[sweep.name])]
+    parts += ["## Cases\n", _table("case", named)]
+    return "\n".join(parts)
+
+
+HEADER = (
+    "drawn",
+    "condition",
+    "forward",
+    "inputs",
+    "gradient",
+    "inputs",
+    "worst in",
+    "flipped",
+    "float64 forward",
+    "float64 gradient",
+    "reference forward",
+    "reference gradient",
+    "verdict",
+)
+
+
+def _table(first: str, rows: Sequence[Row]) -> str:
+    lines = []
+    for row in rows:
+        e, d = row.single, row.double
+        cells = [
+            f"{e.drawn:,}",
+            f"{max(e.input_forward, e.input_gradient) / ROUNDING[torch.float32]:.0e}",
+            _short(e.forward),
+            _short(e.input_forward),
+            _short(e.gradient),
+            _short(e.input_gradient),
+            e.worst if e.gradient else "",
+            f"{100 * e.flipped:.2g} %" if e.flipped else "0",
+            _short(d.forward),
+            _short(d.gradient),
+            _short(row.trust.forward) if row.trust else "-",
+            _short(row.trust.gradient) if row.trust else "-",
+            row.verdict,
+        ]
+        lines.append([row.label, *cells])
+    return markdown.table([first, *HEADER], lines, (0, len(HEADER))) + "\n"
+
+
+def _short(value: float) -> str:
+    return "0" if value == 0 else f"{value:.1e}"
+
+
+FORWARD, GRADIENT, DOUBLE = "#0b62b8", "#d1540b", "#6b6f76"
+LOWEST = 1e-17
+
+
+def _plot(swept: dict[str, list[Row]]) -> bytes:
+    figure = Figure(figsize=(13, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, sweep in zip(figure.subplots(2, 4, sharey=True).flat, SWEEPS, strict=True):
+        _panel(axes, sweep, swept[sweep.name])
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=6, fontsize=9, frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=90)
+    return buffer.getvalue()
+
+
+def _panel(axes: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
+    x = sweep.values
+    lines = (
+        ("float32 images", FORWARD, "-", "o", [r.single.forward for r in rows]),
+        ("rounded inputs, images", FORWARD, "--", "", [r.single.input_forward for r in rows]),
+        ("float32 gradients", GRADIENT, "-", "s", [r.single.gradient for r in rows]),
+        ("rounded inputs, gradients", GRADIENT, "--", "", [r.single.input_gradient for r in rows]),
+        ("float64 images", DOUBLE, ":", "", [r.double.forward for r in rows]),
+        ("float64 gradients", DOUBLE, "-.", "", [r.double.gradient for r in rows]),
+    )
+    for label, color, style, marker, values in lines:
+        shown = [max(value, LOWEST) for value in values]
+        axes.plot(x, shown, color=color, linestyle=style, marker=marker, markersize=4, linewidth=1.3, label=label)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(LOWEST / 2, 30)
+    if x[-1] < x[0]:
+        axes.invert_xaxis()  # stiffer to the right
+    axes.set_title(sweep.name, fontsize=10)
+    axes.set_xlabel(sweep.axis, fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.grid(color="#e3e5e8", linewidth=0.6)
+    if axes.get_subplotspec().is_first_col():
+        axes.set_ylabel("relative error", fontsize=8)

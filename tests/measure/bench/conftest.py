@@ -1,0 +1,130 @@
+"""Stand-ins for nerfstudio's console scripts: they write what the real ones would, in no time, and keep a log."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.measure.bench import Bundle, Matrix, Row, SceneSpec
+
+FAKE = """#!{python} -SE
+import json, os, pathlib, sys, time
+
+def given(name):
+    return sys.argv[sys.argv.index(name) + 1]
+
+name = pathlib.Path(sys.argv[0]).name
+call = " ".join([name, *sys.argv[1:]])
+with open({log!r}, "a") as log:
+    log.write(call + "\\n")
+for line in pathlib.Path({plan!r}).read_text().splitlines():
+    if line and all(word in call for word in line.split()):
+        print("something is wrong with the capture")
+        sys.exit(3)
+while any(all(word in call for word in line.split()) for line in pathlib.Path({slow!r}).read_text().splitlines()):
+    time.sleep(0.05)
+print(os.environ["OMP_WAIT_POLICY"])
+if name == "ns-train":
+    run = pathlib.Path(given("--output-dir"), given("--experiment-name"), sys.argv[1], given("--timestamp"))
+    run.mkdir(parents=True)
+    (run / "config.yml").write_text("config")
+    steps = int(given("--max-num-iterations"))
+    points = [dict(step=s, seconds=s / 10, cpu_seconds=s / 5, surfels=100 + s, psnr=20 + s / steps, fragments=7.0,
+                   experiment_name=given("--experiment-name"), method_name=sys.argv[1]) for s in (steps // 2, steps)]
+    (run / "training_curve.jsonl").write_text("".join(json.dumps(p) + "\\n" for p in points))
+elif name == "ns-export":
+    bundle = pathlib.Path(given("--output-dir"))
+    bundle.mkdir(parents=True)
+    files = dict(zip(["surfels.ply", "atlas.ktx2"], [dict(bytes=1000), dict(bytes=5000)]))
+    info = dict(files=files, atlas=dict(format=given("--format"), file="atlas.ktx2"), statistics=dict(
+        surfels=dict(kept=100), texels=dict(nyquist=9999, after_cap_by_views=1600),
+        held_out=dict(psnr_baked_against_neural=50.0)))
+    (bundle / "bundle.json").write_text(json.dumps(info))
+    (bundle / "config.yml").write_text("config")
+elif name == "ns-eval":
+    assert pathlib.Path(given("--load-config")).is_file()
+    baked = "/bundles/" in given("--load-config")
+    results = dict(psnr=21.0 - 0.01 * baked, ssim=0.8, flip=0.1, lpips=float("nan"), surfels=120.0,
+                   render_ms=9.0 - 5 * baked, fragments_per_pixel=8.0)
+    if baked:
+        results["atlas_bytes"] = 5000.0
+    pathlib.Path(given("--output-path")).write_text(json.dumps(dict(results=results)))
+elif "pictures" in sys.argv:
+    folder = pathlib.Path(given("--output-dir"))
+    folder.mkdir(parents=True)
+    view = dict(view=3, rank=1, of=7, metrics=dict(psnr=19.5), files=dict(photo="view0003-photo.png"))
+    text = dict(bitymi_pictures=1, scene="fox", method="bitymi", captions=dict(photo="photograph"), views=[view])
+    (folder / "pictures.json").write_text(json.dumps(text))
+else:
+    point = dict(knob="r_max", value=64, renderer="baked", exact=False, default=True, max_steps=2.0, mean_steps=0.1,
+                 psnr_exact=60.0, psnr=21.0, ms=5.0, cpu_ms=9.0, bytes=5000)
+    pathlib.Path(given("--output")).write_text(json.dumps(point) + "\\n")
+"""
+TOOLS = ("ns-train", "ns-export", "ns-eval", "bitymi")
+
+
+class Fakes:
+    """The stand-ins: what was called, which calls fail, and (`slow`) which wait until they are no longer named."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.log, self.plan, self.slow = folder / "log", folder / "fail", folder / "slow"
+        for file in (self.log, self.plan, self.slow):
+            file.write_text("")
+        text = FAKE.format(python=sys.executable, log=str(self.log), plan=str(self.plan), slow=str(self.slow))
+        for name in TOOLS:
+            (folder / name).write_text(text)
+            (folder / name).chmod(0o755)
+
+    def calls(self) -> list[str]:
+        """Command lines so far, and forget them."""
+        lines = self.log.read_text().splitlines()
+        self.log.write_text("")
+        return lines
+
+    def fail(self, *lines: str) -> None:
+        """Calls that contain all words of one of the lines end with status 3."""
+        self.plan.write_text("\n".join(lines))
+
+    def python(self, monkeypatch: pytest.MonkeyPatch) -> str:
+        """A Python that finds the stand-ins beside it, for code in other processes."""
+        link = self.folder / "python"
+        link.symlink_to(Path(sys.executable).resolve())
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+        return str(link)
+
+
+@pytest.fixture
+def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
+    """Stand-ins in the place of the console scripts."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    found = Fakes(folder)
+    monkeypatch.setattr("bitymi_ns.measure.bench.commands.tool", lambda name: str(folder / name))
+    return found
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Callable[[str], Path]:
+    """Make the folder of a capture."""
+
+    def make(name: str) -> Path:
+        folder = tmp_path / "captures" / name
+        folder.mkdir(parents=True)
+        (folder / "transforms.json").write_text(json.dumps({"frames": []}))
+        return folder
+
+    return make
+
+
+@pytest.fixture
+def matrix(capture: Callable[[str], Path]) -> Matrix:
+    """Two captures, two seeds, one format, with pictures and knobs: 24 cells."""
+    scenes = [SceneSpec(name, capture(name)) for name in ("fox", "lego")]
+    bundles = [Bundle("bc7", ("--format", "bc7"))]
+    return Matrix(scenes, [Row("bitymi", "bitymi")], (0, 1), 100, bundles, pictures=1, knobs=True)

@@ -1,0 +1,232 @@
+"""The matrix engine: what is done, what is skipped, and what a failure or a kill costs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.cli import main
+from bitymi_ns.files import Lock
+from bitymi_ns.measure.bench import BenchError, CommandFailed, Matrix, Row, Stage, engine, open_cells, run_chains
+from bitymi_ns.measure.bench.cells import Cells, identity
+from bitymi_ns.measure.bench.process import run_measured, tool
+
+
+def lines(work: Path) -> list[dict]:
+    return [json.loads(line) for line in (work / "cells.jsonl").read_text().splitlines()]
+
+
+def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    assert run_chains(work, matrix.chains()) == []
+    cells = lines(work)
+    assert len(cells) == 24 and len({identity(c["key"]) for c in cells}) == 24
+    kinds = [c["key"]["cell"] for c in cells[:6]]
+    assert kinds == ["train", "eval", "export", "eval", "pictures", "knobs"]
+    train = cells[6]
+    assert train["key"]["seed"] == 1 and train["key"]["steps"] == 100 and train["key"]["scene"] == "fox"
+    assert train["value"]["seconds"] == 10 and train["value"]["process_cpu_seconds"] > 0
+    assert (work / train["value"]["curve"]).is_file()
+    assert cells[2]["value"]["bytes"] > 6000 and cells[2]["value"]["format"] == "bc7"
+    assert cells[3]["value"]["results"]["lpips"] is None  # NaN is no JSON
+    assert cells[5]["value"]["points"][0]["knob"] == "r_max"
+    for cell in cells:
+        assert cell["made"]["machine"] and cell["made"]["versions"]["python"] and cell["made"]["command"]
+    log = (work / "logs" / "fox" / "bitymi").glob("*/train-neural.log")
+    assert "passive" in next(log).read_text()
+
+
+def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    run_chains(tmp_path / "work", matrix.chains()[1:2])
+    train, neural, export, baked, pictures, knobs = fakes.calls()
+    assert train.startswith("ns-train bitymi ") and train.endswith("captures/fox")
+    for words in ("--machine.seed 1", "--pipeline.model.train.seed 1", "--max-num-iterations 100", "--vis none"):
+        assert words in train
+    assert export.startswith("ns-export bitymi-atlas --load-config ") and export.endswith("--format bc7")
+    assert neural.startswith("ns-eval --load-config ") and "/bundles/" in baked
+    assert pictures.startswith("bitymi bench pictures ") and knobs.startswith("bitymi bench knobs ")
+
+
+def test_finished_cells_are_skipped(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    run_chains(tmp_path / "work", matrix.chains())
+    fakes.calls()
+    renamed = Matrix(matrix.scenes, [Row("another name", "bitymi")], (0, 1), 100, matrix.bundles, 1, True)
+    assert run_chains(tmp_path / "work", matrix.chains()) == run_chains(tmp_path / "work", renamed.chains()) == []
+    assert fakes.calls() == []
+
+
+@pytest.mark.parametrize("at", range(6))
+def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
+    work, chain = tmp_path / "work", matrix.chains()[0]
+    calls = iter(range(99))
+
+    def killed(command: list[str], log: Path, lock: Lock) -> object:
+        if next(calls) == at:
+            if "--output-dir" in command:  # half of its files are there
+                Path(command[command.index("--output-dir") + 1]).mkdir(parents=True, exist_ok=True)
+            raise KeyboardInterrupt
+        return run_measured(command, log, lock)
+
+    monkeypatch.setattr(engine, "run_measured", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_chains(work, [chain])
+    done = len(lines(work)) if at else 0
+    assert done == at
+    fakes.calls()
+    monkeypatch.setattr(engine, "run_measured", run_measured)
+    assert run_chains(work, [chain]) == []
+    assert len(fakes.calls()) == 6 - at and len(lines(work)) == 6
+
+
+def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
+    fakes, matrix: Matrix, capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work, python = tmp_path / "work", fakes.python(monkeypatch)
+    words = [python, "-m", "bitymi_ns.cli", "bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10"]
+    words += ["--formats", "bc7", "--pictures", "0", "--work", str(work)]
+    fakes.slow.write_text("ns-export")
+    process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not any(call.startswith("ns-export") for call in fakes.log.read_text().splitlines()):
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert len(lines(work)) == 2
+    again = subprocess.run(words, capture_output=True, text=True, check=False)
+    named = re.search(r"fox, bitymi: process (\d+) is at work there: wait for it, or end it", again.stderr)
+    assert again.returncode == 1 and named is not None and int(named[1]) != process.pid
+    assert b"ns-export" in Path(f"/proc/{named[1]}/cmdline").read_bytes()  # its export still runs
+    fakes.calls()
+    fakes.slow.write_text("")
+    while subprocess.run(words, capture_output=True, check=False).returncode != 0:
+        assert time.monotonic() < deadline
+    assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"] and len(lines(work)) == 4
+
+
+def test_a_line_that_was_cut_off_is_that_cell_alone(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    work, chain = tmp_path / "work", matrix.chains()[0]
+    run_chains(work, [chain])
+    fakes.calls()
+    text = (work / "cells.jsonl").read_text()
+    (work / "cells.jsonl").write_text(text[:-40])
+    assert run_chains(work, [chain]) == []
+    assert len(fakes.calls()) == 1
+    assert [identity(c["key"]) for c in lines(work)] == [identity(s.key) for s in chain]
+
+
+def test_a_training_that_is_done_again_takes_its_cells_with_it(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    work, chain = tmp_path / "work", matrix.chains()[0]
+    run_chains(work, [chain])
+    fakes.calls()
+    text = (work / "cells.jsonl").read_text().splitlines(keepends=True)
+    (work / "cells.jsonl").write_text("".join(text[1:]))
+    run_chains(work, [chain])
+    assert len(fakes.calls()) == 6
+    (work / "cells.jsonl").write_text("".join([*text[:2], *text[3:]]))  # without the export
+    run_chains(work, [chain])
+    assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"]
+
+
+def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    fakes.fail("ns-train captures/fox", "ns-export /lego/ -seed1")
+    failures = run_chains(work, matrix.chains())
+    assert len(failures) == 3
+    assert "fox, bitymi, seed 0: training failed" in failures[0] and "status 3" in failures[0]
+    assert "something is wrong with the capture" in failures[0]
+    assert "export (bc7) failed" in failures[2]
+    assert len(lines(work)) == 6 + 4  # the second lego run has no export and no evaluation of it
+    fakes.fail()
+    fakes.calls()
+    assert run_chains(work, matrix.chains()) == []
+    assert len(fakes.calls()) == 12 + 2
+
+
+def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    (fakes.folder / "ns-eval").write_text("#!/bin/sh\nexit 0\n")
+    (failure, *_) = run_chains(tmp_path / "work", matrix.chains()[:1])
+    assert "evaluation (neural)" in failure and "no figures" in failure
+
+
+def test_two_benchmarks_do_not_work_on_one_run(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    work, chain = tmp_path / "work", matrix.chains()[0]
+    with engine.locked(work, chain[0]):
+        (failure,) = run_chains(work, [chain])
+    assert f"process {os.getpid()} is at work there" in failure and fakes.calls() == []
+
+
+def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
+    other = Matrix(matrix.scenes[:1], [Row("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1, True)
+    assert run_chains(tmp_path / "work", other.chains()) == []
+    assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
+    (cell, _) = lines(tmp_path / "work")
+    assert "seconds" not in cell["value"] and cell["value"]["process_seconds"] >= 0
+
+
+def test_broken_cells_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "cells.jsonl"
+    path.write_text('{"key": {"cell": "train"}, "value": {}}\nhello\n{"key": {}, "value": {}}\n')
+    with pytest.raises(BenchError, match=r"cells\.jsonl, line 2, is not a finished cell"):
+        Cells(path)
+    path.write_text('{"key": {"cell": "train"}, "value": {}}\n{"key": {"cel')
+    assert len(Cells(path)) == 1
+
+
+def test_several_writers_share_a_file(tmp_path: Path) -> None:
+    first, second = Cells(tmp_path / "cells.jsonl"), Cells(tmp_path / "cells.jsonl")
+    first.add({"cell": "a"}, {"x": 1}, {})
+    second.add({"cell": "b"}, {"x": 2}, {})
+    assert first.get({"cell": "b"}) is None
+    first.refresh()
+    assert first.get({"cell": "b", "suite": "any"})["value"] == {"x": 2} and len(first) == 2
+
+
+def test_empty_matrix_and_missing_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(BenchError, match="nothing to run"):
+        run_chains(tmp_path, [])
+    with pytest.raises(BenchError, match="there is no ns-nothing"):
+        tool("ns-nothing")
+    with pytest.raises(CommandFailed, match="cannot be started"):
+        run_measured([str(tmp_path / "nothing")], tmp_path / "log")
+
+
+def test_no_file_is_named_that_is_not_there(
+    fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work = tmp_path / "work"
+    words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(work)]
+    fakes.fail("ns-train")
+    assert main(words) == 1
+    told = capsys.readouterr().err
+    assert "No cell was finished." in told and "cells.jsonl" not in told
+
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bitymi_ns.measure.bench.cli.run_chains", interrupted)
+    assert main(words) == 130
+    assert "interrupted; no cell was finished. The same command goes on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--work", "--output"])
+def test_places_that_cannot_be_written_are_found_first(
+    fakes, matrix: Matrix, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(tmp_path / "work")]
+    assert main([*words, option, str(tmp_path / "file" / "x")]) == 1
+    assert f"x cannot be written: {tmp_path / 'file'} is not a folder" in capsys.readouterr().err
+    assert fakes.calls() == []
+
+
+def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> None:
+    runs = matrix.runs()
+    assert len({run.folder for run in runs}) == 4
+    assert open_cells(Path("/nowhere")).get(Stage(runs[0], "train").key) is None

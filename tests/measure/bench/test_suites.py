@@ -1,0 +1,199 @@
+"""Suites, plans and the command line of a matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns import cli
+from bitymi_ns.measure.bench import BenchError
+from bitymi_ns.measure.bench.suites import format_bundles, local_scenes, read_plan, standard_scenes, suites
+from bitymi_ns.presets import preset_names
+
+
+def make_suite(root: Path, name: str) -> Path:
+    """The folders that a standard data set has."""
+    for scene, images in suites()[name].scenes.items():
+        if suites()[name].layout == "colmap":
+            (root / scene / images).mkdir(parents=True)
+            (root / scene / "sparse" / "0").mkdir(parents=True)
+        else:
+            (root / scene).mkdir(parents=True)
+            for split in ("train", "val", "test"):
+                (root / scene / f"transforms_{split}.json").write_text("{}")
+    return root
+
+
+def test_standard_suites_are_the_published_ones() -> None:
+    found = suites()
+    assert {name: len(suite.scenes) for name, suite in found.items()} == {
+        "mipnerf360": 9,
+        "tanksandtemples": 2,
+        "nerf-synthetic": 8,
+    }
+    images = found["mipnerf360"].scenes
+    assert {s for s, folder in images.items() if folder == "images_2"} == {"bonsai", "counter", "kitchen", "room"}
+    assert {s for s, f in images.items() if f == "images_4"} == {"bicycle", "flowers", "garden", "stump", "treehill"}
+
+
+def test_mipnerf360_is_read_by_the_colmap_parser(tmp_path: Path) -> None:
+    bicycle, room = standard_scenes(suites()["mipnerf360"], make_suite(tmp_path, "mipnerf360"), ["bicycle", "room"])
+    parser = " ".join(bicycle.parser)
+    assert parser.startswith("colmap --images-path images --colmap-path sparse/0 --downscale-factor 4")
+    assert "--eval-mode interval --eval-interval 8" in parser and "--downscale-rounding-mode round" in parser
+    assert "--downscale-factor 2" in " ".join(room.parser) and room.suite == "mipnerf360"
+
+
+def test_other_suites(tmp_path: Path) -> None:
+    train, truck = standard_scenes(suites()["tanksandtemples"], make_suite(tmp_path / "a", "tanksandtemples"))
+    assert "--downscale-factor 1" in " ".join(train.parser) and truck.name == "truck"
+    scenes = standard_scenes(suites()["nerf-synthetic"], make_suite(tmp_path / "b", "nerf-synthetic"))
+    assert len(scenes) == 8 and scenes[0].parser == ("blender-data",) and scenes[0].hold_out == 0
+
+
+def test_a_folder_of_another_layout_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bicycle" / "images_4").mkdir(parents=True)
+    with pytest.raises(BenchError, match=r"not Mip-NeRF 360's bicycle: there is no sparse/0"):
+        standard_scenes(suites()["mipnerf360"], tmp_path, ["bicycle"])
+    with pytest.raises(BenchError, match="has no scene fox; it has bicycle"):
+        standard_scenes(suites()["mipnerf360"], tmp_path, ["fox"])
+
+
+def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
+    lego = tmp_path / "lego"
+    lego.mkdir()
+    (lego / "transforms_train.json").write_text("{}")
+    (lego / "hull_pc.ply").write_text("")
+    first, second = local_scenes([capture("fox"), lego])
+    assert first.parser == () and first.hold_out == 8
+    assert second.parser == ("blender-data", "--ply-path", "hull_pc.ply")
+    with pytest.raises(BenchError, match="is not a capture"):
+        local_scenes([tmp_path / "captures"])
+    with pytest.raises(BenchError, match="different names"):
+        local_scenes([lego, lego])
+    with pytest.raises(BenchError, match="give --data"):
+        local_scenes([])
+
+
+@pytest.mark.parametrize("name", ["ablation", "overdraw", "paper", "resolution"])
+def test_plans_name_methods_that_there_are(name: str) -> None:
+    rows, bundles = read_plan(name)
+    assert {row.method for row in rows} <= set(preset_names()) and len({row.name for row in rows}) == len(rows) > 2
+    assert bundles is None if name == "paper" else len(bundles) == (name == "overdraw")
+
+
+def test_the_atlas_plan_compares_rules_of_one_run() -> None:
+    rows, bundles = read_plan("atlas")
+    assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "local-voxel"]
+    assert all("--format bc7" in " ".join(b.options) for b in bundles)
+
+
+def test_a_plan_of_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text('rows: {a: {method: bitymi, options: [--x, 0.5]}}\nbundles: {small: [--r-max, "16"]}\n')
+    (row,), (bundle,) = read_plan(str(path))
+    assert row.options == ("--x", "0.5") and bundle.options == ("--r-max", "16")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("rows: [", "is not valid YAML"),
+        ("rows: {}", "'rows' must map names"),
+        ("rows: {a: bitymi}", "row a: it must be"),
+        ("rows: {a: {method: bitymi, option: []}}", "row a: it must be"),
+        ("rows: {a: {method: bitymi, options: --x}}", "options must be a list"),
+        ("rows: {a: {method: bitymi}}\nbundle: {}", "unknown entry bundle"),
+        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "a bundle's name"),
+        ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "'bundles' must map names"),
+    ],
+)
+def test_a_malformed_plan_says_where(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text(text)
+    with pytest.raises(BenchError, match=reason):
+        read_plan(str(path))
+
+
+def test_unknown_plan_and_format() -> None:
+    with pytest.raises(BenchError, match="there is no plan x: give ablation"):
+        read_plan("x")
+    with pytest.raises(BenchError, match="no atlas format jpeg"):
+        format_bundles(["jpeg"])
+
+
+def run(*words: object) -> int:
+    return cli.main(["bench", *map(str, words)])
+
+
+def test_the_command_prints_the_table_and_skips_what_is_done(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["local", "--data", capture("fox"), "--steps", 10, "--formats", "bc7", "--pictures", 0]
+    words += ["--work", tmp_path / "w", "--output", tmp_path / "table.md", "--extra=--a.b 1"]
+    assert run(*words) == 0
+    out = capsys.readouterr().out
+    assert "| fox | bitymi | bc7 | 20.99 | 0.8000 | 0.1000 |" in out and "-0.010 |" in out
+    assert (tmp_path / "table.md").read_text() in out
+    assert "--a.b 1" in fakes.calls()[0]
+    assert run(*words) == 0
+    assert fakes.calls() == [] and "4 of 4 cells are finished" in capsys.readouterr().err
+
+
+def test_several_bundles_are_compared(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7", "--pictures", 0)
+    assert run(*words, "--work", tmp_path / "w") == 0
+    out = capsys.readouterr().out
+    assert "| fox | bitymi | bc7 | 100 | 16 | 5,000 | 1.000 | -0.010 | 50.00 | 0.0000 | 4.0 |" in out
+
+
+def test_a_plan_by_the_command(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("local", "--data", capture("fox"), "--steps", 10, "--plan", "ablation", "--pictures", 0)
+    assert run(*words, "--work", tmp_path / "w") == 0
+    out = capsys.readouterr().out
+    assert "| fox | falloff 0.001 | neural |" in out and len(fakes.calls()) == 20
+
+
+def test_failures_end_with_status_1(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fakes.fail("ns-export")
+    words = ("local", "--data", capture("fox"), "--steps", 10, "--formats", "bc7", "--pictures", 0)
+    assert run(*words, "--work", tmp_path / "w") == 1
+    captured = capsys.readouterr()
+    assert "- Failed: fox, bitymi: export (bc7) failed" in captured.out and "status 3" in captured.err
+
+
+def test_ctrl_c_says_how_to_go_on(
+    fakes, capture: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bitymi_ns.measure.bench.engine.run_measured", interrupted)
+    assert run("local", "--data", capture("fox"), "--steps", 10, "--work", tmp_path / "w") == 130
+    assert "interrupted; no cell was finished. The same command goes on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("local", "--data", "/nowhere"), "is not a capture"),
+        (("mipnerf360", "--data", "/nowhere"), "not Mip-NeRF 360's bicycle"),
+        (("mipnerf360", "--data", "/a", "/b"), "--data is one folder"),
+        (("local", "--data", "/a", "--scenes", "x"), "--scenes chooses"),
+        (("local", "--data", "/a", "--steps", "0"), "--steps must be"),
+        (("local", "--data", "/a", "--jobs", "2"), "are for --cluster"),
+        (("local", "--data", "/a", "--pictures", "-1"), "--pictures must not"),
+    ],
+)
+def test_mistakes_are_one_line(words: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*words) == 1
+    error = capsys.readouterr().err
+    assert reason in error and error.startswith("bitymi: ") and error.count("\n") == 1

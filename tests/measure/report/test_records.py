@@ -1,0 +1,129 @@
+"""Reading evaluations and curves: what they hold, and what broken files say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.measure.report.collect import collect
+from bitymi_ns.measure.report.records import ReportError, evaluation_from, neural_parent, read_json, read_jsonl
+
+
+def make(scene="fox", method="bitymi", checkpoint="", source="a/eval.json", **results):
+    data = {"experiment_name": scene, "method_name": method, "checkpoint": checkpoint, "results": results}
+    return evaluation_from(data, Path(source))
+
+
+def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
+    path = tmp_path / "eval.json"
+    path.write_text('{"results": {"psnr": 20.5, "psnr_std": NaN, "lpips": Infinity, "note": "x", "flag": true}}')
+    (row,) = read_json(path)
+    assert row.results == {"psnr": 20.5}
+    assert row.scene == tmp_path.name and row.method == "unnamed method"
+
+
+@pytest.mark.parametrize(
+    ("method", "checkpoint", "atlas_bytes", "baked"),
+    [
+        ("bitymi", "/o/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 0, False),
+        ("bitymi", "/o/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 4096, True),
+        ("bitymi-bundle", "", 0, True),
+        ("bitymi", "/demo/bundle/nerfstudio_models/step-000000000.ckpt", 0, True),
+        ("bitymi", "C:\\demo\\bundle\\nerfstudio_models\\step-0.ckpt", 0, True),
+        # the data set's name says bundle, the run does not
+        ("bitymi", "/bundle/outputs/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 0, False),
+        ("bitymi", "/data/bundler/2025/nerfstudio_models/step-1.ckpt", 0, False),
+    ],
+)
+def test_baked_or_neural(method: str, checkpoint: str, atlas_bytes: int, baked: bool):
+    row = make(method=method, checkpoint=checkpoint, atlas_bytes=atlas_bytes, psnr=20.0)
+    assert row.baked is baked
+    assert row.method == "bitymi"
+
+
+def test_export_without_texture_is_known_by_its_stand_in_for_a_checkpoint(tmp_path):
+    checkpoint = str(tmp_path / "bitymi-bundle-x7/room/nerfstudio_models/step-000000000.ckpt")
+    assert make(method="bitymi-notexture", checkpoint=checkpoint, atlas_bytes=0).baked
+    assert not make(checkpoint="nul\0/a/b").baked
+
+
+def test_label_of_a_bundle_names_its_format():
+    row = make(checkpoint="/e/fox-bc7/nerfstudio_models/step-0.ckpt", atlas_bytes=10)
+    assert row.label == "bitymi, bc7"
+
+
+def test_neural_parent_is_of_the_same_folder_when_there_are_several():
+    first, second = make(source="run1/neural.json", psnr=20.0), make(source="run2/neural.json", psnr=21.0)
+    baked = make(source="run2/baked.json", atlas_bytes=1, psnr=20.9)
+    assert neural_parent(baked, [first, second, baked]) is second
+    elsewhere = make(source="run3/baked.json", atlas_bytes=1)
+    assert neural_parent(elsewhere, [first, second]) is None
+    assert neural_parent(first, [first, second]) is None
+    assert neural_parent(make(scene="lego", source="run1/x.json", atlas_bytes=1), [first, second]) is None
+
+
+def test_curve_keeps_the_last_line_of_a_repeated_step_and_leaves_out_a_cut_last_line(tmp_path: Path):
+    path = tmp_path / "curve.jsonl"
+    lines = [{"step": 0, "psnr": 9.0}, {"step": 100, "psnr": float("nan")}, {"step": 200}, {"step": 100, "psnr": 15.0}]
+    path.write_text("\n".join(map(json.dumps, lines)) + '\n\n{"step": 300, "ps')
+    evaluations, (curve,), notes = read_jsonl(path)
+    assert not evaluations
+    assert curve.series("step", "psnr") == ([0.0, 100.0], [9.0, 15.0])
+    assert curve.last("step") == 200 and curve.best("psnr") == 15.0 and curve.last("seconds") is None
+    assert len(notes) == 1 and "cut off" in notes[0]
+
+
+def test_broken_line_inside_a_curve_is_an_error_with_its_number(tmp_path: Path):
+    path = tmp_path / "curve.jsonl"
+    path.write_text('{"step": 0}\n{"step": 1,,}\n{"step": 2}\n')
+    with pytest.raises(ReportError, match=r"curve\.jsonl, line 2, is not valid JSON"):
+        read_jsonl(path)
+
+
+def test_lines_with_results_are_evaluations(tmp_path: Path):
+    path = tmp_path / "cells.jsonl"
+    path.write_text('{"step": 5, "experiment_name": "fox", "method_name": "m", "results": {"psnr": 20}}\n')
+    (row,), curves, _ = read_jsonl(path)
+    assert row.results == {"psnr": 20.0} and not curves
+
+
+def test_results_folder(results: Path, tmp_path: Path):
+    records = collect([results], tmp_path / "report")
+    assert len(records.evaluations) == 16 and sum(e.baked for e in records.evaluations) == 12
+    assert {(c.scene, c.label) for c in records.curves} == {
+        (scene, method) for scene in ("fox", "snowmiku") for method in ("bitymi", "bitymi-quality")
+    }
+    assert len(records.images) == 28
+    assert not records.notes
+
+
+def test_curve_is_named_by_the_run_folders_without_an_evaluation(results: Path, tmp_path: Path):
+    (curve,) = collect([results / "outputs/fox/bitymi"], tmp_path / "report").curves
+    assert (curve.scene, curve.label) == ("fox", "bitymi")
+
+
+def test_namesakes_get_different_labels(eval_json, tmp_path: Path):
+    inputs = [eval_json("seed0/eval.json", psnr=20.0), eval_json("seed1/eval.json", psnr=20.1)]
+    labels = [e.label for e in collect(inputs, tmp_path / "report").evaluations]
+    assert sorted(labels) == ["bitymi (seed0)", "bitymi (seed1)"]
+
+
+def test_file_named_twice_is_read_once(eval_json, tmp_path: Path):
+    path = eval_json(psnr=20.0)
+    assert len(collect([path, path, path.parent], tmp_path / "report").evaluations) == 1
+
+
+def test_search_is_bounded_and_leaves_out_hidden_folders_and_the_report(eval_json, tmp_path: Path):
+    for name in (".hidden/e.json", "report/e.json", "/".join("abcdefghijkl") + "/e.json"):
+        eval_json(name, psnr=1.0)
+    eval_json("kept/e.json", psnr=2.0)
+    records = collect([tmp_path], tmp_path / "report")
+    assert [e.results["psnr"] for e in records.evaluations] == [2.0]
+
+
+def test_link_that_leads_back_does_not_loop(eval_json, tmp_path: Path):
+    eval_json("in/e.json", psnr=2.0)
+    (tmp_path / "in" / "again").symlink_to(tmp_path / "in")
+    assert len(collect([tmp_path / "in"], tmp_path / "report").evaluations) == 1

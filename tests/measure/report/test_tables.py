@@ -1,0 +1,71 @@
+"""Tables: columns that are there, bold values, differences, means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.measure.report.records import Records, evaluation_from
+from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, summary, to_html, to_markdown
+
+
+def make(scene="fox", method="bitymi", source="a/eval.json", **results):
+    data = {"experiment_name": scene, "method_name": method, "results": results}
+    return evaluation_from(data, Path(source))
+
+
+def test_columns_that_no_row_fills_are_left_out():
+    (table,) = quality_tables(Records([make(psnr=20.0, ssim=0.9)]))
+    assert table.header == ("Method", "PSNR ↑", "SSIM ↑")
+
+
+def test_layout_before_and_after_baking():
+    rows = [
+        make(psnr=27.40, flip=0.12, render_ms=50.0, surfels=12345, atlas_bytes=0),
+        make(psnr=27.38, flip=0.12, render_ms=10.0, surfels=12345, atlas_bytes=2_500_000, method="bitymi-bundle"),
+    ]
+    (table,) = quality_tables(Records(rows))
+    assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Points ↓", "ms ↓", "FPS ↑", "Atlas MB ↓", "ΔPSNR")
+    before, neural, after, baked = table.rows
+    assert before.section and after.section
+    assert neural.cells == ("bitymi", "27.40", "0.120", "12,345", "50.0", "20.0", "–", "–")
+    assert baked.cells == ("bitymi", "27.38", "0.120", "12,345", "10.0", "100", "2.50", "−0.020")
+    assert neural.best == {1} and baked.best == {4, 5}  # a column without a difference has no best
+
+
+def test_missing_values_are_dashes_and_never_best():
+    rows = [make(psnr=20.0, lpips=float("nan")), make(method="other", psnr=21.0, lpips=0.2)]
+    (table,) = quality_tables(Records(rows))
+    assert table.rows[1].cells[2] == "–" and 2 not in table.rows[1].best
+
+
+def test_means_only_over_what_covers_the_same_scenes():
+    rows = [make(scene=s, psnr=p) for s, p in (("a", 20.0), ("b", 22.0))] + [make(scene="a", method="x", psnr=40.0)]
+    *scenes, mean = quality_tables(Records(rows))
+    assert [t.title for t in scenes] == ["a", "b"]
+    assert mean.title == "Mean of 2 scenes" and "a, b" in mean.note
+    assert [row.cells for row in mean.rows if not row.section] == [("bitymi", "21.00")]
+
+
+def test_summary_says_what_baking_changed():
+    rows = [
+        make(psnr=27.0, render_ms=50.0),
+        make(psnr=26.99, render_ms=10.0, atlas_bytes=3_000_000, method="bitymi-bundle"),
+    ]
+    (line,) = summary(Records(rows))
+    assert "27.00 dB neural, 26.99 dB baked (−0.010)" in line
+    assert "50.0 ms to 10.0 ms per view (5.0× as fast)" in line and "3.00 MB" in line
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0"), (0.0012345, "0.0012"), (0.1234, "0.123"), (3.14159, "3.14"), (61.72, "61.7")]
+)
+def test_significant(value: float, text: str):
+    assert significant(value) == text
+
+
+def test_names_cannot_break_the_table():
+    table = Table("t", ("Method", "A"), (Row(("<script>a|b</script>", "1"), frozenset({1})),))
+    assert "<script>" not in to_html(table) and "&lt;script&gt;" in to_html(table)
+    assert to_markdown(table).splitlines()[2] == "| <script>a\\|b</script> | **1** |"

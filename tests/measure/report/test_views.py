@@ -1,0 +1,71 @@
+"""Held-out views: which are shown, and what is shown of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bitymi_ns.measure.report.page import _views
+from bitymi_ns.measure.report.views import ERROR_SCALE, compare_views, heat
+
+
+def write(folder: Path, name: str, errors: list[float], tint: float = 0.0) -> list[Path]:
+    """Views whose renders differ from grey photographs by these amounts everywhere."""
+    paths = []
+    (folder / name).mkdir(parents=True)
+    for index, error in enumerate(errors):
+        photo = np.full((6, 8, 3), 0.4 + tint + 0.01 * index)
+        paths.append(folder / name / f"eval_img_{index:04d}.png")
+        Image.fromarray((np.concatenate([photo, photo + error], 1) * 255).round().astype(np.uint8)).save(paths[-1])
+    return paths
+
+
+def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path: Path) -> None:
+    neural = write(tmp_path, "neural", [0.1, 0.3, 0.2, 0.05, 0.15])
+    baked = write(tmp_path, "baked", [0.1, 0.3, 0.2, 0.01, 0.15])
+    (compared,), others, notes = compare_views([*baked, *neural])
+    assert (others, notes, compared.title) == ([], [], "neural, baked")
+    titles = [view.title for view in compared.views]
+    assert titles == ["Worst view of 5: number 1", "Median view of 5: number 4", "Best view of 5: number 3"]
+    for view in compared.views:
+        photograph, *renders = [[picture.caption for picture in column] for column in view.columns]
+        assert photograph == ["photograph"]
+        assert [error for _, error in renders] == ["error of neural", "error of baked"]
+        assert all((p.width, p.height) == (8, 6) for column in view.columns for p in column)
+    # of 8-bit pictures: errors of 12 and 2 steps
+    best = [column[0].caption for column in compared.views[2].columns]
+    assert best == ["photograph", "neural: 26.55 dB", "baked: 42.11 dB"]
+    html = "".join(_views(compared, named=False))
+    assert html.count("<figure>") == 15 and html.count('<div class="views">') == 3
+
+
+def test_one_folder_has_its_error_beside_the_render(tmp_path: Path) -> None:
+    (compared,), _, _ = compare_views(write(tmp_path, "renders", [0.1, 0.2]))
+    html = "".join(_views(compared, named=False))
+    assert html.count("<div><figure>") == 2 * 3  # two views are worst and best
+
+
+def test_renders_of_other_photographs_are_apart(tmp_path: Path) -> None:
+    sets, _, _ = compare_views([*write(tmp_path, "a", [0.1, 0.2]), *write(tmp_path, "b", [0.1, 0.2], tint=0.1)])
+    assert [compared.title for compared in sets] == ["a", "b"]
+    assert "a: Worst view" in "".join(_views(sets[0], named=True))
+
+
+@pytest.mark.parametrize("spoil", ["cut", "odd"])
+def test_a_picture_that_cannot_be_used_is_noted(tmp_path: Path, spoil: str) -> None:
+    paths = write(tmp_path, "renders", [0.1, 0.2, 0.3])
+    if spoil == "cut":
+        paths[0].write_bytes(paths[0].read_bytes()[:40])
+    else:
+        Image.new("RGB", (9, 6)).save(paths[0])
+    (compared,), _, notes = compare_views(paths)
+    assert len(compared.views) == 2 and len(notes) == 1 and str(paths[0]) in notes[0]
+
+
+def test_the_error_map_goes_from_black_to_yellow() -> None:
+    black, yellow, beyond = heat(np.array([[0.0, ERROR_SCALE, 1.0]], np.float32), ERROR_SCALE)[0]
+    assert black.max() < 0.02 and yellow[0] > 0.95 and yellow[2] < 0.7
+    assert np.array_equal(yellow, beyond)

@@ -1,0 +1,44 @@
+"""The page of errors, on a few scenes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns import cli
+from bitymi_ns.measure.stability import page
+from bitymi_ns.measure.stability.backends import BACKENDS
+from bitymi_ns.measure.stability.errors import Errors
+from bitymi_ns.measure.stability.scenes import random_scene
+
+
+def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    short = tuple(dataclasses.replace(sweep, values=sweep.values[:1]) for sweep in page.SWEEPS)
+    some = page.cases()[:2]
+    monkeypatch.setattr(page, "SWEEPS", short)
+    monkeypatch.setattr(page, "cases", lambda: some)
+    target = tmp_path / "deep" / "numbers.md"
+    assert cli.main(["stability", "--output", str(target)]) == 0
+    text = target.read_text("utf8")
+    assert "(numbers.png)" in text and (tmp_path / "deep" / "numbers.png").read_bytes().startswith(b"\x89PNG")
+    assert text.count("accurate |") >= 6 and "through the camera plane" in text
+    assert sorted(path.name for path in target.parent.iterdir()) == ["numbers.md", "numbers.png"]
+    assert "10 scenes, 0 of them" in capsys.readouterr().out
+    assert cli.main(["stability", "--backend", "abacus"]) == 1
+    assert "no backend 'abacus'" in capsys.readouterr().err
+
+
+def test_verdicts() -> None:
+    row = page.measure_row("easy", random_scene(3, 0, 8, 8), BACKENDS["cpu"])
+    assert row.verdict == "accurate" and row.trust is not None and row.trust.gradient < 1e-10
+
+    def verdict(**changes: float) -> str:
+        return dataclasses.replace(row, single=dataclasses.replace(row.single, **changes)).verdict
+
+    assert verdict(finite=False) == "**not finite**"
+    assert verdict(drawn=0) == "nothing drawn"
+    assert verdict(gradient=1e-3, input_gradient=5e-4) == "as the inputs allow"
+    assert verdict(gradient=1e-3, input_gradient=1e-5) == "**loses figures**"
+    assert isinstance(row.single, Errors)

@@ -18,6 +18,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from bitymi_ns.host import duplicates
 from bitymi_ns.host.cameras import check_cameras, to_camera
 from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
+from bitymi_ns.host.colmap import checked_models
 from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import check_orientation, file_has_transparency
@@ -75,11 +76,12 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     ) -> None:
         self._room = Room(PHOTOGRAPH_BYTES)
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
-        points = check_capture(config, images=test_mode != "inference")
+        cloud = check_capture(config, images=test_mode != "inference")
         with (
             reporting_input_errors(config),
             corrected_files(config.dataparser),
-            reporting_time("Reading", points),
+            checked_models(config.dataparser),
+            reporting_time("Reading", cloud.points),
         ):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)

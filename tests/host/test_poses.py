@@ -15,7 +15,7 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.host.poses import check_places, rotations
+from bitymi_ns.host.poses import check_cloud, check_places, rotations
 from tests.host.captures import colmap_model, expect, images_of, load, load_with, said
 
 
@@ -211,3 +211,32 @@ def test_the_photographs_of_a_scaled_capture_are_those_of_its_frames(capture: Pa
     change_poses(edit, capture, lambda part: 3.0 * part)
     data = load(capture).train_view(0)[1]["image"]
     assert np.array_equal(data.numpy(), np.asarray(Image.open(images_of(capture)[1])))
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"),
+    [(1.0, ""), (1000.0, "times as far from the cameras as these"), (0.001, "of a picture's width")],
+)
+def test_a_cloud_in_another_unit(
+    capture: Path, capsys: pytest.CaptureFixture[str], factor: float, message: str
+) -> None:
+    points = np.random.default_rng(0).normal(size=(500, 3)) * factor
+    points[0], points[1] = np.nan, 1e9  # outliers say nothing
+    lines = "\n".join(f"{x} {y} {z}" for x, y, z in points)
+    (capture / "sparse_pc.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 500\n"
+        f"property float x\nproperty float y\nproperty float z\nend_header\n{lines}\n"
+    )
+    load(capture)
+    warning = said(capsys)
+    assert ("The point cloud seems to be in another unit than the poses" in warning) == bool(message)
+    assert message in warning
+
+
+def test_cameras_on_a_tripod_and_one_walk_make_no_other_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    generator = np.random.default_rng(0)
+    points, tripod, walk = (generator.normal(size=(n, 3)) for n in (200, 30, 10))
+    check_cloud(points, np.concatenate([1e-4 * tripod, 2.0 + walk]), np.ones(40))
+    check_cloud(points[:0], tripod, np.ones(30))
+    check_cloud(np.zeros((9, 3)), tripod, np.ones(30))
+    assert said(capsys) == ""

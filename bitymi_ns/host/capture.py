@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import sys
 from collections.abc import Iterator, Sequence
@@ -53,6 +54,7 @@ def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> Cl
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
         fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
+    _check_options(dataparser)
     if isinstance(dataparser, NerfstudioDataParserConfig):
         return _check_transforms(data, dataparser, images)
     if isinstance(dataparser, ColmapDataParserConfig):
@@ -60,6 +62,19 @@ def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> Cl
     if isinstance(dataparser, BlenderDataParserConfig) and dataparser.ply_path is not None:
         return _check_cloud(data / dataparser.ply_path, "leave --ply-path out")
     return Cloud()
+
+
+def _check_options(dataparser: DataParserConfig) -> None:
+    """Stop at options of nerfstudio's readers that leave no capture, by their names on the command line."""
+    mode = getattr(dataparser, "eval_mode", None)
+    for name, used, within, what in (
+        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
+        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
+        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
+        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
+    ):
+        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
+            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
 def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> Cloud:

@@ -20,11 +20,12 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
-from PIL import UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.host import transforms
 from bitymi_ns.host.colmap import check_model, models_in, options_for
 from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
 
@@ -130,10 +131,11 @@ def _what_it_is(data: Path) -> str:
 
 
 def check_images(paths: Sequence[Path]) -> None:
-    """Stop when images that the capture has poses for are not there."""
+    """Stop when images that the capture has poses for are not there, or beyond all sizes."""
     names = list(dict.fromkeys(paths))
     missing = [path for path in names if not path.is_file()]
     if not missing:
+        check_sizes(names)
         return
     some = "\n  ".join(f"{path}{_instead(path)}" for path in missing[:3])
     fail(
@@ -191,6 +193,11 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has no reduced photographs, and nerfstudio's question whether to make "
             "them found nobody to answer it. Give `--downscale-factor 1` after the parser's name (`colmap`) to read "
             "the photographs as they are, or run once in a terminal and answer.",
+            error,
+        )
+    except Image.DecompressionBombError as error:  # nerfstudio looks into one photograph before they are checked
+        fail(
+            f"the capture {_folder_of(config)} has a photograph of more than {MOST_PIXELS:,} pixels: make it smaller",
             error,
         )
     except (

@@ -102,24 +102,32 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
             fail(
                 f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. Correct the capture."
             )
-    _check_views(cameras, names)
     if distortion is not None:
         _check_distortion(cameras, names)
 
 
-def _check_views(cameras: Cameras, names: Sequence[object]) -> None:
-    """Focal lengths against the size of the pictures."""
-    perspective = (cameras.camera_type == CameraType.PERSPECTIVE.value).flatten()
-    for key, size, focal in (("fl_x", cameras.width, cameras.fx), ("fl_y", cameras.height, cameras.fy)):
-        degrees = 2.0 * torch.rad2deg(torch.atan(0.5 * size.double() / focal.double())).flatten()
+def check_views(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
+    """Stop, or warn, at focal lengths that do not go with the size of the pictures.
+
+    Args:
+        cameras: of training and of held-out views, with positive focal lengths.
+        names: of the photographs of all of them, for messages.
+    """
+    perspective = torch.cat([some.camera_type.flatten() for some in cameras]) == CameraType.PERSPECTIVE.value
+    for key, sizes, focals in (
+        ("fl_x", [some.width for some in cameras], [some.fx for some in cameras]),
+        ("fl_y", [some.height for some in cameras], [some.fy for some in cameras]),
+    ):
+        size, focal = (torch.cat([some.flatten() for some in values]).double() for values in (sizes, focals))
+        degrees = 2.0 * torch.rad2deg(torch.atan(0.5 * size / focal))
         for (least, most), refused in ((POSSIBLE_VIEW, True), (USUAL_VIEW, False)):
             wrong = (perspective & ~((degrees >= least) & (degrees <= most))).nonzero().flatten().tolist()
             if not wrong:
                 continue
             i = wrong[0]
             message = (
-                f"focal length of {listed([names[j] for j in wrong])} is {focal.flatten()[i]:g} pixels ({key}): "
-                f"{int(size.flatten()[i])} pixels of the picture span {degrees[i]:.3g} degrees. Focal lengths are in "
+                f"focal length of {listed([names[j] for j in wrong])} is {focal[i]:g} pixels ({key}): "
+                f"{int(size[i])} pixels of the picture span {degrees[i]:.3g} degrees. Focal lengths are in "
                 "pixels, not in millimetres, and camera_angle_x is in radians."
             )
             if refused:

@@ -16,7 +16,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 
 from bitymi_ns.host import duplicates
-from bitymi_ns.host.cameras import check_cameras, to_camera
+from bitymi_ns.host.cameras import check_cameras, check_views, to_camera
 from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
 from bitymi_ns.host.colmap import checked_models
 from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
@@ -121,6 +121,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         train, held_out = self.train_dataset.image_filenames, self.eval_dataset.image_filenames
         for dataset in (self.train_dataset, self.eval_dataset):
             check_cameras(dataset.cameras, dataset.image_filenames)
+        check_views([self.train_dataset.cameras, self.eval_dataset.cameras], [*train, *held_out])
         poses = (
             torch.cat([d.cameras.camera_to_worlds for d in (self.train_dataset, self.eval_dataset)]).double().numpy()
         )

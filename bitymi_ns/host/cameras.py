@@ -18,6 +18,10 @@ UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624
 """Kinds of cameras whose photographs become those of a perspective camera on loading."""
 OFF_AXIS = 80
 """Degrees between the axis and the middle of the picture that no perspective camera has."""
+USUAL_VIEW = (0.5, 150.0)
+"""Degrees that a picture of a perspective camera may span; outside, the focal length is doubtful."""
+POSSIBLE_VIEW = (0.01, 178.0)
+"""Outside of these it cannot be meant: nothing but the middle pixels, or a single ray, would be seen."""
 LITTLE_LEFT = 0.25
 """Share of a photograph's area; where undistorting leaves less, the numbers are doubtful."""
 NOTHING_LEFT = 0.05
@@ -100,6 +104,36 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
             )
     if distortion is not None:
         _check_distortion(cameras, names)
+
+
+def check_views(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
+    """Stop, or warn, at focal lengths that do not go with the size of the pictures.
+
+    Args:
+        cameras: of training and of held-out views, with positive focal lengths.
+        names: of the photographs of all of them, for messages.
+    """
+    perspective = torch.cat([some.camera_type.flatten() for some in cameras]) == CameraType.PERSPECTIVE.value
+    for key, sizes, focals in (
+        ("fl_x", [some.width for some in cameras], [some.fx for some in cameras]),
+        ("fl_y", [some.height for some in cameras], [some.fy for some in cameras]),
+    ):
+        size, focal = (torch.cat([some.flatten() for some in values]).double() for values in (sizes, focals))
+        degrees = 2.0 * torch.rad2deg(torch.atan(0.5 * size / focal))
+        for (least, most), refused in ((POSSIBLE_VIEW, True), (USUAL_VIEW, False)):
+            wrong = (perspective & ~((degrees >= least) & (degrees <= most))).nonzero().flatten().tolist()
+            if not wrong:
+                continue
+            i = wrong[0]
+            message = (
+                f"focal length of {listed([names[j] for j in wrong])} is {focal[i]:g} pixels ({key}): "
+                f"{int(size[i])} pixels of the picture span {degrees[i]:.3g} degrees. Focal lengths are in "
+                "pixels, not in millimetres, and camera_angle_x is in radians."
+            )
+            if refused:
+                fail(f"the {message} Correct the capture.")
+            warn(f"The {message} If that is a mistake, correct the capture.")
+            return
 
 
 def _check_distortion(cameras: Cameras, names: Sequence[object]) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -19,40 +20,65 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
-from PIL import UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.host import transforms
-from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.colmap import check_model, models_in, options_for
+from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
 
 PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic"}
 
 
-def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> int:
+class Cloud(NamedTuple):
+    """A capture's points, as far as they are known before they are read.
+
+    Attributes:
+        points: how many there are; 0 where that cannot be told.
+        file: the PLY file that nerfstudio reads them from; None for other files.
+    """
+
+    points: int = 0
+    file: Path | None = None
+
+
+def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> Cloud:
     """Stop with a clear message when there is no usable capture where the configuration points.
 
     Args:
         config: the data manager's.
         images: the photographs are needed, too.
-
-    Returns:
-        How many points its cloud has, as far as that can be told before it is read; else 0.
     """
     dataparser = config.dataparser
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
         fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
+    _check_options(dataparser)
     if isinstance(dataparser, NerfstudioDataParserConfig):
         return _check_transforms(data, dataparser, images)
     if isinstance(dataparser, ColmapDataParserConfig):
-        return _check_colmap(data, dataparser)
+        return Cloud(check_model(data, dataparser))
     if isinstance(dataparser, BlenderDataParserConfig) and dataparser.ply_path is not None:
         return _check_cloud(data / dataparser.ply_path, "leave --ply-path out")
-    return 0
+    return Cloud()
 
 
-def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> int:
+def _check_options(dataparser: DataParserConfig) -> None:
+    """Stop at options of nerfstudio's readers that leave no capture, by their names on the command line."""
+    mode = getattr(dataparser, "eval_mode", None)
+    for name, used, within, what in (
+        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
+        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
+        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
+        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
+    ):
+        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
+            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
+
+
+def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> Cloud:
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         if not data.is_dir():
@@ -69,7 +95,7 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images
     if dataparser.auto_scale_poses and not np.ptp(places, axis=0).any():
         fail(f"{path}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
     if not dataparser.load_3D_points:
-        return 0
+        return Cloud()
     points = meta.get("ply_file_path")
     if points is not None:
         if not isinstance(points, str) or not points:
@@ -82,14 +108,14 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images
             "random points. Run once in a terminal to convert them."
         )
         dataparser.load_3D_points = False
-    return 0
+    return Cloud()
 
 
 def _what_it_is(data: Path) -> str:
     """What to do with a folder that has no transforms.json, by what lies in it."""
-    models = _colmap_models(data)
+    models = models_in(data)
     if models:
-        return f"It has a COLMAP model: give `{_colmap_options(data, models[0])}` after the options of the method."
+        return f"It has a COLMAP model: give `{options_for(data, models[0])}` after the options of the method."
     if (data / "transforms_train.json").is_file():
         return f"It has a transforms_train.json: give `blender-data --data {data}` after the options of the method."
     photos = {p.parent for pattern in ("*", "*/*") for p in data.glob(pattern) if p.suffix.lower() in PHOTOGRAPHS}
@@ -104,48 +130,12 @@ def _what_it_is(data: Path) -> str:
     )
 
 
-def _check_colmap(data: Path, dataparser: ColmapDataParserConfig) -> int:
-    model = data / dataparser.colmap_path
-    if not _is_colmap_model(model):
-        models = _colmap_models(data)
-        what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
-        if not models:
-            fail(
-                f"the COLMAP model {model} {what}, and there is none in other folders of {data}. Give its folder, "
-                "seen from the capture, with `--colmap-path` after `colmap`."
-            )
-        others = "" if len(models) == 1 else f" ({listed(models[1:])} would do, too)"
-        fail(f"the COLMAP model {model} {what}. Give `{_colmap_options(data, models[0])}`{others}.")
-    photographs = data / dataparser.images_path
-    reduced = photographs.with_name(f"{photographs.name}_{dataparser.downscale_factor}")
-    if not photographs.is_dir() and not reduced.is_dir():  # nerfstudio reads the reduced ones where they are asked for
-        fail(
-            f"the folder of photographs {photographs} does not exist. Give it, seen from the capture, with "
-            "`--images-path` after `colmap`."
-        )
-    counts = (point_count(model / name) for name in ("points3D.bin", "points3D.txt"))
-    return next((count for count in counts if count), 0) if dataparser.load_3D_points else 0
-
-
-def _is_colmap_model(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
-
-
-def _colmap_models(data: Path) -> list[Path]:
-    """Folders of COLMAP models at most three levels below the capture, seen from it."""
-    found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
-    return sorted(path.relative_to(data) for path in found if _is_colmap_model(path))
-
-
-def _colmap_options(data: Path, model: Path) -> str:
-    return f"colmap --data {data} --colmap-path {model}"
-
-
 def check_images(paths: Sequence[Path]) -> None:
-    """Stop when images that the capture has poses for are not there."""
+    """Stop when images that the capture has poses for are not there, or beyond all sizes."""
     names = list(dict.fromkeys(paths))
     missing = [path for path in names if not path.is_file()]
     if not missing:
+        check_sizes(names)
         return
     some = "\n  ".join(f"{path}{_instead(path)}" for path in missing[:3])
     fail(
@@ -165,12 +155,11 @@ def _instead(path: Path) -> str:
     return f" (but there is {min(others).name})" if others else ""
 
 
-def _check_cloud(cloud: Path, way_out: str) -> int:
-    """The number of its points."""
-    wrong = what_is_wrong_with(cloud) if cloud.is_file() else "does not exist"
+def _check_cloud(file: Path, way_out: str) -> Cloud:
+    wrong = what_is_wrong_with(file) if file.is_file() else "does not exist"
     if wrong is not None:
-        fail(f"the point cloud {cloud} {wrong}. Put it there again, or {way_out} to start from random points.")
-    return point_count(cloud)
+        fail(f"the point cloud {file} {wrong}. Put it there again, or {way_out} to start from random points.")
+    return Cloud(point_count(file), file)
 
 
 def _interactive() -> bool:
@@ -204,6 +193,11 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has no reduced photographs, and nerfstudio's question whether to make "
             "them found nobody to answer it. Give `--downscale-factor 1` after the parser's name (`colmap`) to read "
             "the photographs as they are, or run once in a terminal and answer.",
+            error,
+        )
+    except Image.DecompressionBombError as error:  # nerfstudio looks into one photograph before they are checked
+        fail(
+            f"the capture {_folder_of(config)} has a photograph of more than {MOST_PIXELS:,} pixels: make it smaller",
             error,
         )
     except (

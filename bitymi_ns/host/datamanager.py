@@ -16,14 +16,16 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 
 from bitymi_ns.host import duplicates
-from bitymi_ns.host.cameras import check_cameras, to_camera
+from bitymi_ns.host.cameras import check_cameras, check_views, to_camera
 from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
+from bitymi_ns.host.colmap import checked_models
 from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
 from bitymi_ns.host.errors import fail, listed, warn
-from bitymi_ns.host.images import check_orientation, file_has_transparency
+from bitymi_ns.host.images import allow_large_photographs, check_orientation, file_has_transparency
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES, Photographs
+from bitymi_ns.host.ply import colours
 from bitymi_ns.host.point_cloud import reporting_time
-from bitymi_ns.host.poses import check_places, warn_of_mirrored
+from bitymi_ns.host.poses import check_cloud, check_places, warn_of_mirrored
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import View, training_order
@@ -75,14 +77,18 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     ) -> None:
         self._room = Room(PHOTOGRAPH_BYTES)
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
-        points = check_capture(config, images=test_mode != "inference")
+        allow_large_photographs()
+        cloud = check_capture(config, images=test_mode != "inference")
         with (
             reporting_input_errors(config),
             corrected_files(config.dataparser),
-            reporting_time("Reading", points),
+            checked_models(config.dataparser),
+            reporting_time("Reading", cloud.points),
         ):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
+        if test_mode == "val":
+            self._check_points(cloud.file)
         outputs = self.train_dataparser_outputs
         color = outputs.alpha_color
         self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
@@ -115,6 +121,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         train, held_out = self.train_dataset.image_filenames, self.eval_dataset.image_filenames
         for dataset in (self.train_dataset, self.eval_dataset):
             check_cameras(dataset.cameras, dataset.image_filenames)
+        check_views([self.train_dataset.cameras, self.eval_dataset.cameras], [*train, *held_out])
         poses = (
             torch.cat([d.cameras.camera_to_worlds for d in (self.train_dataset, self.eval_dataset)]).double().numpy()
         )
@@ -134,6 +141,25 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
                 f"Only {count} training views: all of them are used for multi-view scoring, and views "
                 "from elsewhere will look poor. Twenty or more photographs are advisable."
             )
+
+    def _check_points(self, file: Path | None) -> None:
+        """Colours as the file has them, and a word where the points are in another unit than the poses."""
+        outputs = self.train_dataparser_outputs
+        points = outputs.metadata.get("points3D_xyz")
+        if points is None:
+            return
+        rgb = None if file is None else colours(file)
+        if isinstance(rgb, str):
+            warn(f"The points of {file} start without colours: {rgb}. Write them as bytes (property uchar red).")
+            outputs.metadata["points3D_rgb"] = torch.zeros(0, 3, dtype=torch.uint8)
+        elif rgb is not None and len(rgb) == len(points):
+            outputs.metadata["points3D_rgb"] = torch.from_numpy(rgb)
+        cameras = outputs.cameras
+        check_cloud(
+            points.double().numpy(),
+            cameras.camera_to_worlds[:, :, 3].double().numpy(),
+            (cameras.width / cameras.fx).flatten().double().numpy(),
+        )
 
     def create_train_dataset(self) -> BitymiDataset:
         if self.test_mode != "inference":

@@ -16,9 +16,37 @@ from bitymi_ns.host.errors import fail, listed, warn
 
 ORIENTATION = 0x0112
 """The EXIF tag that asks viewers to turn a photograph; 1 = as it is stored."""
+MOST_PIXELS = 1_000_000_000
+"""Photographs with more pixels are refused; phones take some of 200 million."""
 THREADS = 4
 FINGERPRINT = 64
 """Pixels across, and down, that decide whether two photographs are the same."""
+
+
+def allow_large_photographs() -> None:
+    """Raise the number of pixels from which PIL takes a file for an attack, which is 179 million."""
+    Image.MAX_IMAGE_PIXELS = MOST_PIXELS // 2  # PIL refuses twice as many
+
+
+def check_sizes(paths: Sequence[Path]) -> None:
+    """Stop at photographs that are too large to be meant, of which only the headers are read."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        large = [path for path, too_large in zip(paths, pool.map(_is_too_large, paths), strict=True) if too_large]
+    if large:
+        fail(
+            f"{listed(large)} has more than {MOST_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy "
+            "of its camera with it."
+        )
+
+
+def _is_too_large(path: Path) -> bool:
+    try:
+        with Image.open(path):
+            return False
+    except Image.DecompressionBombError:
+        return True
+    except (OSError, SyntaxError, ValueError):
+        return False  # what else is wrong is said where it is read
 
 
 def read_image(path: Path) -> Image.Image:

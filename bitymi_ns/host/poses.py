@@ -18,6 +18,9 @@ FAR = 100.0
 TOO_FAR = 1000.0
 """So many times as far out, the others shrink to one place beside it."""
 
+OTHER_UNIT = 150.0
+"""Points so many times as far away as the cameras lie apart, or so small a part of a picture: another unit."""
+
 
 def rotations(
     matrices: npt.NDArray[np.float64], names: Sequence[object], where: str, announce: bool = True
@@ -116,3 +119,42 @@ def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> N
         else:
             fail(f"{message} Beside it they are all at one place. Correct the pose or remove the frame.")
         return
+
+
+def check_cloud(
+    points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
+) -> None:
+    """Warn where the points seem to be in another unit than the poses.
+
+    Far more than what the cameras' places span, or all in a spot of the picture: both leave training next to nothing
+    to start from. Medians and percentiles, because clouds and captures have outliers.
+
+    Args:
+        points: [N, 3] of the cloud.
+        centers: [M, 3] camera positions, finite.
+        widths: [M] of the pictures, in focal lengths.
+    """
+    points = points[:: max(1, len(points) // 100_000)]
+    points = points[np.isfinite(points).all(1)]
+    if len(points) == 0:
+        return
+    middle, cloud_middle = np.median(centers, axis=0), np.median(points, axis=0)
+    apart = np.percentile(np.linalg.norm(centers - middle, axis=1), 90)  # a median may be that of a group on a tripod
+    away = np.median(np.linalg.norm(points - middle, axis=1))
+    spread = np.median(np.linalg.norm(points - cloud_middle, axis=1))
+    picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # its width, where the cloud is
+    remedy = "Give the points in the unit of the poses, or remove the cloud to start from random points."
+    if apart > 0.0 and away > OTHER_UNIT * apart:
+        warn(
+            "The point cloud seems to be in another unit than the poses: half of its points are more than "
+            f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {remedy}"
+        )
+    elif 0.0 < spread < picture / OTHER_UNIT:
+        warn(
+            "The point cloud seems to be in another unit than the poses: half of its points lie in a spot that is "
+            f"1/{_rounded(picture / spread)} of a picture's width. {remedy}"
+        )
+
+
+def _rounded(ratio: float) -> str:
+    return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"

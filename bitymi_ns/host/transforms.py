@@ -24,6 +24,8 @@ from bitymi_ns.host.poses import rotations
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")
 INTRINSICS = (*SIZES, "fl_x", "fl_y", "cx", "cy")
+LONGEST_SIDE = 1 << 20
+"""Pixels; what is beyond is no size of a picture."""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 
@@ -70,9 +72,13 @@ def load(path: Path, own_format: bool, announce: bool = True) -> Any:
         _check_camera(path, meta)
         _distribute(path, meta, announce)
         _check_transform(path, meta)
+        _check_lists(path, meta)
+    elif isinstance(meta, dict):
+        _check_other_format(path, meta)
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if isinstance(frames, list) and all(isinstance(f, dict) and "transform_matrix" in f for f in frames):
         _correct_poses(path, frames, announce)
+        _check_repeated(path, frames)
     return meta
 
 
@@ -103,6 +109,54 @@ def _file_name(path: Path, i: int, key: str, name: Any) -> str:
     return portable if os.sep == "/" and not (path.parent / name).exists() else name
 
 
+def _check_other_format(path: Path, meta: dict[str, Any]) -> None:
+    """What Blender's files and instant-ngp's have in common."""
+    if "frames" in meta and (not isinstance(meta["frames"], list) or not meta["frames"]):
+        fail(
+            f"{path} lists no frames, but the reader of this format needs some in each of its files, those of held-out "
+            "views as well. Move a few frames there."
+        )
+    for key in ("camera_angle_x", "camera_angle_y"):
+        if key not in meta or f"fl_{key[-1]}" in meta:
+            continue  # nothing reads it
+        angle = meta[key] = _number(path, key, meta[key], "for all frames")
+        if not 0.0 < angle < math.pi:
+            converted = f" ({angle:g} degrees are {math.radians(angle):.6g})" if math.pi <= angle < 180.0 else ""
+            fail(f"{path}: {key} is {angle:g}, but lies between 0 and pi: it is in radians, not degrees{converted}.")
+
+
+def _check_lists(path: Path, meta: dict[str, Any]) -> None:
+    """The lists of photographs for training and evaluation: all of them or none."""
+    keys = [f"{split}_filenames" for split in ("train", "val", "test")]
+    given = [key for key in keys if key in meta]
+    if not given:
+        return
+    for key in given:
+        if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
+            fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
+    if given[0] != keys[0] or len(given) == 1:
+        fail(
+            f"{path} has {', '.join(given)}, but a split needs train_filenames and val_filenames (or test_filenames). "
+            "Add what is missing, or remove the lists to have views held out by --eval-mode."
+        )
+    for key, other in ((keys[1], keys[2]), (keys[2], keys[1])):
+        meta.setdefault(key, meta.get(other))
+
+
+def _check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
+    """One photograph has one pose."""
+    first: dict[str, int] = {}
+    for i, frame in enumerate(frames):
+        name = os.path.normpath(str(frame.get("file_path", f"frame {i}")))
+        before = first.setdefault(name, i)
+        poses = [np.asarray(frames[j]["transform_matrix"]) for j in (before, i)]
+        if before != i and not np.allclose(*poses, rtol=1e-5, atol=1e-5):
+            fail(
+                f"{path}: frames {before} and {i} (counted from 0) are both of {name}, but with different poses. "
+                "Correct the name of one of them or remove it."
+            )
+
+
 def _check_camera(path: Path, meta: dict[str, Any]) -> None:
     """Numbers are numbers, and every frame has all that it needs."""
     frames = meta["frames"]
@@ -131,12 +185,12 @@ def _check_camera(path: Path, meta: dict[str, Any]) -> None:
 
 def _number(path: Path, key: str, value: Any, whose: str) -> float | int:
     try:
-        number = float(value)
+        number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         fail(f"{path}: {key} {whose} is {value!r}, which is no number")
     if key not in SIZES:
         return number  # what is not finite is refused with the cameras
-    if not number.is_integer():
+    if not number.is_integer() or number > LONGEST_SIDE:
         fail(f"{path}: {key} {whose} is {value!r}, which is no number of pixels")
     return int(number)
 

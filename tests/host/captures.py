@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from scipy.spatial.transform import Rotation
 
 from bitymi_ns.host.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.host.errors import InputError
@@ -35,3 +38,18 @@ def expect(message: str) -> Any:
 def said(capsys: pytest.CaptureFixture[str]) -> str:
     """What was printed, on one line."""
     return " ".join(capsys.readouterr().out.split())
+
+
+def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
+    """The capture's views as a COLMAP model in text; the quaternion of the fourth is `scale` long."""
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 48 36 40 40 24 18\n")
+    lines = []
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    for i, frame in enumerate(frames):
+        w2c = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
+        quaternion = Rotation.from_matrix(w2c[:3, :3]).as_quat()[[3, 0, 1, 2]] * (scale if i == 3 else 1.0)
+        numbers = " ".join(map(str, [i + 1, *quaternion, *w2c[:3, 3], 1]))
+        lines.append(f"{numbers} {Path(frame['file_path']).name}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5 1 0 2 0\n2 0.1 0 0.5 200 10 10 0.5 1 0 2 0\n")

@@ -233,3 +233,22 @@ def test_colmap_points_do_not_stop_a_run_without_terminal(capture: Path, edit: A
 def test_the_transforms_file_may_be_named_itself(capture: Path) -> None:
     assert json.loads((capture / "transforms.json").read_text())["frames"]
     assert len(load(capture / "transforms.json").train_dataset) == 10
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scale_factor": 0.0}, "--scale-factor is 0.0, but has to be above 0"),
+        ({"scale_factor": -1.0}, "--scale-factor is -1.0, but has to be above 0"),
+        ({"downscale_factor": 0}, "--downscale-factor is 0, but has to be 1 or more"),
+        ({"eval_mode": "fraction", "train_split_fraction": 2.0}, "--train-split-fraction is 2.0, .* at most 1"),
+        ({"eval_interval": 0}, "--eval-interval is 0, but has to be 1 or more"),
+    ],
+)
+def test_options_that_leave_no_capture(capture: Path, options: dict[str, Any], message: str) -> None:
+    with expect(message):
+        load(capture, **options)
+
+
+def test_options_that_nothing_reads_are_not_looked_at(capture: Path) -> None:
+    assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -236,3 +238,24 @@ def test_turned_photographs(capture: Path, edit: Any, capsys: pytest.CaptureFixt
     with_orientation(paths[3], Image.open(paths[3]).rotate(90, expand=True), 6)
     with expect(f"{paths[3].name} is stored turned by a quarter: it has 36 x 48 .* camera is for 48 x 36.*EXIF tag"):
         _ = load(capture).cached_train
+
+
+def declared(path: Path, width: int, height: int) -> None:
+    """A PNG file that says it has this size; there are no pixels in it."""
+    ihdr = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = [ihdr, b"IDAT" + zlib.compress(b""), b"IEND"]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    )
+
+
+@pytest.mark.parametrize("index", [0, 4])
+def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
+    path = images_of(capture)[index]
+    declared(path, 16320, 12240)  # of a phone's sensor of 200 million pixels
+    manager = load(capture)
+    assert len(manager.train_dataset) == 10
+    declared(path, 60000, 60000)
+    with expect(f"{path.name} has more than 1,000,000,000 pixels. Make it smaller"):
+        load(capture)

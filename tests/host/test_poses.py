@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,8 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.host.poses import check_places, rotations
-from tests.host.captures import expect, images_of, load, load_with, said
+from bitymi_ns.host.poses import check_cloud, check_places, rotations
+from tests.host.captures import colmap_model, expect, images_of, load, load_with, said
 
 
 def pose_of(frame: dict[str, Any]) -> np.ndarray:
@@ -115,7 +114,8 @@ def test_a_transposed_matrix_is_told(capture: Path, edit: Any) -> None:
         load(capture)
 
 
-def blender(capture: Path, scale: float, shear: float) -> None:
+def blender(capture: Path, scale: float = 1.0, shear: float = 0.0, **common: Any) -> None:
+    """The capture in Blender's format; `common` are entries of each file."""
     meta = json.loads((capture / "transforms.json").read_text())
     frames = []
     for i, frame in enumerate(meta["frames"]):
@@ -124,7 +124,13 @@ def blender(capture: Path, scale: float, shear: float) -> None:
         pose[:3, 0] += (i == 0) * shear * pose[:3, 1]
         frames.append({"file_path": frame["file_path"][:-4], "transform_matrix": pose.tolist()})
     for split, some in (("train", frames[:9]), ("val", frames[9:])):
-        text = json.dumps({"camera_angle_x": 1.1, "frames": some})
+        text = json.dumps(
+            {
+                "camera_angle_x": 1.1,
+                "frames": some,
+                **(common.get(split) or ({} if {"train", "val"} & common.keys() else common)),
+            }
+        )
         (capture / f"transforms_{split}.json").write_text(text, "utf-8-sig")
 
 
@@ -145,19 +151,27 @@ def test_blenders_and_instant_ngps_poses_are_checked_as_well(
     assert torch.allclose(load_with(capture, ngp).train_dataset.cameras.camera_to_worlds, clean, atol=1e-6)
 
 
-def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
-    """The capture's views as a COLMAP model in text; the quaternion of the fourth is `scale` long."""
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text("1 PINHOLE 48 36 40 40 24 18\n")
-    lines = []
-    frames = json.loads((capture / "transforms.json").read_text())["frames"]
-    for i, frame in enumerate(frames):
-        w2c = np.linalg.inv(pose_of(frame) @ np.diag([1, -1, -1, 1]))
-        quaternion = Rotation.from_matrix(w2c[:3, :3]).as_quat()[[3, 0, 1, 2]] * (scale if i == 3 else 1.0)
-        numbers = " ".join(map(str, [i + 1, *quaternion, *w2c[:3, 3], 1]))
-        lines.append(f"{numbers} {Path(frame['file_path']).name}\n\n")
-    (folder / "images.txt").write_text("".join(lines))
-    (folder / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5 1 0 2 0\n2 0.1 0 0.5 200 10 10 0.5 1 0 2 0\n")
+@pytest.mark.parametrize(
+    ("common", "message"),
+    [
+        (
+            {"camera_angle_x": 39.6},
+            r"transforms_train.json: camera_angle_x is 39.6.*not degrees \(39.6 deg.* 0.69115\)",
+        ),
+        ({"camera_angle_x": True}, "camera_angle_x for all frames is True, which is no number"),
+        (
+            {"camera_angle_x": 3.14159},
+            "focal length of .*frame_00001.png.*span 180 degrees.*camera_angle_x is in radia",
+        ),
+        ({"frames": None}, "transforms_train.json lists no frames"),
+        ({"train": {"frames": []}}, "transforms_train.json lists no frames"),
+        ({"val": {"frames": []}}, "transforms_val.json lists no frames.*Move a few frames there"),
+    ],
+)
+def test_blenders_files_that_cannot_be_used(capture: Path, common: dict[str, Any], message: str) -> None:
+    blender(capture, **common)
+    with expect(message):
+        load_with(capture, BlenderDataParserConfig())
 
 
 def test_poses_from_other_files_are_checked_when_they_have_been_read(capture: Path) -> None:
@@ -168,19 +182,6 @@ def test_poses_from_other_files_are_checked_when_they_have_been_read(capture: Pa
     assert torch.allclose(parts @ parts.transpose(1, 2), torch.eye(3).expand_as(parts), atol=1e-5)
     with expect("the 3 x 3 part of the pose of .*frame_00004.png is no rotation"):
         load_with(capture, ColmapDataParserConfig(colmap_path=Path("sparse/1")))
-
-
-def test_where_a_colmap_model_lies_is_told(capture: Path) -> None:
-    with expect("COLMAP model .*colmap/sparse/0 does not exist, and there is none in other folders"):
-        load_with(capture, ColmapDataParserConfig())
-    colmap_model(capture, capture / "sparse/0")
-    with expect("does not exist. Give `colmap --data .* --colmap-path sparse/0`"):
-        load_with(capture, ColmapDataParserConfig())
-    with expect("folder of photographs .*photos does not exist.*--images-path"):
-        load_with(capture, ColmapDataParserConfig(colmap_path=Path("sparse/0"), images_path=Path("photos")))
-    (capture / "transforms.json").unlink()
-    with expect("holds no transforms.json. It has a COLMAP model: give `colmap --data .* --colmap-path sparse/0`"):
-        load(capture)
 
 
 def test_a_camera_far_from_all_others(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -212,8 +213,30 @@ def test_the_photographs_of_a_scaled_capture_are_those_of_its_frames(capture: Pa
     assert np.array_equal(data.numpy(), np.asarray(Image.open(images_of(capture)[1])))
 
 
-def test_reduced_photographs_that_nobody_can_be_asked_for(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    colmap_model(capture, capture / "sparse/0")
-    monkeypatch.setattr("sys.stdin", io.StringIO())  # a batch job: the host's question meets the end of its input
-    with expect("has no reduced photographs.*Give `--downscale-factor 1` after the parser's name"):
-        load_with(capture, ColmapDataParserConfig(colmap_path=Path("sparse/0"), downscale_factor=2))
+@pytest.mark.parametrize(
+    ("factor", "message"),
+    [(1.0, ""), (1000.0, "times as far from the cameras as these"), (0.001, "of a picture's width")],
+)
+def test_a_cloud_in_another_unit(
+    capture: Path, capsys: pytest.CaptureFixture[str], factor: float, message: str
+) -> None:
+    points = np.random.default_rng(0).normal(size=(500, 3)) * factor
+    points[0], points[1] = np.nan, 1e9  # outliers say nothing
+    lines = "\n".join(f"{x} {y} {z}" for x, y, z in points)
+    (capture / "sparse_pc.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 500\n"
+        f"property float x\nproperty float y\nproperty float z\nend_header\n{lines}\n"
+    )
+    load(capture)
+    warning = said(capsys)
+    assert ("The point cloud seems to be in another unit than the poses" in warning) == bool(message)
+    assert message in warning
+
+
+def test_cameras_on_a_tripod_and_one_walk_make_no_other_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    generator = np.random.default_rng(0)
+    points, tripod, walk = (generator.normal(size=(n, 3)) for n in (200, 30, 10))
+    check_cloud(points, np.concatenate([1e-4 * tripod, 2.0 + walk]), np.ones(40))
+    check_cloud(points[:0], tripod, np.ones(30))
+    check_cloud(np.zeros((9, 3)), tripod, np.ones(30))
+    assert said(capsys) == ""

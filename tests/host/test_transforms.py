@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.data.dataparsers import nerfstudio_dataparser
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from PIL import Image
 
@@ -74,6 +73,14 @@ def set_value(key: str, value: Any) -> Any:
         (set_value("applied_scale", 0), "applied_scale is 0.0, which is no positive number"),
         (set_value("w", "48px"), "w for all frames is '48px', which is no number"),
         (set_value("w", 48.5), "w for all frames is 48.5, which is no number of pixels"),
+        (set_value("w", 1e30), r"w for all frames is 1e\+30, which is no number of pixels"),
+        (set_value("fl_x", True), "fl_x for all frames is True, which is no number"),
+        (set_value("fl_x", 1e9), r"focal length of .*frame_00002.png.* 1e\+09 pixels \(fl_x\).*not in millimetres"),
+        (set_value("fl_y", 0.1), r"focal length of .*frame_00002.png.* 0.1 pixels \(fl_y\).*span 179 degrees"),
+        (set_value("train_filenames", None), "train_filenames is None, not a list of names. Correct it or remove it"),
+        (set_value("test_filenames", "a.png"), "test_filenames is 'a.png', not a list of names"),
+        (set_value("train_filenames", []), "has train_filenames, but a split needs .*val_filenames.*remove the lists"),
+        (set_value("test_filenames", []), "has test_filenames, but a split needs train_filenames and val_filenames"),
         (set_value("cx", None), "cx for all frames is None, which is no number"),
         (set_value("k1", [0.1]), r"k1 for all frames is \[0.1\], which is no number"),
         (set_value("cx", 5e5), "frame_00002.png cannot be used: its principal point is so far .* 80 degrees off"),
@@ -162,13 +169,6 @@ def test_one_view_that_instant_ngps_reader_loses(capture: Path) -> None:
         load_with(capture, InstantNGPDataParserConfig())
 
 
-def test_a_cut_off_colmap_file(capture: Path) -> None:
-    (capture / "sparse").mkdir()
-    (capture / "sparse/cameras.bin").write_bytes(b"\x05\0\0")
-    with expect("cannot be loaded: unpack requires"):
-        load_with(capture, ColmapDataParserConfig(colmap_path=Path("sparse")))
-
-
 def test_fisheye_photographs_are_perspective_ones_once_undistorted(capture: Path, edit: Any) -> None:
     edit(capture, lambda meta: meta.update(camera_model="OPENCV_FISHEYE", k1=0.01))
     manager = load(capture)
@@ -207,3 +207,30 @@ def test_points_are_counted_before_they_are_read(tmp_path: Path) -> None:
     (tmp_path / "b.ply").write_text(json.dumps({}))
     counts = [point_cloud.point_count(tmp_path / n) for n in ("points3D.bin", "points3D.txt", "a.ply", "b.ply", "gone")]
     assert counts == [5_000_000, 123, 7, 0, 0]
+
+
+def test_doubtful_focal_lengths_are_said(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    load(capture)
+    assert "focal length" not in said(capsys)
+    edit(capture, lambda meta: meta.update(fl_x=4.2))
+    load(capture)
+    message = said(capsys)
+    assert (
+        message.count("The focal length of") == 1
+        and "is 4.2 pixels (fl_x): 48 pixels of the picture span 160 deg" in message
+    )
+
+
+def test_one_photograph_with_two_poses(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta["frames"][5].update(file_path="./" + meta["frames"][3]["file_path"]))
+    with expect(r"frames 3 and 5 \(counted from 0\) are both of images/frame_00004.png, but with different poses"):
+        load(capture)
+
+
+@pytest.mark.parametrize("given", ["val_filenames", "test_filenames"])
+def test_lists_of_two_splits_are_enough(capture: Path, edit: Any, given: str) -> None:
+    names = [f"images/{path.name}" for path in images_of(capture)]
+    edit(capture, lambda meta: meta.update({"train_filenames": names[2:], given: names[:2]}))
+    manager = load(capture)
+    assert [path.name for path in manager.eval_dataset.image_filenames] == ["frame_00001.png", "frame_00002.png"]
+    assert len(manager.train_dataset) == 10

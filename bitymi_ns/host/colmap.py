@@ -1,0 +1,145 @@
+"""COLMAP models: where they lie, and what is wrong with one, by file and entry."""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.utils import colmap_parsing_utils as reader
+
+from bitymi_ns.host.errors import fail, listed, warn
+from bitymi_ns.host.point_cloud import point_count
+
+
+def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:
+    """Stop where there is no model or no photographs; without points, go on from random ones.
+
+    Returns:
+        How many points it has, as far as that can be told before they are read; else 0.
+    """
+    model = data / dataparser.colmap_path
+    if not _is_model(model):
+        models = models_in(data)
+        what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
+        if not models:
+            fail(
+                f"the COLMAP model {model} {what}, and there is none in other folders of {data}. Give its folder, "
+                "seen from the capture, with `--colmap-path` after `colmap`."
+            )
+        others = "" if len(models) == 1 else f" ({listed(models[1:])} would do, too)"
+        fail(f"the COLMAP model {model} {what}. Give `{options_for(data, models[0])}`{others}.")
+    photographs = data / dataparser.images_path
+    reduced = photographs.with_name(f"{photographs.name}_{dataparser.downscale_factor}")
+    if not photographs.is_dir() and not reduced.is_dir():  # nerfstudio reads the reduced ones where they are asked for
+        fail(
+            f"the folder of photographs {photographs} does not exist. Give it, seen from the capture, with "
+            "`--images-path` after `colmap`."
+        )
+    if not dataparser.load_3D_points:
+        return 0
+    points = next((file for name in ("points3D.bin", "points3D.txt") if (file := model / name).is_file()), None)
+    if points is None or _is_empty(points):
+        what = "has no points3D.bin or points3D.txt" if points is None else f"has no points: {points.name} is empty"
+        warn(f"The COLMAP model {model} {what}. Training starts from random points.")
+        dataparser.load_3D_points = False
+        return 0
+    return point_count(points)
+
+
+def _is_empty(points: Path) -> bool:
+    if points.suffix == ".bin":
+        return points.stat().st_size == 8 and point_count(points) == 0  # one that is cut off is named when it is read
+    with open(points, "rb") as file:
+        return not any(line.strip() and not line.startswith(b"#") for line in file)
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
+
+
+def models_in(data: Path) -> list[Path]:
+    """Folders of COLMAP models at most three levels below the capture, seen from it."""
+    found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
+    return sorted(path.relative_to(data) for path in found if _is_model(path))
+
+
+def options_for(data: Path, model: Path) -> str:
+    """What to write on the command line to train on a model."""
+    return f"colmap --data {data} --colmap-path {model}"
+
+
+@contextmanager
+def checked_models(config: DataParserConfig) -> Iterator[None]:
+    """While it lasts, nerfstudio's reader of COLMAP models stops at what is wrong with one, in words that name it.
+
+    Each file is read once, not anew for every split.
+    """
+    if not isinstance(config, ColmapDataParserConfig):
+        yield
+        return
+    cameras: dict[int, Any] = {}  # of the model, to which its images belong
+
+    def check_cameras(path: Path, found: dict[int, Any]) -> None:
+        _check_cameras(path, found)
+        cameras.update(found)
+
+    checks: dict[str, Callable[[Path, Any], None]] = {
+        "cameras": check_cameras,
+        "images": lambda path, found: _check_images(path, found, cameras),
+        "points3D": lambda path, found: None,
+    }
+    kept = {}
+    for name, check in ((f"read_{what}_{kind}", checks[what]) for what in checks for kind in ("text", "binary")):
+        kept[name] = getattr(reader, name)
+        setattr(reader, name, functools.cache(functools.partial(_read, kept[name], check)))
+    try:
+        yield
+    finally:
+        for name, original in kept.items():
+            setattr(reader, name, original)
+
+
+def _read(original: Callable[[Path], Any], check: Callable[[Path, Any], None], path: Path) -> Any:
+    try:
+        found = original(path)
+    except FileNotFoundError as error:
+        fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.", error)
+    except (struct.error, ValueError, LookupError, AssertionError, MemoryError, OverflowError) as error:
+        what = "is cut off or damaged" if path.suffix == ".bin" else f"has a line that cannot be read ({error})"
+        hint = " Each image has two lines; the second, of its 2D points, may be empty." * (path.name == "images.txt")
+        fail(f"{path} {what}.{hint} Copy the model again, or write it anew from COLMAP.", error)
+    check(path, found)
+    return found
+
+
+def _check_cameras(path: Path, cameras: dict[int, Any]) -> None:
+    for number, camera in cameras.items():
+        model = reader.CAMERA_MODEL_NAMES.get(camera.model)
+        if model is not None and len(camera.params) != model.num_params:  # nerfstudio names models it does not know
+            fail(
+                f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has "
+                f"{model.num_params}. Correct its line."
+            )
+
+
+def _check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
+    if not images:
+        fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path` after `colmap`.")
+    for number, image in images.items():
+        if cameras and image.camera_id not in cameras:
+            fail(
+                f"{path}: image {number} ({image.name}) was taken by camera {image.camera_id}, but the model has only "
+                f"{listed(sorted(cameras))}. Correct its line, or copy the whole model again."
+            )
+        if not np.isfinite([*image.qvec, *image.tvec]).all() or not image.qvec.any():
+            fail(
+                f"{path}: the pose of image {number} ({image.name}) is not finite, or its rotation is zero. Correct "
+                "its line or remove the image."
+            )

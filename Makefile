@@ -83,7 +83,7 @@ demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash scripts/demo.sh $(if $(DATA),"$(DATA)")
 
 test: setup
-	$(BIN)/python -m pytest -q
+	BITYMI_TESTS_REQUIRE=emulated $(BIN)/python -m pytest -q
 
 gate gate-accept: setup
 	$(BIN)/python benchmarks/gate.py $(if $(DATA),--capture "$(DATA)") $(if $(filter %-accept,$@),--accept)

@@ -10,6 +10,7 @@ import torch
 
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import emulated_cuda
+from tests.required import skip_without
 
 
 def why_not_on_a_card() -> str | None:
@@ -37,7 +38,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     """A device whose tensors go to the CUDA kernels."""
     reason = why_not_emulated() if request.param == "emulated" else why_not_on_a_card()
     if reason:
-        pytest.skip(reason)
+        skip_without(request.param, reason)
     if request.param == "card":
         yield torch.device("cuda")
     else:

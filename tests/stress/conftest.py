@@ -7,12 +7,13 @@ from collections.abc import Iterator
 import pytest
 
 from bitymi_ns.measure.stability.backends import BACKENDS, Backend, missing
+from tests.required import skip_without
 
 
 @pytest.fixture(params=sorted(BACKENDS))
 def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
     chosen = BACKENDS[request.param]
     if why := missing(chosen):
-        pytest.skip(why)
+        skip_without(chosen.name, why)
     with chosen.use():
         yield chosen

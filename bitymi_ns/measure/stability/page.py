@@ -50,8 +50,9 @@ that were rounded once. Divided by 2^-24 it is the condition number of the case.
 evaluation in extended precision (64 bits of mantissa; gradients by complex steps); a dash where it is too large for
 that.
 
-**Verdict**: *accurate*: both errors at most {accurate:g}, 1/{steps} of an 8-bit step; *as the inputs allow*: at
-most {allowance:g} times what rounding the inputs does; *nothing drawn*; else *loses figures*.
+**Verdict**: *accurate*: the errors of float32 and of float64 are at most {accurate:g}, 1/{steps} of an 8-bit step; *as
+the inputs allow*: at most {allowance:g} times what rounding the inputs to the same type does; *nothing drawn*; else
+*loses figures*.
 """
 
 
@@ -68,11 +69,15 @@ class Row:
     def verdict(self) -> str:
         """One of the verdicts that the page explains."""
         e = self.single
-        if not e.finite:
+        if not (e.finite and self.double.finite):
             return "**not finite**"
         if e.drawn == 0:
             return "nothing drawn"
-        pairs = ((e.forward, e.input_forward), (e.gradient, e.input_gradient))
+        pairs = [
+            pair
+            for each in (self.single, self.double)
+            for pair in ((each.forward, each.input_forward), (each.gradient, each.input_gradient))
+        ]
         if all(error <= ACCURATE for error, _ in pairs):
             return "accurate"
         if all(error <= max(ACCURATE, ALLOWANCE * allowed) for error, allowed in pairs):

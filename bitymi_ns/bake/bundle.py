@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from bitymi_ns import __version__
 from bitymi_ns.bake import ktx2, ply
@@ -37,10 +36,10 @@ from bitymi_ns.bake.surfel_table import (
     first_problem,
     term_columns,
     to_columns,
-    view_color_kind,
 )
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
+from bitymi_ns.scene.baked import BakedScene
 
 __all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
 
@@ -69,16 +68,9 @@ class World:
 
 def write_bundle(
     folder: str | Path,
-    surfels: Mapping[str, Tensor],
-    tiles: npt.NDArray[np.int32],
-    atlas: EncodedAtlas | None,
+    scene: BakedScene,
+    atlas: EncodedAtlas | None = None,
     *,
-    extent: Tensor | None = None,
-    mean_residual: Tensor | None = None,
-    near: float = 0.2,
-    weight_bound: float = 0.0,
-    prefilter: str = "low_pass",
-    view_color: str | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     world: World | None = None,
     statistics: Mapping[str, Any] | None = None,
@@ -90,16 +82,9 @@ def write_bundle(
 
     Args:
         folder: the bundle's folder.
-        surfels: per-surfel parameters, N rows each, all finite; the view colour all or lean.
-        tiles: [N, 5] int32.
+        scene: on the CPU, all numbers finite, the view colours all or lean. Its own atlas is not looked at. The mean
+            residuals are also a part of the colour that other viewers show.
         atlas: the encoded atlas, None for a scene without texture.
-        extent: [N] half side of each tile in scale units, None = 3, the kernel's support.
-        mean_residual: [N, 3] mean of each tile; the residual of the surfels without a tile, and part of the colour that
-            other viewers show. None = 0.
-        near: nearest drawn depth.
-        weight_bound: fragments of smaller blending weight get no residual.
-        prefilter: low_pass or pixel (`SceneConfig.prefilter`).
-        view_color: sv, sh, sb or sg; lean colours need it, None = the kind whose parameters are there.
         background: colour behind the surfels.
         world: place in the capture's own frame.
         statistics: anything worth knowing about the bake, for people and reports.
@@ -115,16 +100,16 @@ def write_bundle(
             what is read (`limits.py`, `manifest.py`).
     """
     folder = Path(folder)
-    kind = view_color or view_color_kind(surfels)
-    _check_surfels(surfels, tiles, kind, mean_residual)
+    surfels = scene.surfels
+    _check_surfels(scene)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS):
             raise BundleError(f"extra_files may not replace {name}")
-    info = _describe(surfels, kind, atlas, near, weight_bound, prefilter, background, world or World(), statistics)
+    info = _describe(scene, atlas, background, world or World(), statistics)
     try:
         with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
-            columns = to_columns(surfels, tiles, mean_residual, extent, kind)
+            columns = to_columns(surfels, scene.tiles.numpy(), scene.mean_residual, scene.extent, scene.view_color)
             terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
             ply.write_ply(new / SURFELS, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
             if atlas is not None:
@@ -144,17 +129,14 @@ def write_bundle(
 
 
 def _describe(
-    surfels: Mapping[str, Tensor],
-    kind: str,
+    scene: BakedScene,
     atlas: EncodedAtlas | None,
-    near: float,
-    weight_bound: float,
-    prefilter: str,
     background: Sequence[float],
     world: World,
     statistics: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """What `manifest.describe` takes, without the list of files; what is the same for all bundles stands there."""
+    surfels, kind = scene.surfels, scene.view_color
     means, lean = surfels["means"].detach(), "view_terms" in surfels
     version = VERSION if lean else FULL_VERSION
     empty = len(means) == 0
@@ -164,9 +146,9 @@ def _describe(
         "surfels": {"count": len(means), "view_color": kind},
         "atlas": None,
         "render": {
-            "near": near,
-            "weight_bound": weight_bound,
-            "prefilter": prefilter,
+            "near": scene.near,
+            "weight_bound": scene.weight_bound,
+            "prefilter": scene.prefilter,
             "background": list(background),
         },
         "world": {"transform": np.asarray(world.transform, dtype=np.float64)[:3], "scale": float(world.scale)},
@@ -199,9 +181,8 @@ def _describe(
     return described
 
 
-def _check_surfels(
-    surfels: Mapping[str, Tensor], tiles: npt.NDArray[np.int32], kind: str, mean_residual: Tensor | None
-) -> None:
+def _check_surfels(scene: BakedScene) -> None:
+    surfels, tiles, kind, mean_residual = scene.surfels, scene.tiles, scene.view_color, scene.mean_residual
     if "view_terms" in surfels:
         try:
             check_lean(kind, surfels, len(tiles))

@@ -23,12 +23,13 @@ from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
 from bitymi_ns.bake.progress import Progress, no_progress
-from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, encode
+from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.surfel_table import view_color_kind
 from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_color import VIEW_COLORS
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 
@@ -47,35 +48,55 @@ class Baked:
     """A baked scene, before it is written.
 
     Attributes:
-        surfels: parameters of the surfels that are kept, N rows, CPU; view colours are lean (`ops.view_color.LEAN`)
-            where they were reduced.
+        scene: the surfels that are kept, N of them on the CPU, without an atlas; their view colours are lean
+            (`ops.view_color.LEAN`) where they were reduced.
         rows: [N] int64, their rows in the scene.
-        packing: where the tiles lie.
+        packing: where the tiles lie; `scene.tiles` are the same memory.
         texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
-        extent: [N] half side of every tile in scale units.
-        mean_residual: [N, 3] mean of every tile; the residual of a surfel without a tile.
         atlas: the encoded atlas, None without texture.
-        near: nearest drawn depth.
-        weight_bound: fragments of smaller blending weight get no residual.
         options: what it was baked with.
         statistics: what was left out, what it cost, and the error of the quantisation.
-        prefilter: as the scene was drawn.
-        view_color: sv, sh, sb or sg.
     """
 
-    surfels: dict[str, Tensor]
+    scene: BakedScene
     rows: Tensor
     packing: Packing
-    extent: Tensor
     texels: Tensor | None
-    mean_residual: Tensor
     atlas: EncodedAtlas | None
-    near: float
-    weight_bound: float
     options: BakeOptions
     statistics: dict[str, Any] = field(default_factory=dict)
-    prefilter: str = "low_pass"
-    view_color: str = "sv"
+
+    @property
+    def mean_residual(self) -> Tensor:
+        """[N, 3] mean of every tile; the residual of a surfel without a tile."""
+        assert self.scene.mean_residual is not None
+        return self.scene.mean_residual
+
+    @property
+    def extent(self) -> Tensor:
+        """[N] half side of every tile in scale units."""
+        assert self.scene.extent is not None
+        return self.scene.extent
+
+    def with_mean_residual(self, mean_residual: Tensor) -> Baked:
+        """The same bake with other means [N, 3]."""
+        return replace(self, scene=replace(self.scene, mean_residual=mean_residual))
+
+    def unquantised(self) -> BakedScene:
+        """The scene with its texels as 32-bit floats."""
+        if self.texels is None:
+            return self.scene
+        rgba = torch.cat([self.texels, torch.ones_like(self.texels[..., :1])], -1).contiguous()
+        return replace(self.scene, atlas=rgba)
+
+    def stored(self) -> BakedScene:
+        """The scene with its texels as a bundle has them."""
+        if self.atlas is None:
+            return self.scene
+        atlas = self.atlas
+        pages = torch.from_numpy(decode_pages(atlas.payload, atlas.format, atlas.width, atlas.height))
+        pages = pages if pages.dtype == torch.uint8 else pages.float()
+        return replace(self.scene, atlas=pages, offset=atlas.range.offset, scale=atlas.range.scale)
 
     def with_texels(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
         """The same bake with other residual colours (fine-tuned ones, say), quantised and encoded anew."""
@@ -87,7 +108,7 @@ class Baked:
         statistics.pop("error", None)  # the field is no longer what the texels are meant to hold
         tiled = torch.from_numpy(self.packing.tiles[:, 3:4] > 0)
         means = torch.where(tiled, tile_means(texels, self.packing), self.mean_residual)
-        return replace(self, texels=texels, mean_residual=means, atlas=atlas, statistics=statistics)
+        return replace(self.with_mean_residual(means), texels=texels, atlas=atlas, statistics=statistics)
 
 
 @torch.no_grad()
@@ -172,21 +193,17 @@ def bake(
         surfels, statistics["view_color"] = _lean_surfels(surfels, views, cameras, options.tolerance, progress)
     statistics["seconds"] = round(time.perf_counter() - started, 3)
     surfels = {name: value.cpu() for name, value in surfels.items()}
-    return Baked(
+    baked = BakedScene(
         surfels,
-        kept.cpu(),
-        packing,
-        extent,
-        texels,
-        mean_residual,
-        atlas,
-        near,
-        weight_bound,
-        options,
-        statistics,
-        prefilter,
         kind,
+        torch.from_numpy(packing.tiles),
+        extent=extent,
+        mean_residual=mean_residual,
+        near=near,
+        weight_bound=weight_bound,
+        prefilter=prefilter,
     )
+    return Baked(baked, kept.cpu(), packing, texels, atlas, options, statistics)
 
 
 def export(
@@ -206,15 +223,8 @@ def export(
     """
     return write_bundle(
         folder,
-        baked.surfels,
-        baked.packing.tiles,
+        replace(baked.scene, mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),
         baked.atlas,
-        extent=baked.extent,
-        mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT),
-        near=baked.near,
-        weight_bound=baked.weight_bound,
-        prefilter=baked.prefilter,
-        view_color=baked.view_color,
         background=background,
         world=world,
         statistics={**baked.statistics, **(statistics or {})},

@@ -136,21 +136,22 @@ class TexelScene:
             pages.view(-1, 3)[texel] = texels[rows]
         bare = torch.from_numpy(self._baked.packing.tiles)[:, 3] == 0
         constants = torch.where(bare[:, None], texels[self.tiles.first], self._baked.mean_residual)
-        return replace(self._baked, mean_residual=constants).with_texels(pages, progress)
+        return self._baked.with_mean_residual(constants).with_texels(pages, progress)
 
     @torch.no_grad()
     def view(self, view: View) -> TexelView:
         """Traces a view."""
-        p, camera = self._baked.surfels, view.camera.to("cpu")
+        scene, camera = self._baked.scene, view.camera.to("cpu")
+        p = scene.surfels
         geometry = (p[name] for name in ("means", "quats", "log_scales", "opacity_logits", "beta_raw"))
-        projection = project(*geometry, camera, self._baked.near, self._baked.prefilter == "pixel")
-        base = view_color(self._baked.view_color, p, p["means"], camera.exact_center, projection.visible)
+        projection = project(*geometry, camera, scene.near, scene.prefilter == "pixel")
+        base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
         drawn: list[Tensor] = []
 
         def chosen_lists() -> Iterator[tuple[Fragments, Tensor]]:
             for fragments in fitting_lists(projection):
                 drawn.append(composite_image(fragments, projection, shade(fragments, base, projection.frames)))
-                yield fragments, fragments.weight >= self._baked.weight_bound
+                yield fragments, fragments.weight >= scene.weight_bound
                 del fragments  # before the next list is made
 
         chosen = TexelFragments.of_lists(chosen_lists())

@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.bake import Baked, BakeOptions, bake, rich_progress
-from bitymi_ns.bake.quantise import decode_pages
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.export import load_trained, replace_file
@@ -184,38 +183,18 @@ class Knobs:
         with rich_progress() as progress:
             return bake(self.scene, self.views, replace(self.options, **options), progress)
 
-    def _scene(self, baked: Baked, atlas: Tensor | None, offset: float = 0.0, scale: float = 1.0) -> BakedScene:
-        # with the view colours as they were trained: the knobs are the atlas's
+    def _all_colors(self, baked: Baked, scene: BakedScene) -> BakedScene:
+        """With the view colours as they were trained: the knobs are the atlas's."""
         surfels = {name: value.detach()[baked.rows].float().cpu() for name, value in self.scene.surfels.items()}
-        return BakedScene(
-            surfels,
-            self.scene.config.view_color,
-            torch.from_numpy(baked.packing.tiles).contiguous(),
-            atlas,
-            offset,
-            scale,
-            baked.extent,
-            baked.mean_residual,
-            baked.near,
-            baked.weight_bound,
-            baked.prefilter,
-        )
+        return replace(scene, surfels=surfels)
 
     def exact_texels(self, baked: Baked) -> BakedScene:
         """A bake with its texels as 32-bit floats."""
-        if baked.texels is None:
-            return self._scene(baked, None)
-        rgba = torch.cat([baked.texels, torch.zeros_like(baked.texels[..., :1])], -1).contiguous()
-        return self._scene(baked, rgba)
+        return self._all_colors(baked, baked.unquantised())
 
     def stored_texels(self, baked: Baked) -> BakedScene:
         """A bake with its texels as they are stored."""
-        atlas = baked.atlas
-        if atlas is None:
-            return self._scene(baked, None)
-        pages = torch.from_numpy(decode_pages(atlas.payload, atlas.format, atlas.width, atlas.height))
-        pages = pages if pages.dtype == torch.uint8 else pages.float()
-        return self._scene(baked, pages.contiguous(), atlas.range.offset, atlas.range.scale)
+        return self._all_colors(baked, baked.stored())
 
     def _draw(self, scene: BakedScene, bound: float | None = None, stop: float = TRANSMITTANCE_MIN) -> Render:
         """Settings share the scene: what it keeps between views for its renderer is there once."""

@@ -30,7 +30,8 @@ class BakedOutput:
 
 @dataclass
 class BakedScene:
-    """Renders a bundle, on the CPU or, after `to`, on a CUDA device.
+    """A baked scene and its renderer, on the CPU or, after `to`, on a CUDA device: what the bake makes, and what a
+    bundle holds.
 
     Attributes:
         surfels: per-surfel parameters by name (docs/architecture.md), float32.
@@ -53,7 +54,7 @@ class BakedScene:
     surfels: Mapping[str, Tensor]
     view_color: str
     tiles: Tensor
-    atlas: Tensor | None
+    atlas: Tensor | None = None
     offset: float = 0.0
     scale: float = 1.0
     extent: Tensor | None = None

@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 
 from bitymi_ns.bake import bundle as bundle_module
 from bitymi_ns.bake import ktx2, ply
-from bitymi_ns.bake.bundle import BundleError, World, check_target, read_bundle, verify_bundle, write_bundle
+from bitymi_ns.bake.bundle import BundleError, World, check_target, read_bundle, verify_bundle
 from bitymi_ns.bake.manifest import parse
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import Range, encode
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from tests.bake.damage import amend, signed
+from tests.bake.scenes import write
 from tests.ops.test_view_color import lean_parameters
 
 
@@ -29,7 +30,7 @@ def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
     atlas = None if format is None else encode(texels, packing, format, Range(-0.5, 2.0, "test"))
     tiles = packing.tiles if atlas else np.zeros_like(packing.tiles)
-    write_bundle(folder, params, tiles, atlas, **kwargs)
+    write(folder, params, tiles, atlas, **kwargs)
     return params, tiles, texels, atlas
 
 
@@ -37,7 +38,7 @@ def make_lean(surfels, folder, kind="sv", count=6):
     """A bundle with lean view colours and without texture; returns its surfels."""
     params = {k: v for k, v in surfels(count, kind).items() if k not in VIEW_COLORS[kind]}
     params |= lean_parameters(kind, count, torch.float32)
-    write_bundle(folder, params, np.zeros((count, 5), dtype=np.int32), None, view_color=kind)
+    write(folder, params, np.zeros((count, 5), dtype=np.int32), None, kind=kind)
     return params
 
 
@@ -98,7 +99,7 @@ def test_lean_view_colours_that_do_not_fit_are_refused(surfels, tmp_path):
     with pytest.raises(BundleError, match="surfel 2"):
         bad = {**params, "view_span": params["view_span"].clone()}
         bad["view_span"][2, 1] = 99
-        write_bundle(tmp_path / "bad", bad, np.zeros((6, 5), dtype=np.int32), None, view_color="sv")
+        write(tmp_path / "bad", bad, np.zeros((6, 5), dtype=np.int32), None, kind="sv")
     elements = ply.parse_ply((target / "surfels.ply").read_bytes())
 
     def rewrite(columns=None, terms=None):
@@ -238,9 +239,9 @@ def test_parameters_that_are_not_finite_are_not_written(surfels, tmp_path):
     params = surfels(3)
     params["log_scales"][1, 0] = float("nan")
     with pytest.raises(BundleError, match="log_scales is not finite in row 1"):
-        write_bundle(tmp_path / "b", params, np.zeros((3, 5), dtype=np.int32), None)
+        write(tmp_path / "b", params, np.zeros((3, 5), dtype=np.int32), None)
     with pytest.raises(BundleError, match="rows"):
-        write_bundle(tmp_path / "b", surfels(3), np.zeros((2, 5), dtype=np.int32), None)
+        write(tmp_path / "b", surfels(3), np.zeros((2, 5), dtype=np.int32), None)
     with pytest.raises(BundleError, match="cannot be the name"):
         make(surfels, tmp_path / "b", extra_files={"../escape": b""})
     with pytest.raises(BundleError, match="may not replace"):
@@ -346,7 +347,7 @@ def test_tiles_outside_the_atlas_are_refused(surfels, tmp_path):
     atlas = encode(np.zeros((1, 8, 8, 3), dtype=np.float32), packing, "uint8")
     bad_tiles = [[4, 0, 0, 8, 8], [0, 4, 0, 8, 8], [0, 0, 1, 8, 8], [-4, 0, 0, 8, 8], [0, 0, 0, 8, 0]]
     for i, tile in enumerate(bad_tiles):
-        write_bundle(tmp_path / str(i), params, np.array([tile], dtype=np.int32), atlas)
+        write(tmp_path / str(i), params, np.array([tile], dtype=np.int32), atlas)
         with pytest.raises(BundleError, match="outside the atlas"):
             read_bundle(tmp_path / str(i))
 

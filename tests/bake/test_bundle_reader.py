@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import bundle_reader, check_files, ktx2, read_bundle, write_bundle
+from bitymi_ns.bake import bundle_reader, check_files, ktx2, read_bundle
 from bitymi_ns.bake.manifest import BundleError
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import encode
 from bitymi_ns.cli import main
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from tests.bake.damage import amend, change_columns, signed
+from tests.bake.scenes import write
 from tests.ops.test_view_color import lean_parameters
 
 COUNT = 6
@@ -36,7 +37,7 @@ def make(surfels, folder: Path, kind: str = "sv", format: str = "uint8", lean: b
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
     atlas = encode(texels, packing, format)
     more = {"extent": torch.full((COUNT,), 2.0), "mean_residual": torch.zeros(COUNT, 3), **kwargs}
-    return write_bundle(folder, params, packing.tiles, atlas, view_color=kind, **more)
+    return write(folder, params, packing.tiles, atlas, kind=kind, **more)
 
 
 def sparse(folder: Path, name: str, size: int) -> None:
@@ -198,13 +199,13 @@ def test_what_would_be_refused_is_not_written(surfels, tmp_path):
     params = surfels(COUNT)
     params["sv_rgb"][3, 1, 2] = 1e4
     with pytest.raises(BundleError, match="sv_rgb_5 is 10000 in row 3; it must be from -256 to 256"):
-        write_bundle(tmp_path / "b", params, tiles, None)
+        write(tmp_path / "b", params, tiles, None)
     params = surfels(COUNT)
     params["quats"][2] = 0
     with pytest.raises(BundleError, match="quats has the length 0 in row 2"):
-        write_bundle(tmp_path / "b", params, tiles, None)
+        write(tmp_path / "b", params, tiles, None)
     with pytest.raises(BundleError, match="render.background.0 must be less than or equal to 1"):
-        write_bundle(tmp_path / "b", surfels(COUNT), tiles, None, background=(255, 0, 0))
+        write(tmp_path / "b", surfels(COUNT), tiles, None, background=(255, 0, 0))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -137,14 +137,14 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     assert all(check.ok for check in checks) and bundle.scene.view_color == kind
     assert bundle.info.version == "2.1" and bundle.info.surfels.terms == len(bundle.scene.surfels["view_terms"])
     for name in LEAN:
-        assert torch.equal(bundle.scene.surfels[name], baked.surfels[name])
+        assert torch.equal(bundle.scene.surfels[name], baked.scene.surfels[name])
     stated = bundle.info.statistics.view_color.model_dump()
     assert stated["error"]["p100"] <= 2.0 and stated["sites"]["after"] < stated["sites"]["before"]
     assert stated["one_color"] == int((bundle.scene.surfels["view_span"][:, 1] == 0).sum())
     check = check_view_color(bundle, made.surfels, cameras)
     assert check.ok and "stated" in check.detail
     full = bake(made, cameras, BakeOptions(format="uint8", tolerance=0.0))
-    assert "view_color" not in full.statistics and set(full.surfels) == set(made.surfels)
+    assert "view_color" not in full.statistics and set(full.scene.surfels) == set(made.surfels)
     export(full, tmp_path / "full")
     whole = read_bundle(tmp_path / "full")
     assert whole.info.version == "1.2" and check_view_color(whole, made.surfels, cameras).ok
@@ -168,7 +168,7 @@ def test_altered_colours_are_found(scene, camera, tmp_path):
 def test_without_views_the_bound_holds_all_around(scene):
     made = scene(40)
     baked = bake(made, options=BakeOptions(tolerance=3.0))
-    opacity = baked.surfels["opacity_logits"].sigmoid().clamp(max=0.99)
+    opacity = baked.scene.surfels["opacity_logits"].sigmoid().clamp(max=0.99)
     none = torch.zeros(0, 40, dtype=torch.bool), torch.zeros(0, 3, dtype=torch.float64)
     full = {name: value[baked.rows] for name, value in made.surfels.items()}
-    assert float(view_color_errors("sv", full, baked.surfels, full["means"], *none, opacity).amax()) <= 3.01
+    assert float(view_color_errors("sv", full, baked.scene.surfels, full["means"], *none, opacity).amax()) <= 3.01

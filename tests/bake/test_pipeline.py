@@ -60,7 +60,7 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
         "without_tile": int((baked.packing.tiles[:, 3] == 0).sum()),
     }
     assert baked.rows.tolist() == list(range(13, 100))
-    torch.testing.assert_close(baked.surfels["means"], made.surfels["means"][13:])
+    torch.testing.assert_close(baked.scene.surfels["means"], made.surfels["means"][13:])
     export(baked, tmp_path / "b", statistics={"psnr": 30.0})
     info = read_bundle(tmp_path / "b").info
     assert info.statistics.surfels.left_out["transparent"] == 7 and info.statistics.psnr == 30.0
@@ -112,7 +112,7 @@ def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     # of what no view sees nothing is known: it is treated as if nothing stood in front
     within = bake(made, [camera()], BakeOptions(drop_unseen=False))
     assert within.packing.tiles[::2].any() and within.packing.tiles[::2, 3:].max() == 4
-    assert (within.surfels["view_span"][::2, 1] > 0).any()
+    assert (within.scene.surfels["view_span"][::2, 1] > 0).any()
     dropped = bake(made, [camera()])
     assert dropped.rows.tolist() == list(range(1, 50, 2))
     assert dropped.statistics["surfels"]["left_out"]["unseen"] == 25

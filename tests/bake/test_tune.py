@@ -13,7 +13,6 @@ from torch import Tensor
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
 from bitymi_ns.bake.tune import TexelScene, TexelView, TexelViews, coverage
 from bitymi_ns.ops import fitting_lists, project, trace_cpu
-from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.memory import Room
@@ -38,13 +37,7 @@ def cameras() -> list[Camera]:
 
 def render(baked: Baked, camera: Camera) -> Tensor:
     """What the baked renderer shows of the texels before quantisation."""
-    atlas = torch.cat([baked.texels, torch.ones_like(baked.texels[..., :1])], dim=-1)
-    tiles = torch.from_numpy(baked.packing.tiles)
-    scene = BakedScene(
-        baked.surfels, "sv", tiles, atlas, extent=baked.extent, mean_residual=baked.mean_residual, near=baked.near,
-        weight_bound=baked.weight_bound, prefilter=baked.prefilter,
-    )  # fmt: skip
-    return scene.render(camera, BACKGROUND).rgb
+    return baked.unquantised().render(camera, BACKGROUND).rgb
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +48,7 @@ def truth(scene) -> Baked:
     made.surfels["opacity_logits"] += 1.0
     made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])  # no view sees it
     baked = bake(made, options=BakeOptions(format="fp16", r_max=8))
-    baked.weight_bound = 0.02
+    baked.scene.weight_bound = 0.02
     baked.packing.tiles[0] = 0
     baked.mean_residual[0] = 0.3
     return baked
@@ -70,7 +63,7 @@ def views(truth: Baked) -> list[View]:
 @pytest.fixture(scope="module")
 def wrong(truth: Baked) -> Baked:
     """The same scene with another constant for a residual."""
-    grey = replace(truth, mean_residual=torch.full_like(truth.mean_residual, 0.1))
+    grey = truth.with_mean_residual(torch.full_like(truth.mean_residual, 0.1))
     return grey.with_texels(torch.full_like(truth.texels, 0.1))
 
 
@@ -91,7 +84,7 @@ def test_tuning_finds_what_the_photographs_show(truth: Baked, wrong: Baked, view
 
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
-    baked = replace(truth, prefilter=prefilter)
+    baked = replace(truth, scene=replace(truth.scene, prefilter=prefilter))
     scene = TexelScene(baked, BACKGROUND)
     for camera in cameras()[:2]:
         want = render(baked, camera)
@@ -199,8 +192,8 @@ def test_a_view_with_many_fragments_is_traced_in_bands(
     scene = TexelScene(wrong, BACKGROUND)
     whole = scene.view(views[0])
     monkeypatch.setattr(trace_cpu, "MOST", 3500)
-    camera, p = views[0].camera, wrong.surfels
-    projection = project(*(p[name] for name in GEOMETRY), camera, wrong.near)
+    camera, p = views[0].camera, wrong.scene.surfels
+    projection = project(*(p[name] for name in GEOMETRY), camera, wrong.scene.near)
     assert len(list(fitting_lists(projection))) > 1
     parts = scene.view(views[0])
     for name in ("surfel", "pixel", "tile_start", "run_start", "order"):

@@ -81,10 +81,10 @@ def of_a_file(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
 
 def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
     """Two versions of a bundle."""
-    import numpy as np
     import torch
 
     from bitymi_ns.bake.bundle import write_bundle
+    from bitymi_ns.scene.baked import BakedScene
 
     torch.set_num_threads(1)
 
@@ -93,8 +93,8 @@ def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
         shapes |= {"sh_dc": (3, 3), "sh_rest": (3, 15, 3)}
         surfels = {name: torch.full(shape, value) for name, shape in shapes.items()}
         more = {"extra_files": {"preview.png": b"png"}, "loose_files": {"config.yml": b"config"}}
-        tiles = np.zeros((3, 5), dtype=np.int32)
-        return lambda: write_bundle(folder / "b", surfels, tiles, None, overwrite=True, **more) and None
+        scene = BakedScene(surfels, "sh", torch.zeros(3, 5, dtype=torch.int32))
+        return lambda: write_bundle(folder / "b", scene, overwrite=True, **more) and None
 
     return version(1.0), version(2.0)
 

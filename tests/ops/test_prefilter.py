@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.bake import read_bundle, write_bundle
+from bitymi_ns.bake import read_bundle
 from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
 from bitymi_ns.measure.stability.sweeps import SWEEPS
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene import Scene, SceneConfig
+from tests.bake.scenes import write
 from tests.ops.golden import camera_of, dense, reference, traced
 
 
@@ -140,7 +141,7 @@ def test_a_baked_scene_is_drawn_as_the_trained_one(tmp_path: Path) -> None:
     params = {key: value.float() for key, value in case.params.items()}
     scene = Scene(SceneConfig(texture="none", prefilter="pixel", near=0.2), params, None)
     tiles = torch.zeros(30, 5, dtype=torch.int32)
-    write_bundle(tmp_path / "bundle", params, tiles.numpy(), None, prefilter="pixel")
+    write(tmp_path / "bundle", params, tiles.numpy(), None, prefilter="pixel")
     baked = read_bundle(tmp_path / "bundle").scene
     assert baked.prefilter == "pixel"
     camera = camera_of(case, torch.float32)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BundleError, check_files, read_bundle, write_bundle
+from bitymi_ns.bake import BundleError, check_files, read_bundle
 from bitymi_ns.bake.limits import BRIGHTEST
 from bitymi_ns.bake.manifest import parse
 from bitymi_ns.bake.packing import pack
@@ -25,6 +25,7 @@ from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from tests.bake.damage import signed
+from tests.bake.scenes import write
 from tests.ops.test_view_color import lean_parameters
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
@@ -45,7 +46,7 @@ def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         params |= lean_parameters("sv", N, torch.float32)
     atlas = encode(texels, packing, "uint8" if lean else request.param, Range(-0.5, 2.0, "test"))
     folder = tmp_path_factory.mktemp("bundles") / request.param
-    write_bundle(folder, params, packing.tiles, atlas, view_color="sv")
+    write(folder, params, packing.tiles, atlas, kind="sv")
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 

@@ -1,0 +1,42 @@
+"""Baked scenes for tests of bundles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.bundle import write_bundle
+from bitymi_ns.bake.quantise import EncodedAtlas
+from bitymi_ns.bake.surfel_table import view_color_kind
+from bitymi_ns.scene.baked import BakedScene
+
+OF_THE_SCENE = ("extent", "mean_residual", "near", "weight_bound", "prefilter")
+
+
+def write(
+    folder: Path,
+    surfels: Mapping[str, Tensor],
+    tiles: np.ndarray | None = None,
+    atlas: EncodedAtlas | None = None,
+    kind: str | None = None,
+    **options: Any,
+) -> Path:
+    """Write a bundle of these surfels.
+
+    Args:
+        folder: of the bundle.
+        surfels: N rows.
+        tiles: [N, 5] int32; None = no tiles.
+        atlas: encoded.
+        kind: of the view colour; lean ones need it.
+        options: of the scene and of `write_bundle`.
+    """
+    rows = torch.zeros(len(surfels["means"]), 5, dtype=torch.int32) if tiles is None else torch.from_numpy(tiles)
+    of_scene = {name: options.pop(name) for name in OF_THE_SCENE if name in options}
+    scene = BakedScene(surfels, kind or view_color_kind(surfels), rows, **of_scene)
+    return write_bundle(folder, scene, atlas, **options)

@@ -31,7 +31,7 @@ class Options:
         surfels: sizes of the scenes.
         sizes: image sizes, width and height.
         warm_up, runs: of every timing.
-        copy_bytes: measured bytes a second of a device-to-device copy, read and written bytes counted.
+        copy_bytes: measured bytes per second of a device-to-device copy, read and written bytes counted.
         bundles: folders of real scenes for the baked renderer.
     """
 
@@ -120,7 +120,7 @@ def trained_like(
 
     Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
     deviation 0.85, the mean log scale in pixels 0.7, opacity and kernel exponent are logistic-normal (medians 0.45 and
-    2.4); about 23 fragments a pixel are blended, whatever n. A fifth of the surfels lies outside the view.
+    2.4); about 23 fragments per pixel are blended, whatever n. A fifth of the surfels lies outside the view.
     """
     g = torch.Generator().manual_seed(0)
 

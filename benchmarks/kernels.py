@@ -3,13 +3,13 @@
 
 The scene: surfels in a slab before the camera with random orientation, log-normal scales that shrink with the root of
 their number, logistic-normal opacities, kernel exponents about 3.5 and random Spherical Voronoi colours; a hash field
-of 4 levels; for the baked render a uint8 atlas with one texel a pixel of each surfel's size on screen. Each kernel is
+of 4 levels; for the baked render a uint8 atlas with one texel per pixel of each surfel's size on screen. Each kernel is
 called through `bitymi_ns.ops`, as training and rendering call it; median of --runs after two to warm up.
 
 Operations: additions, multiplications, comparisons, minima, roots and divisions count 1, exp and log 10, integers
 nothing. Only what the formulas ask for is counted: pixels that a pack computes in vain are the kernel's own loss.
 Bytes: arrays that are streamed count once; rows, table entries and texels that are gathered count every time, in cache
-or not; what a tile keeps counts once a pixel. Loads: gathered table entries (16 bytes) and texels (4 bytes).
+or not; what a tile keeps counts once per pixel. Loads: gathered table entries (16 bytes) and texels (4 bytes).
 
 With n surfels of which v are visible, p pixels, f fragments of which t are textured (weight at least the scene's
 bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels, T bytes of table gradient:

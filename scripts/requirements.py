@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Print the project's requirements with its dev extra, one a line without spaces, for the Makefile's pip call."""
+"""Print the project's requirements with its dev extra, one per line without spaces, for the Makefile's pip call."""
 
 import re
 from pathlib import Path

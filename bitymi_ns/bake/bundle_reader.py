@@ -50,7 +50,7 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
     Args:
         folder: the bundle's folder.
         verify: compare every file with its sha256 (sizes are always compared).
-        decode: also decode a BC7 atlas, four bytes a texel; a CUDA device draws from the blocks alone.
+        decode: also decode a BC7 atlas, four bytes per texel; a CUDA device draws from the blocks alone.
 
     Raises:
         BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too

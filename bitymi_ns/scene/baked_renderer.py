@@ -23,7 +23,7 @@ class BakedRenderer:
         views: drawn together in a frame.
         images: what to draw, names of `ops.baked.IMAGES`: fewer images cost less.
         background: [3] colour behind the scene; None = black.
-        graph: record the frame as a CUDA graph, which costs the host one call a frame. For a card only.
+        graph: record the frame as a CUDA graph, which costs the host one call per frame. For a card only.
 
     Raises:
         RuntimeError: the scene is on the CPU, or the device has too little memory.

@@ -48,7 +48,7 @@ class RenderOutput:
         beta: [H, W, 1] sum of w beta, the paper's alpha-blended Beta value.
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
-        soft_overdraw: [H, W, 1] fragments a pixel, those of small weight in part; None without `overdraw_half`.
+        soft_overdraw: [H, W, 1] fragments per pixel, those of small weight in part; None without `overdraw_half`.
         fragments: the view's fragments; where they were too many, what is known of them without the list.
         projection: the view's surfels.
     """
@@ -64,7 +64,7 @@ class RenderOutput:
 
     @property
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels a pixel."""
+        """[H, W, 1] int32: blended surfels per pixel."""
         return self.fragments.overdraw()
 
 

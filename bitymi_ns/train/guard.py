@@ -76,7 +76,7 @@ class Guard:
     ) -> None:
         """
         Args:
-            scene, optimizers, strategy: what is restored; an optimiser a name.
+            scene, optimizers, strategy: what is restored; one optimiser per name.
             schedule: of the run.
             config: training options.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.

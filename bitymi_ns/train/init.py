@@ -128,7 +128,7 @@ def neighbour_distance(xyz: Tensor, extent: float, neighbours: int = 3) -> Tenso
 
     A point on its own gets a hundredth of the extent.
     """
-    from scipy.spatial import cKDTree  # slow to import and needed once a run
+    from scipy.spatial import cKDTree  # slow to import and needed once per run
 
     k = min(neighbours, len(xyz) - 1)
     if k < 1:

@@ -53,7 +53,7 @@ class Schedule:
     def short_run_gain(self) -> float:
         """Factor of the surfels' learning rates: more than 1 in runs of fewer than 30,000 steps.
 
-        Adam moves a parameter by about its rate a step, so a run of 600 steps at the published rates ends long before
+        Adam moves a parameter by about its rate per step, so a run of 600 steps at the published rates ends long before
         the surfels have found their places.
         """
         shortness = max(1.0, REFERENCE_STEPS / self.max_steps)
@@ -82,7 +82,7 @@ class Schedule:
     def reset_opacity(self) -> float:
         """Opacity that a reset lowers to: `reset_opacity`, or more in a short run.
 
-        Adam moves a logit by no more than its learning rate a step. A reset goes only as deep as can be made up for
+        Adam moves a logit by no more than its learning rate per step. A reset goes only as deep as can be made up for
         in half the time to the next one: else a short run would never see an opaque surfel, and its final prunes would
         take nearly all. It matters where resets are less than about 370 steps apart (fewer with the rates of a short
         run).

@@ -106,6 +106,6 @@ def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False
 
 
 def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
-    """[P, N] of one number a fragment."""
+    """[P, N] of one number per fragment."""
     out = values.new_zeros(fragments.width * fragments.height, n)
     return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)

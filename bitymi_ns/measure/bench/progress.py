@@ -18,7 +18,7 @@ class Estimate:
     """Seconds that a cell will take, from the cells that are finished.
 
     The mean over cells of the same kind and form; of these, those of the same scene and length of run where there are
-    any, else of the same length, else all. Trainings of other lengths count by their seconds a step.
+    any, else of the same length, else all. Trainings of other lengths count by their seconds per step.
     """
 
     def __init__(self, cells: Cells) -> None:

@@ -17,7 +17,7 @@ RUNS = {
     ("snowmiku", "bitymi"): (31.055, 0.944, 0.071, 11_207, 48.9),
     ("snowmiku", "bitymi-quality"): (31.618, 0.949, 0.068, 16_550, 66.0),
 }
-# format: change of PSNR, bytes a texel, share of the neural renderer's milliseconds
+# format: change of PSNR, bytes per texel, share of the neural renderer's milliseconds
 FORMATS = {"fp16": (0.001, 6, 0.24), "uint8": (-0.004, 4, 0.22), "bc7": (-0.031, 1, 0.23)}
 
 

@@ -84,7 +84,9 @@ def test_times_are_taken_again_and_not_judged_elsewhere(
         run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_neural": 21.0}, {"train": 120.0})
     stated = json.loads(baseline.read_text())
     baseline.write_text(json.dumps({**stated, "processor": "another one"}))
-    assert run(gate, monkeypatch, baseline, {"train": 200.0}) == 1
+    assert run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_neural": 19.91}) == 1
+    with pytest.raises(SystemExit, match="1 of 9"):
+        run(gate, monkeypatch, baseline, {"psnr_neural": 19.89})
     with pytest.raises(SystemExit, match="1 of 9"):
         run(gate, monkeypatch, baseline, {"surfels": 200.0})
 

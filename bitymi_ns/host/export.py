@@ -40,6 +40,8 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
 
 INTERRUPTED = 130
+FEWEST_PASSES = 4
+"""With fewer steps of fine-tuning per photograph than this the number of steps is a bound, and is said to be."""
 
 
 @dataclass(kw_only=True)
@@ -107,6 +109,12 @@ class ExportAtlas(BakeOptions):
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         finetunes = self.finetune_steps != 0 and not self.exact and model.scene.field is not None
+        if finetunes and self.finetune_steps < FEWEST_PASSES * len(views):
+            passes = self.finetune_steps / len(views)
+            say(
+                f"Fine-tuning has {self.finetune_steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
+                "for each: more may gain (--finetune-steps)."
+            )
         if model.device.type == "cpu":
             state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
         try:

@@ -114,6 +114,7 @@ def test_the_texels_are_fine_tuned(
     assert stored == pytest.approx(held_out["after"], abs=0.1)
     out = " ".join(capsys.readouterr().out.split())
     assert "tuning texels" in out and "Fine-tuning" in out
+    assert "30 steps for 10 training photographs, 3.0 for each: more may gain" in out
     assert "The export will take about" in out and "GB of memory for 10 training photographs of 48 x 36" in out
 
 

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
+from bitymi_ns.host.errors import say
 from bitymi_ns.host.ply import bad_line, read_header, rows_there
 
 MANY_POINTS = 500_000
@@ -67,7 +66,7 @@ def reporting_time(what: str, points: int) -> Iterator[None]:
     if points < MANY_POINTS:
         yield
         return
-    CONSOLE.print(f"{what} {points:,} points. This may take minutes.", soft_wrap=True)
+    say(f"{what} {points:,} points. This may take minutes.")
     start = time.perf_counter()
     yield
-    CONSOLE.print(f"{what} {points:,} points took {time.perf_counter() - start:.1f} s.", soft_wrap=True)
+    say(f"{what} {points:,} points took {time.perf_counter() - start:.1f} s.")

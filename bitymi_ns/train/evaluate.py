@@ -12,7 +12,7 @@ from torch import Tensor
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import mean_psnr, psnr
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import View, judging_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
@@ -49,20 +49,18 @@ def held_out_quality(
         device: of the renders.
     """
     values, fragments = [], []
-    for view in views:
-        output = render(view.camera.to(device))
-        target = view.target(background, device)
-        values.append(psnr(output.rgb.clamp(0.0, 1.0), target, None if view.mask is None else view.mask.to(device)))
+    for view in (view.to(device) for view in views):
+        output = render(view.camera)
+        values.append(psnr(output.rgb.clamp(0.0, 1.0), view.target(background, device), view.mask))
         fragments.append(len(output.fragments))
         del output  # with its fragments, before the next view makes its own
     return Quality(mean_psnr(values), sum(fragments) / len(fragments) if fragments else math.nan)
 
 
 def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Quality:
-    """`held_out_quality` of a trained scene over the background of evaluation: white where training has it, else black,
-    also where training draws a new one at each step."""
+    """`held_out_quality` of a trained scene, over the background on which views are judged."""
     device = scene.surfels["means"].device
-    background = torch.ones(3, device=device) if config.background == "white" else None
+    background = judging_background(config.background, device)
     return held_out_quality(
         lambda camera: scene.render(camera, background=background, field_mode="frozen"), views, background, device
     )

@@ -34,7 +34,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import ReducedViews, background_color
+from bitymi_ns.train.views import ReducedViews, judging_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -138,9 +138,8 @@ class Guard:
     def _loss_of(self, views: ReducedViews, factor: float, blank: bool = False) -> float:
         """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
         losses, count = [], min(len(views), COMPARED_VIEWS)
-        kind = "white" if self.config.background == "white" else "black"
         device = self.scene.surfels["means"].device
-        background = background_color(kind, self.config.seed, 0, device)
+        background = judging_background(self.config.background, device)
         for view in (views.at(i * len(views) // count, factor) for i in range(count)):
             target = view.target(background, device)
             if blank:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
-from bitymi_ns.train.views import View, background_color
+from bitymi_ns.train.views import View, judging_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -73,16 +73,13 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
     device = scene.surfels["means"].device
     total = torch.zeros(n, dtype=torch.int64, device=device)
     weighted = torch.zeros(n, dtype=torch.float64, device=device)
-    # a random background would make the score depend on the draw: judge over black
-    kind = "black" if config.background == "random" else config.background
-    background = background_color(kind, config.seed, 0, device)
-    for view in views:
+    background = judging_background(config.background, device)
+    for view in (view.to(device) for view in views):
         target = view.target(background, device)
-        mask = None if view.mask is None else view.mask.to(device)
-        output = scene.render(view.camera.to(device), background=background, field_mode="frozen")
-        bad = bad_pixels(output.rgb, target, config.densify.error_threshold, mask)
+        output = scene.render(view.camera, background=background, field_mode="frozen")
+        bad = bad_pixels(output.rgb, target, config.densify.error_threshold, view.mask)
         counts = output.fragments.masked_counts(bad.flatten(), n)  # [N]
-        loss = photometric(output.rgb, target, config.loss.ssim_weight, mask)
+        loss = photometric(output.rgb, target, config.loss.ssim_weight, view.mask)
         total += counts
         weighted += loss.double() * counts
         del output  # with its fragments, before the next view makes its own

@@ -35,6 +35,11 @@ class View(NamedTuple):
         """Memory of the picture and its mask."""
         return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
+    def to(self, device: torch.device | str) -> View:
+        """Camera, picture and mask on a device."""
+        mask = None if self.mask is None else self.mask.to(device)
+        return View(self.camera.to(device), self.image.to(device), mask)
+
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
         """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
         return over_background(as_float(self.image.to(device)), background)
@@ -86,6 +91,12 @@ def background_color(
         generator = torch.Generator().manual_seed((seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
         return torch.rand(3, generator=generator).to(device, non_blocking=True)
     raise ValueError(f"background must be black, white or random, not {kind!r}")
+
+
+def judging_background(kind: Literal["black", "white", "random"], device: torch.device | str) -> Tensor | None:
+    """[3] the colour behind the scene where views are judged, None = black: that of training, but black where it is
+    random, so that no figure depends on the draw."""
+    return background_color("white" if kind == "white" else "black", 0, 0, device)
 
 
 def over_background(image: Tensor, background: Tensor | None) -> Tensor:
@@ -158,9 +169,7 @@ class ReducedViews:
     def _full_size(self, index: int) -> View:
         if index in self._resident:
             return self._resident[index]
-        view = self._views[index]
-        pictures = [None if picture is None else picture.to(self._device) for picture in view[1:]]
-        moved = View(view.camera.to(self._device), *pictures)
+        moved = self._views[index].to(self._device)
         if self._room.take(moved.nbytes):
             self._resident[index] = moved
         return moved

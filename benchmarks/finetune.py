@@ -22,7 +22,8 @@ import torch
 import yaml
 from common import number, page, publish, say, table
 
-from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, export, read_bundle, tune_atlas
+from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
+from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.host.export import load_trained
 from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.host.preset import build, load_preset

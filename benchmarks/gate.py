@@ -145,7 +145,8 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     """The figures of one scene and seed."""
     import torch
 
-    from bitymi_ns.bake import BakeOptions, TuneOptions, bake, export, read_bundle, tune_atlas
+    from bitymi_ns.bake import BakeOptions, TuneOptions, bake, tune_atlas
+    from bitymi_ns.bundle import export, read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
     from bitymi_ns.train.domain import build_scene

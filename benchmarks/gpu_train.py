@@ -22,7 +22,7 @@ from common import number, page, publish, say, table
 from gpu_common import Options, milliseconds
 from plain_capture import Capture, load_capture
 
-from bitymi_ns import bake
+from bitymi_ns import bake, bundle
 from bitymi_ns.host.preset import Preset, build, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
@@ -125,8 +125,8 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
     )
     bake_seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
-        bake.export(made, Path(folder) / "bundle")
-        baked = bake.read_bundle(Path(folder) / "bundle").scene
+        bundle.export(made, Path(folder) / "bundle")
+        baked = bundle.read_bundle(Path(folder) / "bundle").scene
     if cuda:
         baked = baked.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)

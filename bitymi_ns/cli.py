@@ -183,7 +183,7 @@ class Verify:
         from rich.markup import escape
         from rich.table import Table
 
-        from bitymi_ns.bake import REMEDY, check_files
+        from bitymi_ns.bundle import REMEDY, check_files
 
         bundle, checks = check_files(self.bundle)
         if bundle is not None and self.run_config is not None:

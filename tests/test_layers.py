@@ -15,7 +15,7 @@ import pytest
 import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
-ORDER = ["ops", "scene", "train", "bake", "host", "measure"]
+ORDER = ["ops", "scene", "train", "bake", "bundle", "host", "measure"]
 """Innermost first. Beside them stand `files`, `presets` and `sample`, which import none of these."""
 KNOW_NERFSTUDIO = ("host", "measure/knobs.py", "measure/pictures.py")
 
@@ -106,6 +106,6 @@ def late():
 
 
 def test_a_scene_can_be_built_and_trained_without_nerfstudio() -> None:
-    modules = "bitymi_ns.train.domain, bitymi_ns.train.fit, bitymi_ns.bake, bitymi_ns.scene.baked"
+    modules = "bitymi_ns.train.domain, bitymi_ns.train.fit, bitymi_ns.bake, bitymi_ns.bundle, bitymi_ns.scene.baked"
     code = f"import sys; sys.modules['nerfstudio'] = None; import {modules}"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

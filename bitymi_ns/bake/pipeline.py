@@ -1,11 +1,10 @@
-"""The bake: a trained scene in, surfels and an encoded atlas out, and the bundle they are written to."""
+"""The bake: a trained scene in, surfels and an encoded atlas out."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,22 +12,20 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.bundle import World, write_bundle
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
 from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
 from bitymi_ns.bake.lean_field import lean_field
-from bitymi_ns.bake.limits import RESIDUAL_LIMIT, within
+from bitymi_ns.bake.limits import within
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.reduce import reduce_tiles
-from bitymi_ns.bake.surfel_table import view_color_kind
 from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.constants import ALPHA_MIN
-from bitymi_ns.ops.view_color import VIEW_COLORS
+from bitymi_ns.ops.view_color import VIEW_COLORS, kind_of
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
@@ -188,7 +185,7 @@ def bake(
         stored = None if atlas is None else atlas.decoded()
         errors = tile_errors(field, plan, packing.tiles, mean_residual, stored, options.chunk, progress)
         statistics["error"] = {"tolerance": options.tolerance, **errors.summary()}
-    kind = view_color_kind(surfels)
+    kind = kind_of(surfels)
     if options.tolerance > 0:
         surfels, statistics["view_color"] = _lean_surfels(surfels, views, cameras, options.tolerance, progress)
     statistics["seconds"] = round(time.perf_counter() - started, 3)
@@ -204,34 +201,6 @@ def bake(
         prefilter=prefilter,
     )
     return Baked(baked, kept.cpu(), packing, texels, atlas, options, statistics)
-
-
-def export(
-    baked: Baked,
-    folder: str | Path,
-    *,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
-    world: World | None = None,
-    statistics: Mapping[str, Any] | None = None,
-    extra_files: Mapping[str, bytes] | None = None,
-    loose_files: Mapping[str, bytes] | None = None,
-    overwrite: bool = False,
-) -> Path:
-    """Writes a baked scene as a bundle; see `write_bundle` for the arguments and errors.
-
-    `statistics` is added to those of the bake.
-    """
-    return write_bundle(
-        folder,
-        replace(baked.scene, mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),
-        baked.atlas,
-        background=background,
-        world=world,
-        statistics={**baked.statistics, **(statistics or {})},
-        extra_files=extra_files,
-        loose_files=loose_files,
-        overwrite=overwrite,
-    )
 
 
 def _lean_surfels(
@@ -250,7 +219,7 @@ def _lean_surfels(
         tolerance: 8-bit steps.
         progress: called after every chunk of work.
     """
-    kind, means = view_color_kind(surfels), surfels["means"]
+    kind, means = kind_of(surfels), surfels["means"]
     seen = means.new_zeros(0, len(means), dtype=torch.bool) if views is None else views.seen
     opacity, _ = kernel_parameters(surfels, None if views is None else views.in_front)
     at = (seen, centers_of(cameras, means), opacity)
@@ -267,7 +236,7 @@ def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
     turned = surfels["quats"].norm(dim=1)
     finite &= torch.isfinite(turned) & (turned > 1e-12)
-    storable = finite & within(surfels, view_color_kind(surfels))
+    storable = finite & within(surfels, kind_of(surfels))
     transparent = storable & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
     kept = torch.nonzero(storable & ~transparent).squeeze(1)
     counts = {"not_finite": ~finite, "beyond_limits": finite & ~storable, "transparent": transparent}

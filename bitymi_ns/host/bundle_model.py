@@ -10,8 +10,8 @@ import torch
 from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 
-from bitymi_ns.bake import REMEDY, BundleError, read_bundle
-from bitymi_ns.bake.manifest import ATLAS
+from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
+from bitymi_ns.bundle.manifest import ATLAS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
 from bitymi_ns.scene.camera import Camera

@@ -24,10 +24,11 @@ from PIL import Image
 from rich.markup import escape
 from rich.table import Table
 
-from bitymi_ns.bake import BakeOptions, BundleError, TuneOptions, bake, export, read_bundle, rich_progress, tune_atlas
-from bitymi_ns.bake.bundle import World
-from bitymi_ns.bake.manifest import MANIFEST, SURFELS, HeldOut, dump
+from bitymi_ns.bake import BakeOptions, TuneOptions, bake, rich_progress, tune_atlas
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
+from bitymi_ns.bundle import BundleError, export, read_bundle
+from bitymi_ns.bundle.manifest import MANIFEST, SURFELS, HeldOut, dump
+from bitymi_ns.bundle.write import World
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from bitymi_ns.bake.folder import check_target
-from bitymi_ns.bake.manifest import MANIFEST, BundleError
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
+from bitymi_ns.bundle.folder import check_target
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError
 from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text
 from bitymi_ns.host.errors import fail, warn
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.bake import Bundle, Check, check_field, check_view_color
+from bitymi_ns.bundle import Bundle, Check, check_field, check_view_color
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import held_out_psnr, load_trained

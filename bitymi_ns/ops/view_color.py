@@ -47,6 +47,18 @@ class _ViewColor(torch.autograd.Function):
         return None, None, None, None, dx, *((da, db) if dc is None else (da, db, dc))
 
 
+def kind_of(params: Mapping[str, Tensor]) -> str:
+    """Which view colour complete parameters belong to: sv, sh, sb or sg.
+
+    Raises:
+        ValueError: the parameters of none are there.
+    """
+    for kind, names in VIEW_COLORS.items():
+        if all(name in params for name in names):
+            return kind
+    raise ValueError(f"no view colour among the surfels' parameters {sorted(params)}")
+
+
 def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
     """The number of terms (sites, coefficients with dc, or lobes) of n surfels' view colours.
 

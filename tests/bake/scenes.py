@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.bundle import write_bundle
 from bitymi_ns.bake.quantise import EncodedAtlas
-from bitymi_ns.bake.surfel_table import view_color_kind
+from bitymi_ns.bundle import write_bundle
+from bitymi_ns.ops.view_color import kind_of
 from bitymi_ns.scene.baked import BakedScene
 
 OF_THE_SCENE = ("extent", "mean_residual", "near", "weight_bound", "prefilter")
@@ -38,5 +38,5 @@ def write(
     """
     rows = torch.zeros(len(surfels["means"]), 5, dtype=torch.int32) if tiles is None else torch.from_numpy(tiles)
     of_scene = {name: options.pop(name) for name in OF_THE_SCENE if name in options}
-    scene = BakedScene(surfels, kind or view_color_kind(surfels), rows, **of_scene)
+    scene = BakedScene(surfels, kind or kind_of(surfels), rows, **of_scene)
     return write_bundle(folder, scene, atlas, **options)

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from bitymi_ns.bake import BakeOptions, bake, check_files, check_view_color, export, read_bundle
+from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.directions import BETWEEN, SPHERE, view_directions
 from bitymi_ns.bake.lean_color import reduce_view_color, view_color_errors
 from bitymi_ns.bake.voronoi_fit import fit_sites, site_vectors, site_weights
+from bitymi_ns.bundle import check_files, check_view_color, export, read_bundle
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import LEAN, VIEW_COLORS, check_lean
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, export
+from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.lean_field import lean_field, level_changes
+from bitymi_ns.bundle import check_field, check_files, export
 from tests.bake.test_real_scene import real_scene
 
 

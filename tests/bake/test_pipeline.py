@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, export, read_bundle, rich_progress
+from bitymi_ns.bake import BakeOptions, bake, rich_progress
 from bitymi_ns.bake.geometry import tangent_vectors
+from bitymi_ns.bundle import export, read_bundle
 
 
 def bilinear(bundle, surfel, u, v, extent=3.0):

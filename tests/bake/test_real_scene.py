@@ -5,9 +5,10 @@ import torch
 
 pytest.importorskip("bitymi_ns._cpu")
 
-from bitymi_ns.bake import BakeOptions, bake, export, read_bundle
+from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.geometry import tangent_vectors
-from bitymi_ns.bake.surfel_table import VIEW_COLORS
+from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.bundle.surfel_table import VIEW_COLORS
 from bitymi_ns.ops import VIEW_COLORS as PARAMETERS
 from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.scene.config import SceneConfig

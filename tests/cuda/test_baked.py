@@ -12,8 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import bake, export, read_bundle
+from bitymi_ns.bake import bake
 from bitymi_ns.bake.pipeline import BakeOptions
+from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import Stage
 from bitymi_ns.ops.view_color import VIEW_COLORS

@@ -19,7 +19,8 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.bake import BakeOptions, TuneOptions, check_files, tune
+from bitymi_ns.bake import BakeOptions, TuneOptions, tune
+from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.host import export as host_export
 from bitymi_ns.host import target

@@ -83,7 +83,7 @@ def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
     """Two versions of a bundle."""
     import torch
 
-    from bitymi_ns.bake.bundle import write_bundle
+    from bitymi_ns.bundle import write_bundle
     from bitymi_ns.scene.baked import BakedScene
 
     torch.set_num_threads(1)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.bake import read_bundle
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
 from bitymi_ns.measure.stability.sweeps import SWEEPS
 from bitymi_ns.ops.reference import project as reference_project

@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BundleError, check_files, read_bundle
 from bitymi_ns.bake.limits import BRIGHTEST
-from bitymi_ns.bake.manifest import parse
 from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.ply import parse_ply, write_ply
 from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.bundle import BundleError, check_files, read_bundle
+from bitymi_ns.bundle.manifest import parse
+from bitymi_ns.bundle.ply import parse_ply, write_ply
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_color import VIEW_COLORS
 from bitymi_ns.scene import Camera
-from tests.bake.damage import signed
 from tests.bake.scenes import write
+from tests.bundle.damage import signed
 from tests.ops.test_view_color import lean_parameters
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.bake import ply, strict_json
+from bitymi_ns.bundle import ply, strict_json
 
 
 def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) -> bytes:

@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.bundle_reader import Bundle, assemble, enough_memory, read_file, read_manifest
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
-from bitymi_ns.bake.manifest import MANIFEST, BundleError
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan
 from bitymi_ns.bake.visibility import visibility
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.read import Bundle, assemble, enough_memory, read_file, read_manifest
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 

@@ -7,11 +7,11 @@ import re
 
 import pytest
 
-from bitymi_ns.bake import strict_json
 from bitymi_ns.bake.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
-from bitymi_ns.bake.manifest import Atlas, BundleError, describe, dump, parse
+from bitymi_ns.bundle import strict_json
+from bitymi_ns.bundle.manifest import Atlas, BundleError, describe, dump, parse
 from bitymi_ns.ops.view_color import MAX_TERMS
-from tests.bake.damage import signed
+from tests.bundle.damage import signed
 
 INFO = {
     "format": "bitymi-bundle",

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import ktx2, ply
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
-from bitymi_ns.bake.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileEntry, Manifest, parse
 from bitymi_ns.bake.quantise import decode_pages
-from bitymi_ns.bake.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
+from bitymi_ns.bundle import ktx2, ply
+from bitymi_ns.bundle.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileEntry, Manifest, parse
+from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 

@@ -10,16 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake import bundle as bundle_module
-from bitymi_ns.bake import ktx2, ply
-from bitymi_ns.bake.bundle import BundleError, World, check_target, read_bundle, verify_bundle
-from bitymi_ns.bake.manifest import parse
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.bundle import BundleError, World, check_target, ktx2, ply, read_bundle, verify_bundle
+from bitymi_ns.bundle import write as bundle_module
+from bitymi_ns.bundle.manifest import parse
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import VIEW_COLORS
-from tests.bake.damage import amend, signed
 from tests.bake.scenes import write
+from tests.bundle.damage import amend, signed
 from tests.ops.test_view_color import lean_parameters
 
 

@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, TERM_LIMITS, UNIT_SLACK, beyond
-from bitymi_ns.bake.ply import PlyError
+from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
-from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, check_lean
+from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, check_lean, kind_of
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.init import fibonacci_sphere
 
@@ -52,21 +52,13 @@ VIEW_COLORS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 
 
-def view_color_kind(surfels: Mapping[str, Tensor]) -> str:
-    """Which view colour the parameters belong to: sv, sh, sb or sg."""
-    for kind, shapes in VIEW_COLORS.items():
-        if all(name in surfels for name in shapes):
-            return kind
-    raise ValueError(f"no view colour among the surfels' parameters {sorted(surfels)}")
-
-
 def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
     """Mean of f_view over all directions, without the bias 0.5: [N, 3].
 
     Exact for sh, sb and sg; a mean over 32 directions for sv and for lean colours, whose kind must be given. For
     display only.
     """
-    kind = kind or view_color_kind(surfels)
+    kind = kind or kind_of(surfels)
     if kind == "sv" or "view_terms" in surfels:
         n, origin = len(surfels["means"]), torch.zeros(3)
         parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in fibonacci_sphere(32)]
@@ -101,7 +93,7 @@ def to_columns(
         extent: [N] half side of each tile in scale units; None = no column.
         kind: sv, sh, sb or sg; None = the one whose parameters are there.
     """
-    kind = kind or view_color_kind(surfels)
+    kind = kind or kind_of(surfels)
     lean = "view_terms" in surfels
     surfels = {name: _plain(value) for name, value in surfels.items()}
     color = mean_view_color(surfels, kind)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake.ply import PlyError
-from bitymi_ns.bake.surfel_table import (
+from bitymi_ns.bundle.ply import PlyError
+from bitymi_ns.bundle.surfel_table import (
     VIEW_COLORS,
     from_columns,
     mean_residuals,

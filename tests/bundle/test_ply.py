@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake.ply import PlyError, parse_ply, write_ply
+from bitymi_ns.bundle.ply import PlyError, parse_ply, write_ply
 
 COLUMNS = {
     "x": np.array([1.5, -2.0, 3e30], dtype=np.float32),

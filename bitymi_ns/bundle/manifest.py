@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 from pydantic_core import PydanticCustomError
 
-from bitymi_ns.bake import strict_json
-from bitymi_ns.bake.ktx2 import Format
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.quantise import Format
+from bitymi_ns.bundle import strict_json
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 
 FORMAT = "bitymi-bundle"

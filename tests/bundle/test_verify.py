@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, check_field, check_files, check_view_color, export
+from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bundle import check_field, check_files, check_view_color, export
 from bitymi_ns.cli import main
-from tests.bake.damage import amend, change_columns
+from tests.bundle.damage import amend, change_columns
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from bitymi_ns.bake.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:

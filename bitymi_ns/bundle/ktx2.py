@@ -9,11 +9,10 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+
+from bitymi_ns.bake.quantise import Format
 
 IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
-
-Format = Literal["bc7", "uint8", "fp16"]
 
 _HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, and the one level
 _KEY_LIMIT = 1 << 20

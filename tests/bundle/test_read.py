@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import bundle_reader, check_files, ktx2, read_bundle
-from bitymi_ns.bake.manifest import BundleError
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import encode
+from bitymi_ns.bundle import check_files, ktx2, read_bundle
+from bitymi_ns.bundle import read as bundle_read
+from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.cli import main
 from bitymi_ns.ops.view_color import VIEW_COLORS
-from tests.bake.damage import amend, change_columns, signed
 from tests.bake.scenes import write
+from tests.bundle.damage import amend, change_columns, signed
 from tests.ops.test_view_color import lean_parameters
 
 COUNT = 6
@@ -125,9 +126,9 @@ def test_a_file_that_shrinks_while_it_is_read_is_truncated(surfels, tmp_path, mo
     info["files"]["preview.png"] = {"bytes": size + 100, "sha256": "0" * 64}
     (folder / "preview.png").write_bytes(bytes(size))
     (folder / "bundle.json").write_bytes(signed(info))
-    monkeypatch.setattr(bundle_reader.os, "fstat", larger)
+    monkeypatch.setattr(bundle_read.os, "fstat", larger)
     with pytest.raises(BundleError, match=f"preview.png is truncated: it ended after {size} bytes"):
-        bundle_reader.read_file(folder, bundle_reader.read_manifest(folder), "preview.png")
+        bundle_read.read_file(folder, bundle_read.read_manifest(folder), "preview.png")
 
 
 def test_a_lack_of_memory_is_a_sentence(surfels, tmp_path, monkeypatch):
@@ -136,7 +137,7 @@ def test_a_lack_of_memory_is_a_sentence(surfels, tmp_path, monkeypatch):
     def lacking(*args):
         raise MemoryError
 
-    monkeypatch.setattr(bundle_reader, "decode_pages", lacking)
+    monkeypatch.setattr(bundle_read, "decode_pages", lacking)
     with pytest.raises(BundleError, match="needs more memory than there is: its files have 0 MB"):
         read_bundle(folder)
     assert "needs more memory" in check_files(folder)[1][-1].detail

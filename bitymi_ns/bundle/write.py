@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ import numpy.typing as npt
 import torch
 
 from bitymi_ns import __version__
-from bitymi_ns.bake import ktx2, ply
-from bitymi_ns.bake.bundle_reader import Bundle, read_bundle, verify_bundle
-from bitymi_ns.bake.folder import check_target
-from bitymi_ns.bake.manifest import (
+from bitymi_ns.bake.limits import RESIDUAL_LIMIT
+from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.quantise import EncodedAtlas
+from bitymi_ns.bundle import ktx2, ply
+from bitymi_ns.bundle.folder import check_target
+from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,
     FULL_VERSION,
@@ -29,8 +31,7 @@ from bitymi_ns.bake.manifest import (
     describe,
     dump,
 )
-from bitymi_ns.bake.quantise import EncodedAtlas
-from bitymi_ns.bake.surfel_table import (
+from bitymi_ns.bundle.surfel_table import (
     EXTENT_COLUMN,
     TERMS,
     first_problem,
@@ -40,8 +41,6 @@ from bitymi_ns.bake.surfel_table import (
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.scene.baked import BakedScene
-
-__all__ = ["Bundle", "BundleError", "World", "check_target", "read_bundle", "verify_bundle", "write_bundle"]
 
 GENERATOR = f"bitymi-ns {__version__}"
 _CHUNK = 1 << 22
@@ -64,6 +63,34 @@ class World:
 
     transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])
     scale: float = 1.0
+
+
+def export(
+    baked: Baked,
+    folder: str | Path,
+    *,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    world: World | None = None,
+    statistics: Mapping[str, Any] | None = None,
+    extra_files: Mapping[str, bytes] | None = None,
+    loose_files: Mapping[str, bytes] | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Writes a baked scene as a bundle; see `write_bundle` for the arguments and errors.
+
+    `statistics` is added to those of the bake.
+    """
+    return write_bundle(
+        folder,
+        replace(baked.scene, mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),
+        baked.atlas,
+        background=background,
+        world=world,
+        statistics={**baked.statistics, **(statistics or {})},
+        extra_files=extra_files,
+        loose_files=loose_files,
+        overwrite=overwrite,
+    )
 
 
 def write_bundle(

@@ -1,0 +1,5 @@
+"""The small scenes of the bake's tests."""
+
+from tests.bake.conftest import camera, scene, surfels
+
+__all__ = ["camera", "scene", "surfels"]

@@ -264,7 +264,7 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
     def ssim() -> object:
         return torch.autograd.grad(ops.ssim(other, photo), other)
 
-    view = tuple(q[name] for name in ops.VIEW_COLORS["sv"])
+    view = tuple(q[name] for name in ops.VIEW_COLORS["sv"].names)
     return sizes, [
         ("project", sizes.project(), without_graph(project)),
         ("project backward", sizes.project_backward(), backward(projection.geom, geometry)),

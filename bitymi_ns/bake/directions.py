@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns.train.init import fibonacci_sphere
+from bitymi_ns.ops.sphere import fibonacci_sphere
 
 BETWEEN = 32
 """Directions between and around those of the views."""

@@ -14,12 +14,12 @@ from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.limits import beyond
 from bitymi_ns.bake.plan import STEPS
 from bitymi_ns.bake.progress import Progress, no_progress
-from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_vectors, site_weights
+from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
 from bitymi_ns.ops import view_color
-from bitymi_ns.ops.constants import COLOR_BIAS, SH_C0
+from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.shade import view_base
-from bitymi_ns.ops.view_color import LEAN_WIDTH, VIEW_COLORS
-from bitymi_ns.train.init import fibonacci_sphere
+from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 FIT_STEPS = 6
 FIT_VIEWS = 16
@@ -36,7 +36,7 @@ class LeanColor:
     Attributes:
         base: [N, 3] float32.
         span: [N, 2] int32 first term and number of terms.
-        terms: [T, LEAN_WIDTH[kind]] float32, those of one surfel after those of the one before.
+        terms: [T, lean_width of the kind] float32, those of one surfel after those of the one before.
     """
 
     base: Tensor
@@ -58,7 +58,7 @@ def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Ten
     """max(f_view + 0.5, 0), the colour that is blended, by the renderers' own kernels: [n, D, 3].
 
     Args:
-        kind: sv, sh, sb or sg.
+        kind: a name of `ops.VIEW_COLORS`.
         params: parameters of n surfels, all or lean.
         directions: [n, D, 3] unit vectors.
     """
@@ -87,19 +87,20 @@ def reduce_view_color(
     The error is the largest one over all directions of `view_directions` and the channels, of max(f_view + 0.5, 0),
     times the largest blending weight that the surfel can have. One colour is tried first, the middle between the
     extremes; then 2, 3, ... sites: those that are hardest to do without, fitted together by least squares. A surfel for
-    which none is good enough keeps all sites. Surfels of other view colours (sh, sb, sg) keep one colour, or all.
+    which none is good enough keeps all sites. Surfels of a kind without sites (`ViewColor.sites`) keep one colour, or
+    all terms.
 
     Args:
         surfels: the per-surfel parameters, N rows.
-        kind: sv, sh, sb or sg.
+        kind: a name of `ops.VIEW_COLORS`.
         seen: [V, N] bool, the training views that see each surfel; V may be 0.
         centers: [V, 3] float64 camera centres.
         opacity: [N] largest blending weight.
         tolerance: 8-bit steps.
         progress: called with the number of surfels done.
     """
-    means = surfels["means"]
-    full = {name: surfels[name] for name in VIEW_COLORS[kind]}
+    means, entry = surfels["means"], VIEW_COLORS[kind]
+    full = {name: surfels[name] for name in entry.names}
     count, base = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means), 3)
     parts: list[tuple[Tensor, Tensor]] = []  # rows [n], terms [n, number, width]
     done = 0
@@ -109,16 +110,15 @@ def reduce_view_color(
         allowed = tolerance / opacity[at.rows]
         low = target.masked_fill(~at.valid[..., None], torch.inf).amin(1)
         high = target.masked_fill(~at.valid[..., None], -torch.inf).amax(1)
-        middle = 0.5 * (low + high) - COLOR_BIAS
-        base[at.rows] = middle / SH_C0 if kind == "sh" else middle  # there the constant is a coefficient
+        base[at.rows] = (0.5 * (low + high) - COLOR_BIAS) / entry.base_unit
         needs_more = STEPS * 0.5 * (high - low).amax(1) > allowed
         needs_more |= beyond("view_base", kind, base[at.rows]).any(1)  # a bundle cannot hold this colour
         rest = torch.nonzero(needs_more).squeeze(1)
-        if kind == "sv":
-            fitted = _fewer_sites(at, rest, own, target, allowed)
+        if entry.sites is not None:
+            fitted = _fewer_sites(at, rest, kind, entry.sites(*own.values()), target, allowed)
         else:
-            names = VIEW_COLORS[kind]
-            fitted = [(rest, own[names[0]][rest], own[names[1]][rest])]
+            color, terms = own.values()
+            fitted = [(rest, color[rest], terms[rest])]
         for rows, color, terms in fitted:
             where = at.rows[rows]
             base[where], count[where] = color, terms.shape[1]
@@ -126,17 +126,20 @@ def reduce_view_color(
         done += len(at.rows)
         progress("reducing the view colours", done, len(means))
     first = count.cumsum(0) - count
-    terms = means.new_zeros(int(count.sum()), LEAN_WIDTH[kind])
+    terms = means.new_zeros(int(count.sum()), entry.lean_width)
     for rows, values in parts:
         terms[first[rows, None] + torch.arange(values.shape[1], device=means.device)] = values
     return LeanColor(base, torch.stack([first, count], dim=1).int(), terms)
 
 
 def _fewer_sites(
-    at: Directions, rest: Tensor, own: Mapping[str, Tensor], target: Tensor, allowed: Tensor
+    at: Directions, rest: Tensor, kind: str, own: tuple[Tensor, Tensor], target: Tensor, allowed: Tensor
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Sites for the surfels `rest` of a chunk: (rows [m], base [m, 3], terms [m, number, 6]) for every number."""
-    vectors, rgb = site_vectors(own["sv_sites"], own["sv_log_tau"]), own["sv_rgb"]
+    """Sites for the surfels `rest` of a chunk: (rows [m], base [m, 3], terms [m, number, 6]) for every number.
+
+    `own` are vectors and colours [n, K, 3] of all its surfels' sites.
+    """
+    vectors, rgb = own
     sites = vectors.shape[1]
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
     stride = -(-at.views // FIT_VIEWS) if at.views else 1  # views that see a surfel come first: an even choice of them
@@ -155,7 +158,7 @@ def _fewer_sites(
         shown = view_base(site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r)
         terms = torch.cat([b, r[:, 1:]], dim=2)
         good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
-        good &= ~beyond("view_terms", "sv", terms).flatten(1).any(1) & ~beyond("view_base", "sv", r[:, 0]).any(1)
+        good &= ~beyond("view_terms", kind, terms).flatten(1).any(1) & ~beyond("view_base", kind, r[:, 0]).any(1)
         result.append((rest[good], r[good, 0], terms[good]))
         rest = rest[~good]
     v = vectors[rest].double()
@@ -177,14 +180,14 @@ def view_color_errors(
     weight, in 8-bit steps: [N].
 
     Args:
-        kind: sv, sh, sb or sg.
+        kind: a name of `ops.VIEW_COLORS`.
         full: parameters of N surfels as they were trained.
         lean: the same surfels' lean parameters.
         means, seen, centers, opacity: as in `reduce_view_color`.
     """
     error = means.new_zeros(len(means))
     for at in view_directions(means, seen, centers):
-        exact = shown_at(kind, {name: full[name][at.rows] for name in VIEW_COLORS[kind]}, at.unit)
+        exact = shown_at(kind, {name: full[name][at.rows] for name in VIEW_COLORS[kind].names}, at.unit)
         rows = {name: lean[name][at.rows] for name in ("view_base", "view_span")}
         found = shown_at(kind, {**rows, "view_terms": lean["view_terms"]}, at.unit)
         error[at.rows] = largest_error(exact, found, at.valid) * opacity[at.rows]
@@ -193,9 +196,9 @@ def view_color_errors(
 
 def describe(kind: str, surfels: Mapping[str, Tensor], lean: LeanColor, error: Tensor, tolerance: float) -> dict:
     """What was left out and what it costs, for bundle.json."""
-    before = sum(surfels[name][0].numel() for name in VIEW_COLORS[kind]) if len(lean.base) else 0
-    terms = surfels[VIEW_COLORS[kind][1]].shape[1]
-    sites = terms if kind == "sv" else terms + 1
+    entry = VIEW_COLORS[kind]
+    before = sum(each[0].numel() for each in entry.of(surfels)) if len(lean.base) else 0
+    sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms
     after = 4 * (4 * len(lean.base) + lean.terms.numel())
     ordered = error.double().sort().values
     return {

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-COLOR_LIMIT = 256.0
-"""Largest absolute value of a colour, a coefficient or the colour of a lobe, 1 = white."""
+from bitymi_ns.ops.view_kinds import COLOR_LIMIT, SHAPE_LIMIT, VIEW_COLORS, VIEW_PARAMETERS, Limit
+
 RESIDUAL_LIMIT = 256.0
 """Largest absolute value of a residual colour."""
 BRIGHTEST = 1e4
@@ -22,48 +22,36 @@ EXTENTS = (1e-6, 16.0)
 UNIT_SLACK = 0.01
 """How far the length of a stored rotation may be from 1."""
 
-_SHAPE = 1e4  # logits, angles, log sharpness: sigmoid and exp have long reached their ends
-_DIRECTION = 1e6  # of any length: the renderers normalise
-_VECTOR = 2e7  # differences of two temperatures of at most exp(16) times a direction
-_BETA_LOBE = (*[COLOR_LIMIT] * 3, *[_SHAPE] * 3)
-_GAUSSIAN_LOBE = (*[_DIRECTION] * 3, _SHAPE, *[COLOR_LIMIT] * 3)
-
-LIMITS: dict[str, tuple[float, ...]] = {
+LIMITS: dict[str, Limit] = {
     "means": (1e9,),
     "log_scales": (104.0,),  # beyond, exp() is 0 or infinite in float32
-    "opacity_logits": (_SHAPE,),
-    "beta_raw": (_SHAPE,),
-    "sv_sites": (_DIRECTION,),
-    "sv_log_tau": (_SHAPE,),
-    "sv_rgb": (COLOR_LIMIT,),
-    "sh_dc": (COLOR_LIMIT,),
-    "sh_rest": (COLOR_LIMIT,),
-    "sb_base": (COLOR_LIMIT,),
-    "sb_lobes": _BETA_LOBE,
-    "sg_base": (COLOR_LIMIT,),
-    "sg_lobes": _GAUSSIAN_LOBE,
+    "opacity_logits": (SHAPE_LIMIT,),
+    "beta_raw": (SHAPE_LIMIT,),
+    **{name: parameter.limit for name, parameter in VIEW_PARAMETERS.items()},
     "view_base": (COLOR_LIMIT,),
     "mean_residual": (RESIDUAL_LIMIT,),
 }
 """Largest absolute value of a parameter, one for all its numbers or one for each along its last axis."""
-TERM_LIMITS: dict[str, tuple[float, ...]] = {
-    "sv": (*[_VECTOR] * 3, *[COLOR_LIMIT] * 3),
-    "sh": (COLOR_LIMIT,),
-    "sb": _BETA_LOBE,
-    "sg": _GAUSSIAN_LOBE,
-}
-"""The same of the terms of lean view colours (`view_terms`), by kind."""
+
+
+def limit_of(name: str, kind: str) -> Limit:
+    """What a parameter may be at most, as in `LIMITS`; infinite for one without a limit.
+
+    Args:
+        name: a parameter of the surfels, view_terms of lean view colours, or mean_residual.
+        kind: a name of `ops.VIEW_COLORS`.
+    """
+    return VIEW_COLORS[kind].lean_limit if name == "view_terms" else LIMITS.get(name, (float("inf"),))
 
 
 def beyond(name: str, kind: str, values: Tensor) -> Tensor:
     """Which numbers of a parameter are beyond its limit: bool of the shape of `values`.
 
     Args:
-        name: a parameter of the surfels, or mean_residual; one without a limit is never beyond it.
-        kind: sv, sh, sb or sg.
+        name, kind: as in `limit_of`.
         values: [N] or [N, ...].
     """
-    largest = TERM_LIMITS[kind] if name == "view_terms" else LIMITS.get(name, (float("inf"),))
+    largest = limit_of(name, kind)
     return values.abs() > (torch.tensor(largest, device=values.device) if values.dim() > 1 else largest[0])
 
 

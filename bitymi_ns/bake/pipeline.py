@@ -25,7 +25,7 @@ from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, en
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.constants import ALPHA_MIN
-from bitymi_ns.ops.view_color import VIEW_COLORS, kind_of
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
@@ -225,7 +225,7 @@ def _lean_surfels(
     at = (seen, centers_of(cameras, means), opacity)
     lean = reduce_view_color(surfels, kind, *at, tolerance, progress)
     error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
-    kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind]}
+    kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind].names}
     return kept | lean.parameters(), {"kind": kind, **describe(kind, surfels, lean, error, tolerance)}
 
 

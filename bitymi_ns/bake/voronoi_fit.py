@@ -6,13 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns.ops.constants import LOG_TAU_MAX
-
-
-def site_vectors(sites: Tensor, log_tau: Tensor) -> Tensor:
-    """tau_k s_k, the gradients of the logits: [n, K, 3]."""
-    return F.normalize(sites, dim=2) * log_tau.clamp(max=LOG_TAU_MAX).exp()[..., None]
-
 
 def site_weights(vectors: Tensor, directions: Tensor) -> Tensor:
     """softmax_k(v_k . d): [n, D, K] from [n, K, 3] and [n, D, 3]."""

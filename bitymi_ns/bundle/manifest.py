@@ -15,6 +15,7 @@ from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.quantise import Format
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
+from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
 VERSION = (2, 1)
@@ -86,7 +87,7 @@ class Surfels(_Part):
 
     file: Literal["surfels.ply"] = SURFELS
     count: Whole
-    view_color: Literal["sv", "sh", "sb", "sg"]
+    view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
     support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
     residual: str = "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound"

@@ -18,13 +18,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.limits import EXTENTS, LIMITS, TERM_LIMITS, UNIT_SLACK, beyond
+from bitymi_ns.bake.limits import EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
-from bitymi_ns.ops.view_color import LEAN, LEAN_WIDTH, check_lean, kind_of
+from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_color import LEAN, check_lean
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.init import fibonacci_sphere
 
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
@@ -40,41 +41,23 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "opacity_logits": ("opacity",),
     "beta_raw": ("beta",),
     "mean_residual": ("residual_0", "residual_1", "residual_2"),
-    "view_terms": tuple(f"term_{i}" for i in range(max(LEAN_WIDTH.values()))),
-}
-
-# Trailing shape of every view-colour parameter; -1 is read from the number of columns.
-VIEW_COLORS: dict[str, dict[str, tuple[int, ...]]] = {
-    "sv": {"sv_sites": (-1, 3), "sv_log_tau": (-1,), "sv_rgb": (-1, 3)},
-    "sh": {"sh_dc": (3,), "sh_rest": (-1, 3)},
-    "sb": {"sb_base": (3,), "sb_lobes": (-1, 6)},
-    "sg": {"sg_base": (3,), "sg_lobes": (-1, 7)},
+    "view_terms": tuple(f"term_{i}" for i in range(max(kind.lean_width for kind in VIEW_COLORS.values()))),
 }
 
 
 def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
     """Mean of f_view over all directions, without the bias 0.5: [N, 3].
 
-    Exact for sh, sb and sg; a mean over 32 directions for sv and for lean colours, whose kind must be given. For
-    display only.
+    Exact where the kind has a closed form (`ViewColor.mean`); else, and for lean colours, whose kind must be given, a
+    mean over 32 directions. For display only.
     """
     kind = kind or kind_of(surfels)
-    if kind == "sv" or "view_terms" in surfels:
-        n, origin = len(surfels["means"]), torch.zeros(3)
-        parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in fibonacci_sphere(32)]
-        return torch.stack(parts).mean(0)
-    if kind == "sh":
-        return surfels["sh_dc"] * SH_C0
-    if kind == "sb":  # mean over the sphere of max(0, d.mu)^p is 1 / (2 (p + 1))
-        lobes = surfels["sb_lobes"]  # [N, L, 6]
-        power = 4.0 * lobes[..., 5].exp()
-        rgb = torch.nn.functional.softplus(lobes[..., :3], beta=10.0 * float(np.log(2.0)))
-        return surfels["sb_base"] + (rgb / (2.0 * (power + 1.0))[..., None]).sum(1)
-    # mean over the sphere of exp(l (d.mu - 1)) is (1 - exp(-2l)) / 2l
-    lobes = surfels["sg_lobes"]  # [N, L, 7]
-    sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
-    share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
-    return surfels["sg_base"] + (lobes[..., 4:] * share[..., None]).sum(1)
+    entry = VIEW_COLORS[kind]
+    if entry.mean is not None and "view_terms" not in surfels:
+        return entry.mean(*entry.of(surfels))
+    n, origin = len(surfels["means"]), torch.zeros(3)
+    parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in fibonacci_sphere(32)]
+    return torch.stack(parts).mean(0)
 
 
 def to_columns(
@@ -91,7 +74,7 @@ def to_columns(
         tiles: [N, 5] int32.
         mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers; None = 0, no column.
         extent: [N] half side of each tile in scale units; None = no column.
-        kind: sv, sh, sb or sg; None = the one whose parameters are there.
+        kind: a name of `ops.VIEW_COLORS`; None = the one whose parameters are there.
     """
     kind = kind or kind_of(surfels)
     lean = "view_terms" in surfels
@@ -110,7 +93,7 @@ def to_columns(
         COLUMNS["quats"]: quats,
         ("beta",): surfels["beta_raw"][:, None],
     }
-    for name in ("view_base",) if lean else VIEW_COLORS[kind]:
+    for name in ("view_base",) if lean else VIEW_COLORS[kind].names:
         values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
         groups[_numbered(name, values.shape[1])] = values
     columns = {name: values[:, i].numpy() for names, values in groups.items() for i, name in enumerate(names)}
@@ -171,14 +154,14 @@ def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
 
     Args:
         surfels: parameters by name, mean_residual too.
-        kind: sv, sh, sb or sg.
+        kind: a name of `ops.VIEW_COLORS`.
     """
     for name, values in surfels.items():
         bad = beyond(name, kind, values)
         if bad.any():
             row, *inner = (int(i) for i in torch.nonzero(bad)[0])
             index = int(np.ravel_multi_index(inner, values.shape[1:])) if inner else 0
-            largest = TERM_LIMITS[kind] if name == "view_terms" else LIMITS[name]
+            largest = limit_of(name, kind)
             bound = largest[inner[-1] if len(largest) > 1 else 0]
             value = float(values[(row, *inner)])
             column = COLUMNS[name][index] if name in COLUMNS else f"{name}_{index}"
@@ -199,7 +182,7 @@ def from_columns(
 
     Args:
         columns: of the element `vertex`.
-        kind: sv, sh, sb or sg.
+        kind: a name of `ops.VIEW_COLORS`.
         terms: columns of the element `view_term`, for lean view colours; None = the file has none.
 
     Returns:
@@ -228,23 +211,22 @@ def from_columns(
 
 
 def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int) -> dict[str, Tensor]:
-    surfels = {}
-    for name, shape in VIEW_COLORS[kind].items():
+    entry, surfels = VIEW_COLORS[kind], {}
+    for name, shape, width in ((p.name, p.shape, p.width) for p in entry.parameters):
         found = [int(column[len(name) + 1 :]) for column in columns if _is_number_of(column, name)]
-        width = int(np.prod([size for size in shape if size > 0]))
         if sorted(found) != list(range(len(found))) or len(found) % width or (-1 not in shape and len(found) != width):
             raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {len(found)} columns")
         values = _stack(columns, _numbered(name, len(found))) if found else torch.zeros(count, 0)
         surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
-    if kind == "sv" and len({surfels[name].shape[1] for name in VIEW_COLORS["sv"]}) != 1:
-        raise PlyError("the Spherical Voronoi parameters disagree about the number of sites")
+    if len({surfels[p.name].shape[1] for p in entry.parameters if -1 in p.shape}) != 1:
+        raise PlyError(f"the parameters of {entry.title} disagree about the number of {entry.term}s")
     return surfels
 
 
 def _lean_from_columns(
     columns: Mapping[str, npt.NDArray], terms: Mapping[str, npt.NDArray], kind: str
 ) -> dict[str, Tensor]:
-    names = _numbered("term", LEAN_WIDTH[kind])
+    names = _numbered("term", VIEW_COLORS[kind].lean_width)
     if set(terms) != set(names):
         raise PlyError(f"the element {TERMS} needs the properties {names[0]} to {names[-1]}, not {sorted(terms)}")
     count = _stack(columns, (COUNT_COLUMN,), np.int32)[:, 0].long()

@@ -40,16 +40,11 @@ from bitymi_ns.bundle.surfel_table import (
 )
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
 
 GENERATOR = f"bitymi-ns {__version__}"
 _CHUNK = 1 << 22
-_LEAN_FORMULAS = {
-    "sv": "(view_base + sum exp(b . d) rgb) / (1 + sum exp(b . d)); a term is b, rgb; d from the camera to the surfel",
-    "sh": "view_base is the coefficient of degree 0, terms are those that follow",
-    "sb": "view_base is the base colour, a term is a lobe",
-    "sg": "view_base is the base colour, a term is a lobe",
-}
 
 
 @dataclass(frozen=True)
@@ -164,6 +159,7 @@ def _describe(
 ) -> dict[str, Any]:
     """What `manifest.describe` takes, without the list of files; what is the same for all bundles stands there."""
     surfels, kind = scene.surfels, scene.view_color
+    entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
     version = VERSION if lean else FULL_VERSION
     empty = len(means) == 0
@@ -187,10 +183,13 @@ def _describe(
     }
     if lean:
         described["surfels"]["terms"] = len(surfels["view_terms"])
-        described["surfels"]["view_terms"] = _LEAN_FORMULAS[kind]
-    elif kind == "sv":
-        described["surfels"]["sites"] = surfels["sv_log_tau"].shape[1]
-        described["surfels"]["activations"] = {**ACTIVATIONS, "sv_sites": "unit", "sv_log_tau": "exp"}
+        described["surfels"]["view_terms"] = entry.lean_formula
+    else:
+        if entry.stated is not None:
+            described["surfels"][entry.stated] = entry.terms(surfels)
+        own = {p.name: p.activation for p in entry.parameters if p.activation is not None}
+        if own:
+            described["surfels"]["activations"] = {**ACTIVATIONS, **own}
     if atlas is not None:
         described["atlas"] = {
             "format": atlas.format,

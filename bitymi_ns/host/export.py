@@ -37,6 +37,7 @@ from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
+from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr
 
@@ -327,8 +328,8 @@ def print_view_color(table: Table, info: dict[str, Any]) -> None:
         table.add_row("Surfel bytes", f"{stored:,}")
         return
     sites, error, count = lean["sites"], lean["error"], info["surfels"]["count"]
-    name = {"sv": "Sites", "sh": "Coefficients"}.get(lean["kind"], "Lobes and base colours")
-    table.add_row(name, f"{sites['before']:,} -> {sites['after']:,} ({100 * sites['after'] / sites['before']:.1f} %)")
+    share = 100 * sites["after"] / sites["before"]
+    table.add_row(VIEW_COLORS[lean["kind"]].kept, f"{sites['before']:,} -> {sites['after']:,} ({share:.1f} %)")
     table.add_row("Surfels of one colour", f"{lean['one_color']:,} ({100 * lean['one_color'] / count:.1f} %)")
     whole = stored + lean["bytes"]["before"] - lean["bytes"]["after"]
     table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")

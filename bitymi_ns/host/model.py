@@ -18,28 +18,15 @@ from bitymi_ns.host.checkpoints import STATE_VERSION, SURFELS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.scene_setup import new_scene
 from bitymi_ns.host.surfel_model import SurfelModel, SurfelModelConfig
+from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View
 
-SURFEL_PARAMETERS = (
-    "means",
-    "quats",
-    "log_scales",
-    "opacity_logits",
-    "beta_raw",
-    "sv_sites",
-    "sv_log_tau",
-    "sv_rgb",
-    "sh_dc",
-    "sh_rest",
-    "sb_base",
-    "sb_lobes",
-    "sg_base",
-    "sg_lobes",
-)
+SURFEL_PARAMETERS = (*GEOMETRY, *VIEW_PARAMETERS)
 PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
 """Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
 

@@ -14,7 +14,8 @@ from .shade import shade
 from .ssim import ssim
 from .texel import TexelFragments, TexelTiles, add_texel_gradient, texel_image
 from .trace import Fragments, masked_counts, trace
-from .view_color import VIEW_COLORS, view_color
+from .view_color import view_color
+from .view_kinds import VIEW_COLORS
 
 __all__ = [
     "VIEW_COLORS",

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from .backend import function, module, require
-from .view_color import LEAN, VIEW_COLORS, check_lean, check_view_color
+from .view_color import LEAN, check_lean, check_view_color
+from .view_kinds import VIEW_COLORS
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -79,7 +80,7 @@ class BakedArrays:
     Attributes:
         surfels: means [N, 3], quats [N, 4], log_scales [N, 2], opacity_logits [N], beta_raw [N] and the parameters of
             the view colour (ops.VIEW_COLORS, or ops.view_color.LEAN).
-        view_color: sv, sh, sb or sg.
+        view_color: a name of `ops.VIEW_COLORS`.
         tiles: [N, 5] int32: x, y, page, r_u, r_v in texels; r_u = 0: no tile.
         texture: the atlas, None = no tiles.
         offset, scale: residual = offset + scale * texel, texels of uint8 and BC7 in [0, 1].
@@ -124,9 +125,8 @@ class BakedArrays:
         if "view_terms" in p:
             lean = tuple(p[name] for name in LEAN)
         else:
-            colors = [p[name] for name in VIEW_COLORS[self.view_color]]
-            terms = colors[1].shape[1] + (1 if self.view_color == "sh" else 0)
-            full = (*colors, None)[:3]
+            entry = VIEW_COLORS[self.view_color]
+            terms, full = entry.terms(p), (*entry.of(p), None)[:3]
         geometry = (p["means"], p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
         pages = None if self.texture is None else self.texture.pages
         optional = [None if t is None else t.detach().float().contiguous() for t in (self.extent, self.mean_residual)]

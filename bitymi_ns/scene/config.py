@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from bitymi_ns.ops.view_kinds import Kind
+
 
 @dataclass
 class SceneConfig:
     """Representation of the scene: surfels, view colour and residual colour field."""
 
-    view_color: Literal["sv", "sh", "sb", "sg"] = "sv"
+    view_color: Kind = "sv"
     """View colour: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta, sg = spherical Gaussians."""
     sv_sites: int = 7
     """Number of Spherical Voronoi sites per surfel (the paper's K), 1 to 32."""

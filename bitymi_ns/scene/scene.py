@@ -85,7 +85,7 @@ class Scene(nn.Module):
         self, config: SceneConfig, surfels: Mapping[str, Tensor], field: HashField | None, near: float = NEAR
     ) -> None:
         super().__init__()
-        names = (*GEOMETRY, *VIEW_COLORS[config.view_color])
+        names = (*GEOMETRY, *VIEW_COLORS[config.view_color].names)
         if set(surfels) != set(names):
             raise ValueError(f"a scene with view colour '{config.view_color}' has {names}, not {tuple(surfels)}")
         self.config = config

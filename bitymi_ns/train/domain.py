@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.constants import MAX_LEVELS, MAX_TERMS
+from bitymi_ns.ops.constants import MAX_LEVELS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import NEAR, Scene
@@ -70,9 +71,7 @@ def check_representation(config: SceneConfig) -> None:
         ValueError: naming the option and its range.
     """
     ranges = {
-        "sv_sites": (config.sv_sites, 1, MAX_TERMS),
-        "lobes": (config.lobes, 1, MAX_TERMS),
-        "sh_degree": (config.sh_degree, 0, 3),
+        **{kind.option: (getattr(config, kind.option), *kind.option_range) for kind in VIEW_COLORS.values()},
         "levels": (config.levels, 1, MAX_LEVELS),
         "min_resolution": (config.min_resolution, 2, 1 << 20),
         "log2_table_size": (1 if config.log2_table_size is None else config.log2_table_size, 1, 24),

@@ -9,21 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.constants import SH_C0
+from bitymi_ns.ops.constants import COLOR_BIAS
+from bitymi_ns.ops.view_kinds import entry_of
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.rotations import facing
 
-"""The constant real spherical harmonic."""
 BETA_RAW = 2.0
 """Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
 MAX_SCALE = 0.25
 """Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
 MIN_SCALE = 1e-6
 """Smallest first scale, as a share of the scene extent."""
-SB_LOBE_MEAN = 0.1 * 0.1
-"""What one fresh Spherical Beta lobe adds on average over all directions: softplus(0) = 0.1 times the mean of
-max(0, cos)^4 over the sphere, 0.1."""
 
 
 @dataclass
@@ -118,7 +115,7 @@ def surfels_from_points(
         "log_scales": scales.log()[:, None].repeat(1, 2),
         "opacity_logits": torch.full((n,), logit),
         "beta_raw": torch.full((n,), BETA_RAW),
-        **_view_color(rgb, scene_config, generator),
+        **entry_of(scene_config.view_color).first_values(rgb - COLOR_BIAS, scene_config, generator),
     }
     return surfels, report
 
@@ -136,15 +133,6 @@ def neighbour_distance(xyz: Tensor, extent: float, neighbours: int = 3) -> Tenso
     points = xyz.double().numpy()
     distances, _ = cKDTree(points).query(points, k=k + 1)  # the nearest is the point itself
     return torch.from_numpy(np.sqrt(np.mean(np.square(distances[:, 1:]), axis=1))).float()
-
-
-def fibonacci_sphere(n: int) -> Tensor:
-    """[n, 3] float32 unit vectors spread evenly over the sphere along a Fibonacci spiral."""
-    i = torch.arange(n, dtype=torch.float64)
-    z = 1.0 - (2.0 * i + 1.0) / n
-    phi = i * math.pi * (3.0 - math.sqrt(5.0))
-    r = torch.sqrt(1.0 - z * z)
-    return torch.stack([r * torch.cos(phi), r * torch.sin(phi), z], -1).float()
 
 
 def _usable(xyz: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, PointReport]:
@@ -189,33 +177,3 @@ def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
     distance = to_camera.norm(dim=-1, keepdim=True)
     normals = torch.where(distance > 1e-12, to_camera / distance.clamp(min=1e-12), fallback)
     return facing(normals, angles)
-
-
-def _view_color(rgb: Tensor, config: SceneConfig, generator: torch.Generator) -> dict[str, Tensor]:
-    """View colour parameters that show `rgb` [N, 3] from every direction (Spherical Beta: on average over them)."""
-    n, kind, lobes = len(rgb), config.view_color, config.lobes
-    color = rgb - 0.5
-    if kind == "sv":
-        k = config.sv_sites
-        return {
-            "sv_sites": fibonacci_sphere(k).expand(n, k, 3).clone(),
-            "sv_log_tau": torch.zeros(n, k),
-            "sv_rgb": color[:, None, :].repeat(1, k, 1),
-        }
-    if kind == "sh":
-        rest = (config.sh_degree + 1) ** 2 - 1
-        return {"sh_dc": color / SH_C0, "sh_rest": torch.zeros(n, rest, 3)}
-    if kind == "sb":
-        # raw colour 0 passes softplus as 0.1, which keeps the gradient alive; the base makes up for it
-        shape = torch.zeros(n, lobes, 6)
-        shape[..., 3] = math.pi * torch.rand(n, lobes, generator=generator)
-        shape[..., 4] = 2.0 * math.pi * torch.rand(n, lobes, generator=generator)
-        return {"sb_base": color - SB_LOBE_MEAN * lobes, "sb_lobes": shape}
-    if kind == "sg":
-        axes = torch.nn.functional.normalize(torch.randn(n, lobes, 3, generator=generator), dim=-1)
-        # log sharpness 1, and no colour of its own yet
-        return {
-            "sg_base": color.clone(),
-            "sg_lobes": torch.cat([axes, torch.ones(n, lobes, 1), torch.zeros(n, lobes, 3)], -1),
-        }
-    raise ValueError(f"view_color must be sv, sh, sb or sg, not {kind!r}")

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 
+from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.options import check_ranges
 
-VIEW_COLOR = ("sv_rgb", "sh_dc", "sb_base", "sg_base")
-VIEW_SHAPE = ("sv_sites", "sv_log_tau", "sb_lobes", "sg_lobes")
 FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
-SH_REST_SHARE = 1.0 / 20.0
-"""The higher SH bands learn at this share of the rate of the constant one."""
 
 
 class Schedule:
@@ -152,12 +149,9 @@ class Schedule:
             return gain * self.extent * self._decay(rates.means, step)
         if name in ("quats", "log_scales", "opacity_logits", "beta_raw"):
             return gain * float(getattr(rates, name))
-        if name in VIEW_COLOR:
-            return gain * self._decay(rates.view_color, step)
-        if name == "sh_rest":
-            return gain * SH_REST_SHARE * self._decay(rates.view_color, step)
-        if name in VIEW_SHAPE:
-            return gain * self._decay(rates.view_shape, step)
+        if name in VIEW_PARAMETERS:
+            parameter = VIEW_PARAMETERS[name]
+            return gain * parameter.share * self._decay(getattr(rates, parameter.rate), step)
         if name == "field_table":
             return self.field_warmup(step) * self._decay(rates.field_table, step)
         if name in FIELD_MLP:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.quantise import EncodedAtlas
 from bitymi_ns.bundle import write_bundle
-from bitymi_ns.ops.view_color import kind_of
+from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.scene.baked import BakedScene
 
 OF_THE_SCENE = ("extent", "mean_residual", "near", "weight_bound", "prefilter")

@@ -11,10 +11,11 @@ from torch.nn import functional as F
 from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.directions import BETWEEN, SPHERE, view_directions
 from bitymi_ns.bake.lean_color import reduce_view_color, view_color_errors
-from bitymi_ns.bake.voronoi_fit import fit_sites, site_vectors, site_weights
+from bitymi_ns.bake.voronoi_fit import fit_sites, site_weights
 from bitymi_ns.bundle import check_files, check_view_color, export, read_bundle
 from bitymi_ns.ops.reference import view_color as reference
-from bitymi_ns.ops.view_color import LEAN, VIEW_COLORS, check_lean
+from bitymi_ns.ops.view_color import LEAN, check_lean
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 KINDS = list(VIEW_COLORS)
 
@@ -31,7 +32,7 @@ def views(n: int, count: int = 9, seed: int = 0, spread: float = 1.0) -> tuple[t
 def exact_errors(kind, params, lean, means, seen, centers, opacity):
     """Largest weighted error at the directions of the views alone, in double precision: [n]."""
     found = torch.zeros(len(means), dtype=torch.float64)
-    full = [params[name].double() for name in VIEW_COLORS[kind]]
+    full = [params[name].double() for name in VIEW_COLORS[kind].names]
     for view, center in zip(seen, centers, strict=True):
         d = F.normalize(means.double() - center, dim=1)
         a = getattr(reference, kind)(*full, d)
@@ -86,7 +87,7 @@ def test_a_colour_that_no_view_sees_change_is_one_colour(surfels):
         lean = reduce_view_color(params, kind, *views(n), torch.ones(n), 1.0)
         assert (lean.span[:, 1] == 0).all()
         d = F.normalize(params["means"].double() - views(n)[1][0], dim=1)
-        a = getattr(reference, kind)(*(params[name].double() for name in VIEW_COLORS[kind]), d)
+        a = getattr(reference, kind)(*(params[name].double() for name in VIEW_COLORS[kind].names), d)
         b = reference.lean(kind, lean.base.double(), lean.span, lean.terms.double(), d)
         torch.testing.assert_close(a.clamp(min=-0.5), b, atol=4e-3, rtol=0)
 
@@ -96,7 +97,7 @@ def test_sites_that_agree_are_merged(surfels):
     n = 20
     params = surfels(n, "sv")
     group = torch.tensor([0, 0, 0, 1, 1, 1])
-    for name in VIEW_COLORS["sv"]:
+    for name in VIEW_COLORS["sv"].names:
         params[name] = params[name][:, group].contiguous()
     lean = reduce_view_color(params, "sv", *views(n), torch.ones(n), 0.05)
     assert (lean.span[:, 1] <= 1).all()
@@ -111,7 +112,7 @@ def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
     rest = torch.arange(n) != 1
     assert (lean.span[rest, 1] == 6).all()
     d = F.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=1).double()
-    want = reference.sv(*(params[name].double() for name in VIEW_COLORS["sv"]), d)
+    want = reference.sv(*(params[name].double() for name in VIEW_COLORS["sv"].names), d)
     got = reference.lean("sv", lean.base.double(), lean.span, lean.terms.double(), d)
     torch.testing.assert_close(got[rest], want[rest], atol=1e-5, rtol=1e-5)
 
@@ -124,7 +125,7 @@ def test_a_fit_from_a_wrong_start_finds_two_sites(surfels):
     start = (v[:, 1:] - v[:, :1]) * 0.5, rgb + 0.1
     b, r = fit_sites(*start, d, target, torch.ones(8, 60), 20)
     torch.testing.assert_close(site_weights(F.pad(b, (0, 0, 1, 0)), d) @ r, target, atol=2e-3, rtol=0)
-    unit = site_vectors(v, torch.full((8, 2), 2.0)).norm(dim=2)
+    unit = VIEW_COLORS["sv"].sites(v, torch.full((8, 2), 2.0), rgb)[0].norm(dim=2)
     torch.testing.assert_close(unit, torch.full((8, 2), 2.0).exp())
 
 

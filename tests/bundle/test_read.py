@@ -20,7 +20,7 @@ from bitymi_ns.bundle import check_files, ktx2, read_bundle
 from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.cli import main
-from bitymi_ns.ops.view_color import VIEW_COLORS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
 from tests.bundle.damage import amend, change_columns, signed
 from tests.ops.test_view_color import lean_parameters
@@ -32,7 +32,7 @@ def make(surfels, folder: Path, kind: str = "sv", format: str = "uint8", lean: b
     """A bundle of a few surfels and random texels."""
     params = surfels(COUNT, kind)
     if lean:
-        params = {k: v for k, v in params.items() if k not in VIEW_COLORS[kind]}
+        params = {k: v for k, v in params.items() if k not in VIEW_COLORS[kind].names}
         params |= lean_parameters(kind, COUNT, torch.float32)
     packing = pack([[8, 4]] * COUNT)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)

@@ -4,13 +4,13 @@ import torch
 
 from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.bundle.surfel_table import (
-    VIEW_COLORS,
     from_columns,
     mean_residuals,
     mean_view_color,
     tile_extents,
     to_columns,
 )
+from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.constants import SH_C0
 
 KINDS = ["sv", "sh", "sb", "sg"]
@@ -55,7 +55,7 @@ def test_mean_view_colours_match_a_sum_over_the_sphere(surfels, kind):
     reference = pytest.importorskip("bitymi_ns.ops.reference.view_color")
     params = surfels(1, kind)
     dirs = torch.nn.functional.normalize(torch.randn(100_000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    inputs = [params[name] for name in VIEW_COLORS[kind]]
+    inputs = [params[name] for name in VIEW_COLORS[kind].names]
     expected = getattr(reference, kind)(*inputs, dirs).mean(0)
     torch.testing.assert_close(mean_view_color(params)[0], expected, atol=0.02, rtol=0)
 

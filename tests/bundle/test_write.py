@@ -16,7 +16,7 @@ from bitymi_ns.bundle import BundleError, World, check_target, ktx2, ply, read_b
 from bitymi_ns.bundle import write as bundle_module
 from bitymi_ns.bundle.manifest import parse
 from bitymi_ns.ops.reference import view_color as reference
-from bitymi_ns.ops.view_color import VIEW_COLORS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
 from tests.bundle.damage import amend, signed
 from tests.ops.test_view_color import lean_parameters
@@ -35,7 +35,7 @@ def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
 
 def make_lean(surfels, folder, kind="sv", count=6):
     """A bundle with lean view colours and without texture; returns its surfels."""
-    params = {k: v for k, v in surfels(count, kind).items() if k not in VIEW_COLORS[kind]}
+    params = {k: v for k, v in surfels(count, kind).items() if k not in VIEW_COLORS[kind].names}
     params |= lean_parameters(kind, count, torch.float32)
     write(folder, params, np.zeros((count, 5), dtype=np.int32), None, kind=kind)
     return params

@@ -17,7 +17,7 @@ from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import Stage
-from bitymi_ns.ops.view_color import VIEW_COLORS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
@@ -131,7 +131,7 @@ def test_view_colours(kind: str, device: torch.device, cpu) -> None:
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
 def test_lean_view_colours(kind: str, device: torch.device, cpu) -> None:
     scene = textured(40, 1, kind=kind)
-    geometry = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind]}
+    geometry = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind].names}
     scene.surfels = geometry | lean_parameters(kind, 40, torch.float32)
     check(scene, front(), device, cpu)
     scene.surfels["view_span"][7, 1] = 33

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.reference import view_color as reference_view_color
-from bitymi_ns.ops.view_color import LEAN_WIDTH, check_lean
+from bitymi_ns.ops.view_color import check_lean
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
@@ -50,7 +51,7 @@ def lean_parameters(kind: str, n: int, dtype: torch.dtype = torch.float64) -> di
     return {
         "view_base": torch.randn(n, 3, generator=g, dtype=torch.float64).to(dtype),
         "view_span": torch.stack([ends - counts, counts], dim=1).int(),
-        "view_terms": torch.randn(total, LEAN_WIDTH[kind], generator=g, dtype=torch.float64).to(dtype),
+        "view_terms": torch.randn(total, VIEW_COLORS[kind].lean_width, generator=g, dtype=torch.float64).to(dtype),
     }
 
 

@@ -22,7 +22,7 @@ from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.manifest import parse
 from bitymi_ns.bundle.ply import parse_ply, write_ply
 from bitymi_ns.measure.stability.scenes import random_scene
-from bitymi_ns.ops.view_color import VIEW_COLORS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from tests.bake.scenes import write
 from tests.bundle.damage import signed
@@ -42,7 +42,7 @@ def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
     lean = request.param == "lean"
     if lean:
-        params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"]}
+        params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
         params |= lean_parameters("sv", N, torch.float32)
     atlas = encode(texels, packing, "uint8" if lean else request.param, Range(-0.5, 2.0, "test"))
     folder = tmp_path_factory.mktemp("bundles") / request.param

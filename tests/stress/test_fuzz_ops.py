@@ -234,7 +234,7 @@ def test_view_colors_of_any_size(kind: str, seed: int, terms: int, value: float)
         "sb": [(n, 3), (n, terms, 6)],
         "sg": [(n, 3), (n, terms, 7)],
     }[kind]
-    names = ops.VIEW_COLORS[kind]
+    names = ops.VIEW_COLORS[kind].names
     params = {name: torch.randn(s, generator=g) for name, s in zip(names, shapes, strict=True)}
     if kind == "sv" and terms:
         params["sv_sites"][0, 0, 0] = params["sv_log_tau"][1, 0] = value

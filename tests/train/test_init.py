@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from bitymi_ns.ops import view_color
+from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.init import fibonacci_sphere, neighbour_distance, scene_extent, surfels_from_points
+from bitymi_ns.train.init import neighbour_distance, scene_extent, surfels_from_points
 from bitymi_ns.train.rotations import facing, tangents
 
 CENTERS = torch.tensor([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 1.0]])

@@ -17,8 +17,8 @@ SUITES = {"mipnerf360": ("Mip-NeRF 360", 9), "tanksandtemples": ("Tanks and Temp
 """Suites of the paper: title and number of scenes."""
 FALLOFF, PLAIN = "bitymi", "bitymi-quality"
 """Our presets with the falloff loss and without."""
-PARAMETERS = {"sv": 60, "sh": 59, "sb": 26}
-"""Numbers that a surfel has, by view colour (docs/architecture.md)."""
+VIEW_COLORS = {"bitymi-sh": ("SH", 59), "bitymi": ("SV", 60), "bitymi-sb": ("SB", 26)}
+"""Presets whose view colours the paper compares: its name of the colour, and the numbers that a surfel has."""
 LOSS = "--pipeline.model.train.loss.falloff-weight"
 
 
@@ -182,14 +182,13 @@ def table_4(data: dict[str, Any], rows: list[Evaluation]) -> Table:
     formats = (count, TWO, count, significant)
     printed = (count, TWO, count, PRINTED[4])
     shown = [Row((e["variant"], *_texts(e["figures"], printed))) for e in data["view_colors"]]
-    presets = {"bitymi-sh": "sh", "bitymi": "sv", "bitymi-sb": "sb"}
     mine = []
-    chosen = [r for r in _preferred(_final(rows), "bonsai") if r.preset in presets and not r.options]
-    for row in sorted(chosen, key=lambda r: (r.scene, list(presets).index(r.preset))):
-        kind, surfels = presets[row.preset], row.get("surfels")
-        numbers = None if surfels is None else surfels * PARAMETERS[kind]
+    chosen = [r for r in _preferred(_final(rows), "bonsai") if r.preset in VIEW_COLORS and not r.options]
+    for row in sorted(chosen, key=lambda r: (r.scene, list(VIEW_COLORS).index(r.preset))):
+        (name, per_surfel), surfels = VIEW_COLORS[row.preset], row.get("surfels")
+        numbers = None if surfels is None else surfels * per_surfel
         texts = _texts((surfels, row.get("psnr"), numbers, _fps(row)), formats)
-        mine.append(Row((f"{row.scene}: {kind.upper()}", *texts)))
+        mine.append(Row((f"{row.scene}: {name}", *texts)))
     header = ("Variant", "N", "PSNR ↑", "Parameters ↓", "FPS ↑")
     return _of_one_scene("Table 4: view colours", "bonsai", header, shown, mine, data["hardware"])
 

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops import VIEW_COLORS
+
 SURFEL_KEYS = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
-SV_KEYS = ("sv_sites", "sv_log_tau", "sv_rgb")
+SV_KEYS = VIEW_COLORS["sv"].names
 
 
 @dataclass
@@ -53,9 +55,7 @@ def random_scene(
         "log_scales": math.log(scale) + 0.5 * normal(n, 2),
         "opacity_logits": normal(n),
         "beta_raw": normal(n),
-        "sv_sites": normal(n, 7, 3),
-        "sv_log_tau": normal(n, 7),
-        "sv_rgb": 0.3 * normal(n, 7, 3),
+        **dict(zip(SV_KEYS, (normal(n, 7, 3), normal(n, 7), 0.3 * normal(n, 7, 3)), strict=True)),
     }
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     return SceneCase(name, params, viewmat, K, width, height, background)

@@ -63,8 +63,11 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
     return torch.stack(basis, dim=-1)
 
 
-def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int = 3) -> Tensor:
-    """Spherical harmonics colour [N, 3] from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]."""
+def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int | None = None) -> Tensor:
+    """Spherical harmonics colour [N, 3] from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]; the
+    degree is that of all coefficients, where it is not given."""
+    if degree is None:
+        degree = round((rest.shape[1] + 1) ** 0.5) - 1
     coefficients = torch.cat([dc[:, None], rest[:, : (degree + 1) ** 2 - 1]], dim=1)
     return (sh_basis(degree, dirs)[..., None] * coefficients).sum(1)
 
@@ -113,7 +116,7 @@ def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> 
     its first site. sh: base is dc, terms are the coefficients from degree 1 on. sb, sg: base plus lobes.
 
     Args:
-        kind: sv, sh, sb or sg.
+        kind: a name of `ops.VIEW_COLORS`.
         base: [N, 3].
         span: [N, 2] first term and number of terms.
         terms: [T, 6] (sv, sb), [T, 3] (sh) or [T, 7] (sg).
@@ -129,7 +132,7 @@ def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> 
             weights = torch.softmax(torch.cat([own.new_zeros(1), own[:, :3] @ d]), dim=0)
             out.append(weights @ torch.cat([color[None], own[:, 3:]]))
         elif kind == "sh":
-            out.append(sh(color[None], own[None], d[None], round((count + 1) ** 0.5) - 1)[0])
+            out.append(sh(color[None], own[None], d[None])[0])
         else:
             out.append({"sb": sb, "sg": sg}[kind](color[None], own[None], d[None])[0])
     return torch.stack(out) if out else base

@@ -1,0 +1,305 @@
+"""The kinds of view colour: all that the package knows of each, in one entry of `VIEW_COLORS`.
+
+What a kind is worth in a direction is computed by csrc/core/view_color.h, and in float64 by
+`ops.reference.view_color`. Everything else that depends on the kind asks its entry here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from .constants import LOG_TAU_MAX, MAX_TERMS, SH_C0
+from .sphere import fibonacci_sphere
+
+Limit = tuple[float, ...]
+"""Largest absolute value of a parameter, one for all its numbers or one for each along its last axis."""
+COLOR_LIMIT = 256.0
+"""Largest absolute value of a colour, a coefficient or the colour of a lobe, 1 = white."""
+SHAPE_LIMIT = 1e4
+"""Of logits, angles and logarithms of sharpness: sigmoid and exp have long reached their ends."""
+DIRECTION_LIMIT = 1e6
+"""Of directions of any length: the renderers normalise."""
+VECTOR_LIMIT = 2e7
+"""Of differences of two temperatures of at most exp(16) times a direction."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a view colour, of which every surfel has one row.
+
+    Attributes:
+        name: as in checkpoints, optimiser groups and columns of surfels.ply.
+        shape: of a row; -1 = one for each term, or for each but the one that the first parameter holds.
+        limit: what a bundle may hold.
+        rate: the learning rate in `train.config.LearningRates` that it has,
+        share: and how much of it.
+        activation: what is done to it before use, as bundle.json says it; None = it says nothing.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    limit: Limit
+    rate: Literal["view_color", "view_shape"]
+    share: float = 1.0
+    activation: str | None = None
+
+    @property
+    def width(self) -> int:
+        """Numbers of a row, or of a term of it."""
+        return math.prod(size for size in self.shape if size > 0)
+
+
+@dataclass(frozen=True)
+class ViewColor:
+    """A kind of view colour.
+
+    A term is a site, a coefficient or a lobe. Lean colours (`ops.view_color.LEAN`) have a base colour and as many terms
+    as each surfel needs.
+
+    Attributes:
+        title: what people call it.
+        term, kept: a term, and the heading under which people read how many a bundle keeps, base colours included.
+        parameters: as the kernels take them, two or three; the second has one row per term.
+        counts: numbers of terms that there may be.
+        rule: the same in words, of the rows that there are.
+        base_terms: terms that the base of a lean colour stands for: 1, or 0 where it stands beside the terms.
+        option: the option of `SceneConfig` that decides how many terms there are,
+        option_range: its smallest and largest value,
+        terms_of: and the number of terms for a value.
+        start: the first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator:
+            they show the colours from every direction, or on average over them.
+        lean_width: numbers of a lean term.
+        lean_limit: what a bundle may hold of them.
+        lean_counts: numbers of lean terms that a surfel may have.
+        lean_formula: how a lean colour is evaluated, for bundle.json.
+        base_unit: the colour that a base of 1 shows.
+        mean: f_view's mean over all directions [N, 3] from the parameters, for display; None = no closed form is known.
+        sites: the colour as softmax_k(v_k . d) rgb_k, from its parameters: v and rgb [N, K, 3] each. The bake then fits
+            fewer terms. None = it is nothing of the kind: a surfel keeps all terms, or one colour.
+        stated: the key of bundle.json's surfels under which the number of terms stands; None = it does not.
+    """
+
+    title: str
+    term: str
+    kept: str
+    parameters: tuple[Parameter, ...]
+    counts: Collection[int]
+    rule: str
+    base_terms: int
+    option: str
+    option_range: tuple[int, int]
+    terms_of: Callable[[int], int]
+    start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]]
+    lean_width: int
+    lean_limit: Limit
+    lean_formula: str
+    lean_counts: Collection[int] = range(MAX_TERMS + 1)
+    base_unit: float = 1.0
+    mean: Callable[..., Tensor] | None = None
+    sites: Callable[..., tuple[Tensor, Tensor]] | None = None
+    stated: str | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def _in_first(self) -> int:
+        """Terms that the first parameter holds alone: 1 for sh, whose dc is the coefficient of degree 0."""
+        return 0 if -1 in self.parameters[0].shape else self.base_terms
+
+    def of(self, params: Mapping[str, Tensor]) -> list[Tensor]:
+        """The parameters, out of all of the surfels."""
+        return [params[name] for name in self.names]
+
+    def terms(self, params: Mapping[str, Tensor]) -> int:
+        """How many terms there are."""
+        return params[self.names[1]].shape[1] + self._in_first
+
+    def shapes(self, terms: int) -> list[tuple[int, ...]]:
+        """Shapes of a row of each parameter."""
+        rows = terms - self._in_first
+        return [tuple(rows if size < 0 else size for size in p.shape) for p in self.parameters]
+
+    def problem(self, terms: int) -> str | None:
+        """What is wrong with a number of terms; None where nothing is."""
+        return None if terms in self.counts else f"{self.rule}, not {terms - self._in_first}"
+
+    def first_values(self, color: Tensor, config: Any, generator: torch.Generator) -> dict[str, Tensor]:
+        """The parameters that training starts from: see `start`; `config` is a `SceneConfig`."""
+        values = self.start(color, self.terms_of(getattr(config, self.option)), generator)
+        return dict(zip(self.names, values, strict=True))
+
+
+def _sv_start(color: Tensor, sites: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+    n = len(color)
+    return (
+        fibonacci_sphere(sites).expand(n, sites, 3).clone(),
+        torch.zeros(n, sites),
+        color[:, None, :].repeat(1, sites, 1),
+    )
+
+
+def _sv_sites(sites: Tensor, log_tau: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
+    """tau_k s_k, the gradients of the logits, and the colours."""
+    return F.normalize(sites, dim=2) * log_tau.clamp(max=LOG_TAU_MAX).exp()[..., None], rgb
+
+
+def _sh_start(color: Tensor, terms: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+    return color / SH_C0, torch.zeros(len(color), terms - 1, 3)
+
+
+def _sb_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+    # raw colour 0 passes softplus as 0.1, which keeps the gradient alive; the base makes up for it
+    shape = torch.zeros(len(color), lobes, 6)
+    shape[..., 3] = math.pi * torch.rand(len(color), lobes, generator=generator)
+    shape[..., 4] = 2.0 * math.pi * torch.rand(len(color), lobes, generator=generator)
+    return color - _SB_LOBE_MEAN * lobes, shape
+
+
+_SB_LOBE_MEAN = 0.1 * 0.1
+"""What one fresh Spherical Beta lobe adds on average over all directions: softplus(0) = 0.1 times the mean of
+max(0, cos)^4 over the sphere, 0.1."""
+
+
+def _sb_mean(base: Tensor, lobes: Tensor) -> Tensor:
+    """The mean over the sphere of max(0, d.mu)^p is 1 / (2 (p + 1))."""
+    power = 4.0 * lobes[..., 5].exp()
+    rgb = F.softplus(lobes[..., :3], beta=10.0 * math.log(2.0))
+    return base + (rgb / (2.0 * (power + 1.0))[..., None]).sum(1)
+
+
+def _sg_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+    n = len(color)
+    axes = F.normalize(torch.randn(n, lobes, 3, generator=generator), dim=-1)
+    # log sharpness 1, and no colour of its own yet
+    return color.clone(), torch.cat([axes, torch.ones(n, lobes, 1), torch.zeros(n, lobes, 3)], -1)
+
+
+def _sg_mean(base: Tensor, lobes: Tensor) -> Tensor:
+    """The mean over the sphere of exp(l (d.mu - 1)) is (1 - exp(-2l)) / 2l."""
+    sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
+    share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
+    return base + (lobes[..., 4:] * share[..., None]).sum(1)
+
+
+_COLOR: Limit = (COLOR_LIMIT,)
+_BETA_LOBE: Limit = (*[COLOR_LIMIT] * 3, *[SHAPE_LIMIT] * 3)
+_GAUSSIAN_LOBE: Limit = (*[DIRECTION_LIMIT] * 3, SHAPE_LIMIT, *[COLOR_LIMIT] * 3)
+
+
+def _with_lobes(
+    title: str,
+    name: str,
+    limit: Limit,
+    start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]],
+    mean: Callable[[Tensor, Tensor], Tensor],
+) -> ViewColor:
+    """A kind of a base colour and lobes."""
+    return ViewColor(
+        title=title,
+        term="lobe",
+        kept="Lobes and base colours",
+        parameters=(
+            Parameter(f"{name}_base", (3,), _COLOR, "view_color"),
+            Parameter(f"{name}_lobes", (-1, len(limit)), limit, "view_shape"),
+        ),
+        counts=range(MAX_TERMS + 1),
+        rule=f"{title} colours have at most {MAX_TERMS} lobes per surfel",
+        base_terms=0,
+        option="lobes",
+        option_range=(1, MAX_TERMS),
+        terms_of=int,
+        start=start,
+        lean_width=len(limit),
+        lean_limit=limit,
+        lean_formula="view_base is the base colour, a term is a lobe",
+        mean=mean,
+    )
+
+
+VIEW_COLORS: dict[str, ViewColor] = {
+    "sv": ViewColor(
+        title="Spherical Voronoi",
+        term="site",
+        kept="Sites",
+        parameters=(
+            Parameter("sv_sites", (-1, 3), (DIRECTION_LIMIT,), "view_shape", activation="unit"),
+            Parameter("sv_log_tau", (-1,), (SHAPE_LIMIT,), "view_shape", activation="exp"),
+            Parameter("sv_rgb", (-1, 3), _COLOR, "view_color"),
+        ),
+        counts=range(1, MAX_TERMS + 1),
+        rule=f"Spherical Voronoi colours need 1 to {MAX_TERMS} sites per surfel",
+        base_terms=1,
+        option="sv_sites",
+        option_range=(1, MAX_TERMS),
+        terms_of=int,
+        start=_sv_start,
+        lean_width=6,  # b, rgb relative to the first site
+        lean_limit=(*[VECTOR_LIMIT] * 3, *[COLOR_LIMIT] * 3),
+        lean_formula="(view_base + sum exp(b . d) rgb) / (1 + sum exp(b . d)); a term is b, rgb; d from the camera to "
+        "the surfel",
+        sites=_sv_sites,
+        stated="sites",
+    ),
+    "sh": ViewColor(
+        title="Spherical harmonics",
+        term="coefficient",
+        kept="Coefficients",
+        parameters=(
+            Parameter("sh_dc", (3,), _COLOR, "view_color"),
+            Parameter("sh_rest", (-1, 3), _COLOR, "view_color", share=1.0 / 20.0),
+        ),
+        counts=(1, 4, 9, 16),
+        rule="sh_rest must hold 0, 3, 8 or 15 coefficients",
+        base_terms=1,
+        option="sh_degree",
+        option_range=(0, 3),
+        terms_of=lambda degree: (degree + 1) ** 2,
+        start=_sh_start,
+        lean_width=3,  # the coefficients of one function, from degree 1 on
+        lean_limit=_COLOR,
+        lean_counts=(0, 3, 8, 15),
+        lean_formula="view_base is the coefficient of degree 0, terms are those that follow",
+        base_unit=SH_C0,
+        mean=lambda dc, rest: dc * SH_C0,
+    ),
+    "sb": _with_lobes("Spherical Beta", "sb", _BETA_LOBE, _sb_start, _sb_mean),
+    "sg": _with_lobes("Spherical Gaussian", "sg", _GAUSSIAN_LOBE, _sg_start, _sg_mean),
+}
+"""The kinds, by name."""
+VIEW_PARAMETERS: dict[str, Parameter] = {p.name: p for kind in VIEW_COLORS.values() for p in kind.parameters}
+"""The parameters of all kinds, by name."""
+Kind = Literal[tuple(VIEW_COLORS)]  # type: ignore[valid-type]
+"""A name of `VIEW_COLORS`, for options and files that are checked by their types."""
+
+
+def entry_of(kind: str) -> ViewColor:
+    """What is known of a kind.
+
+    Raises:
+        ValueError: there is none of this name.
+    """
+    if kind not in VIEW_COLORS:
+        raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
+    return VIEW_COLORS[kind]
+
+
+def kind_of(params: Mapping[str, Tensor]) -> str:
+    """Which view colour complete parameters belong to, by its name.
+
+    Raises:
+        ValueError: the parameters of none are there.
+    """
+    for kind, entry in VIEW_COLORS.items():
+        if all(name in params for name in entry.names):
+            return kind
+    raise ValueError(f"no view colour among the surfels' parameters {sorted(params)}")

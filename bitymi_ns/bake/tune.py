@@ -26,6 +26,7 @@ from bitymi_ns.ops import (
     texel_image,
     view_color,
 )
+from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import View, training_order
@@ -143,7 +144,7 @@ class TexelScene:
         """Traces a view."""
         scene, camera = self._baked.scene, view.camera.to("cpu")
         p = scene.surfels
-        geometry = (p[name] for name in ("means", "quats", "log_scales", "opacity_logits", "beta_raw"))
+        geometry = (p[name] for name in GEOMETRY)
         projection = project(*geometry, camera, scene.near, scene.prefilter == "pixel")
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
         drawn: list[Tensor] = []

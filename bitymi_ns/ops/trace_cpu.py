@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, kernel_class
-from .errors import TooManyFragments
+from .fragment_list import empty_list, too_many
 from .project import Projection
 
 MOST = 1 << 25
@@ -57,13 +57,11 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
         size = (camera.width, camera.height)
         n = tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, most)
         if most and n > most:
-            raise TooManyFragments(n, most, *size, 8 + 5 * geom.element_size())
-        surfel, pixel = torch.empty(n, dtype=torch.int32), torch.empty(n, dtype=torch.int32)
-        weight, depth, sigma = (geom.new_empty(n) for _ in range(3))
-        uv = geom.new_empty(2, n)
+            raise too_many(geom, projection, n, most)
+        arrays = empty_list(geom, n)
         tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
-        tracer.copy(tile_start, surfel, pixel, weight, uv, depth, sigma)
-    return tile_start, tile_start, surfel, pixel, weight, uv, depth, sigma
+        tracer.copy(tile_start, *arrays)
+    return tile_start, tile_start, *arrays
 
 
 def count(projection: Projection) -> int:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .backend import kernel, module, workspace
 from .constants import TILE
-from .errors import TooManyFragments
+from .fragment_list import empty_list, too_many
 from .project import Projection
 
 NUMBERS = 24
@@ -110,31 +110,23 @@ def room(geom: Tensor) -> int:
     return (free + kept) // (NUMBERS * geom.element_size())
 
 
-def _too_many(geom: Tensor, projection: Projection, count: int, most: int) -> TooManyFragments:
-    return TooManyFragments(count, most, projection.camera.width, projection.camera.height, 8 + 5 * geom.element_size())
-
-
 def check_room(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
     """Raises TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for."""
     if most == 0 and geom.device.type == "cuda" and count > FEW:
         most = room(geom)
     if most and count > most:
-        raise _too_many(geom, projection, count, most)
+        raise too_many(geom, projection, count, most)
 
 
 def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[Tensor, ...]:
     """surfel, pixel, weight, uv, depth, sigma as in `Fragments`; raises TooManyFragments where they find no room."""
     count = layout.fragments
     try:
-        surfel, pixel = _ints(geom, count), _ints(geom, count)
-        weight, depth, sigma = (geom.new_empty(count) for _ in range(3))
-        uv = geom.new_empty(2, count)
+        arrays = empty_list(geom, count)
     except torch.cuda.OutOfMemoryError as error:
-        raise _too_many(geom, projection, count, room(geom)) from error
-    kernel("trace_fill", geom)(
-        geom, projection.near, projection.through_pixel, layout, surfel, pixel, weight, uv, depth, sigma
-    )
-    return surfel, pixel, weight, uv, depth, sigma
+        raise too_many(geom, projection, count, room(geom)) from error
+    kernel("trace_fill", geom)(geom, projection.near, projection.through_pixel, layout, *arrays)
+    return arrays
 
 
 def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Any, ...]:

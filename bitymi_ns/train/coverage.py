@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import Scene
 
-SUPPORT = 3.0
-"""Radius of a surfel in units of its scale."""
 SAMPLE = 4096
 """Surfels that are looked for first: nearly all views see one of them."""
 CHUNK = 1 << 20

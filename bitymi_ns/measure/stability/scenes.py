@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops import VIEW_COLORS
+from bitymi_ns.scene.scene import GEOMETRY
 
-SURFEL_KEYS = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
+SURFEL_KEYS = GEOMETRY
 SV_KEYS = VIEW_COLORS["sv"].names
 
 

@@ -131,8 +131,6 @@ def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> 
         if kind == "sv":
             weights = torch.softmax(torch.cat([own.new_zeros(1), own[:, :3] @ d]), dim=0)
             out.append(weights @ torch.cat([color[None], own[:, 3:]]))
-        elif kind == "sh":
-            out.append(sh(color[None], own[None], d[None])[0])
         else:
-            out.append({"sb": sb, "sg": sg}[kind](color[None], own[None], d[None])[0])
+            out.append({"sh": sh, "sb": sb, "sg": sg}[kind](color[None], own[None], d[None])[0])
     return torch.stack(out) if out else base

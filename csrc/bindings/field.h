@@ -37,7 +37,7 @@ struct FieldHandle {
               data(w3, kWidth * 3, "w3")};
     data(table, entries(), "table");
   }
-  int64_t entries() const { return (int64_t(arrays.levels) << arrays.log2_size) * kFeatures; }
+  int64_t entries() const { return arrays.table_size(); }
   FieldGradients<S> gradients(const Out& dtable, const Out& dw1, const Out& dw2, const Out& dw3) const {
     aligned(dtable.data());
     return {data(dtable, entries(), "dtable"), data(dw1, arrays.levels * kFeatures * kWidth, "dw1"),

@@ -42,6 +42,12 @@ BT_HD Vec3<S> rotate_transposed(const S* R, Vec3<S> a) {
   return {R[0] * a.x + R[3] * a.y + R[6] * a.z, R[1] * a.x + R[4] * a.y + R[7] * a.z,
           R[2] * a.x + R[5] * a.y + R[8] * a.z};
 }
+// Where the camera stands in the world, -R^T t.
+template <class S>
+BT_HD void camera_center(const S* viewmat, double* center) {
+  const S* m = viewmat;
+  for (int k = 0; k < 3; ++k) center[k] = -(double(m[k]) * m[3] + double(m[4 + k]) * m[7] + double(m[8 + k]) * m[11]);
+}
 // Where pixel i of a row or column is sampled, in pixels.
 template <class S>
 BT_HD S pixel_centre(int i) {

@@ -40,6 +40,10 @@ template <class T>
 BT_HD T min_(T a, T b) {
   return select(a < b, a, b);
 }
+template <class T>
+BT_HD T abs_(T x) {
+  return select(x < T(0.0f), -x, x);
+}
 // NaN stays NaN: a broken parameter must show, not turn black
 template <class T>
 BT_HD T relu(T x) {
@@ -108,8 +112,7 @@ template <class S>
 BT_HD Unit<S> normalize(Vec3<S> a) {
   const S floor_len = S(1e-12);
   // scaled by the largest entry: |a|^2 neither overflows nor underflows
-  const S ax = a.x < S(0) ? -a.x : a.x, ay = a.y < S(0) ? -a.y : a.y, az = a.z < S(0) ? -a.z : a.z;
-  const S big = max_(ax, max_(ay, az));
+  const S big = max_(abs_(a.x), max_(abs_(a.y), abs_(a.z)));
   if (!(big > floor_len)) return {(S(1) / floor_len) * a, S(1) / floor_len, false};
   const Vec3<S> b = (S(1) / big) * a;
   const S inv = S(1) / (sqrt_(dot(b, b)));

@@ -16,6 +16,12 @@ struct FieldArrays {
   bool contract;
   S mid[3], half;
   const S *table, *w1, *w2, *w3;  // [levels, 2^log2_size, 4], [4 levels, 16], [16, 16], [16, 3]
+
+  // Entries before those of a level; and numbers of all.
+  BT_HD int64_t first_entry(int level) const { return int64_t(level) << log2_size; }
+  BT_HD int64_t table_size() const { return first_entry(levels) * kFeatures; }
+  BT_HD uint32_t hash_mask() const { return (1u << log2_size) - 1u; }
+  BT_HD S resolution(int level) const { return S(min_resolution << level); }  // cells along an edge
 };
 template <class S>
 struct FieldGradients {
@@ -161,6 +167,14 @@ BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state,
 template <class S>
 BT_HD Vec3<S> world_point(const S* frame, S u, S v) {
   return load3(frame) + u * load3(frame + 3) + v * load3(frame + 6);
+}
+// Adds the gradient of the frame to dframe and writes those of u and v, from that of the point.
+template <class S>
+BT_HD void world_point_vjp(const S* frame, S u, S v, Vec3<S> dx, S& du, S& dv, S* dframe) {
+  du = dot(dx, load3(frame + 3)), dv = dot(dx, load3(frame + 6));
+  store3(dframe, load3(dframe) + dx);
+  store3(dframe + 3, load3(dframe + 3) + u * dx);
+  store3(dframe + 6, load3(dframe + 6) + v * dx);
 }
 
 }  // namespace bt

@@ -21,13 +21,19 @@ struct Planes {
 };
 template <class S, class T>
 BT_HD Planes<T> planes(const S* g, T dx, T dy) {
-  return {T(g[kU1]) * dx + T(g[kU2]) * dy, T(g[kV1]) * dx + T(g[kV2]) * dy,
-          T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy};
+  // the sum from left to right, as a chain of multiply-adds
+  return {slope(g, kU1, dx, dy), slope(g, kV1, dx, dy), T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy};
 }
 // u^2 + v^2 < r2 without a division, on either side of the camera.
 template <class T>
 BT_HD MaskOf<T> within(const Planes<T>& p, T r2) {
   return p.U * p.U + p.V * p.V < r2 * p.W * p.W;
+}
+
+// Whether the kernel is above 0 there, in front of the camera or behind it.
+template <class T>
+BT_HD MaskOf<T> in_support(const Planes<T>& p) {
+  return within(p, T(kSupport2));
 }
 
 // Where a ray meets a surfel's plane.
@@ -47,7 +53,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   h.inv = one / select(h.ok, p.W, one);
   h.u = select(h.ok, p.U * h.inv, zero);
   h.v = select(h.ok, p.V * h.inv, zero);
-  h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / (kSupport * kSupport)));
+  h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / kSupport2));
   return h;
 }
 
@@ -75,6 +81,22 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   return f;
 }
 
+// `blur`: whether a pixel of those that are drawn together is near the centre.
+template <class Kernel, class S, class T>
+BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, bool blur) {
+  return blur ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy);
+}
+
+// Sigma as a list of fragments holds it: negative in the low-pass branch.
+template <class T>
+BT_HD T listed_sigma(const Fragment<T>& f) {
+  return select(f.low_pass > T(0.0f), -f.sigma, f.sigma);
+}
+template <class S>
+BT_HD S low_pass_of(S listed) {
+  return listed < S(0) ? S(1) : S(0);
+}
+
 // Gradients towards a row of geom, added to d[kGeom]; ddx, ddy is the gradient with respect to the pixel's offset.
 // `rim` bounds 1 - x from below in the kernel's derivative, which diverges at the rim for beta < 1.
 template <class Kernel, class S, class T>
@@ -93,7 +115,7 @@ BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsi
   const T gk = gs * T(g[kOpacity]) * kernel;  // d sigma / d log kernel
   const T gk3 = select(low, zero, gk);
   d[kBeta] += gk3 * log_rest;
-  const T drho = -gk3 * T(g[kBeta]) / max_(rest, T(rim)) * T(S(1.0 / (kSupport * kSupport)));
+  const T drho = -gk3 * T(g[kBeta]) / max_(rest, T(rim)) * T(S(1.0 / kSupport2));
   const T r = T(S(kSupport));
   // the clamp of the low-pass branch passes gradient only inside the support
   const T gu = select(h.ok & (u * u < r * r), du + two * u * drho, zero);

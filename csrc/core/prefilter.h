@@ -9,7 +9,7 @@
 // and q -> u^2 + v^2, rho -> 1 for large discs. Every sum has positive terms: nothing cancels, also edge-on.
 #pragma once
 
-#include "core/surfel.h"
+#include "core/blend.h"
 
 namespace bt {
 
@@ -25,7 +25,7 @@ struct Fragment {
 
 template <class S>
 BT_HD S filter_variance(S beta) {
-  return S(kPixelVariance * 2 / (kSupport * kSupport)) * (beta + S(2));
+  return S(kPixelVariance * 2 / kSupport2) * (beta + S(2));
 }
 // tr Sigma
 template <class S>
@@ -47,8 +47,8 @@ BT_HD FilteredPlace<T> filtered_place(const S* g, T dx, T dy) {
   FilteredPlace<T> f;
   const T zero = T(S(0)), reach = T(S(kSupport)), w0 = T(g[kW0]), n = T(g[kArea]);
   const S c = filter_variance(g[kBeta]), spread = filter_spread(g);
-  const T tilt = T(g[kW1]) * dx + T(g[kW2]) * dy;  // W - w0
-  f.U = T(g[kU1]) * dx + T(g[kU2]) * dy, f.V = T(g[kV1]) * dx + T(g[kV2]) * dy;
+  const T tilt = slope(g, kW1, dx, dy);  // W - w0
+  f.U = slope(g, kU1, dx, dy), f.V = slope(g, kV1, dx, dy);
   f.r = sqrt_(f.U * f.U + f.V * f.V);
   const auto outside = f.r > reach * (w0 + tilt);
   f.beyond = select(outside, f.r - reach * tilt, zero);
@@ -59,10 +59,15 @@ BT_HD FilteredPlace<T> filtered_place(const S* g, T dx, T dy) {
   f.q = (w2 * (f.Un * f.Un + f.Vn * f.Vn) + T(c) * (dx * dx + dy * dy)) / f.D;
   return f;
 }
+// Whether the kernel is above 0 there.
+template <class T>
+BT_HD MaskOf<T> in_support(const FilteredPlace<T>& at) {
+  return at.q < T(kSupport2);
+}
 template <class S, class T>
 BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredPlace<T>& at) {
   const T zero = T(S(0)), one = T(S(1)), r = T(S(kSupport));
-  const T rest = one - at.q * T(S(1.0 / (kSupport * kSupport)));
+  const T rest = one - at.q * T(S(1.0 / kSupport2));
   const auto inside = (rest > zero) & (T(g[kZ]) > T(near) * at.omega);
   const T kernel = select(inside, exp_(T(g[kBeta]) * log_(select(inside, rest, one))), zero);
   const T inv = one / (T(g[kW0]) * at.omega);
@@ -81,24 +86,24 @@ BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredPlace<T>& 
 template <class S, class T>
 BT_HD void filtered_vjp(const S* g, S near, S rim, T dx, T dy, T dsigma, T du, T dv, T ddepth, T* d, T& ddx, T& ddy) {
   const T zero = T(S(0)), one = T(S(1)), two = T(S(2)), reach = T(S(kSupport));
-  const T n = T(g[kArea]), w0 = T(g[kW0]), third = T(S(1.0 / (kSupport * kSupport)));
+  const T n = T(g[kArea]), w0 = T(g[kW0]), ninth = T(S(1.0 / kSupport2));
   const S c = filter_variance(g[kBeta]), spread = filter_spread(g);
   const FilteredPlace<T> at = filtered_place<S, T>(g, dx, dy);
   const T w = at.omega, w2 = w * w, inv_d = one / at.D, a = w2 * T(g[kArea] * g[kW0]);
   const T rho = a * sqrt_(inv_d);
-  const T rest = max_(one - at.q * third, T(S(1e-30)));
+  const T rest = max_(one - at.q * ninth, T(S(1e-30)));
   const T log_rest = log_(rest), kernel = rho * exp_(T(g[kBeta]) * log_rest);
   const auto open = (T(g[kOpacity]) * kernel < T(S(kAlphaMax))) & (T(g[kZ]) > T(near) * w);
   const T gs = select(open, dsigma, zero);
   d[kOpacity] += gs * kernel;
   const T gl = gs * T(g[kOpacity]) * kernel;  // d sigma / d log(rho kernel)
   const S bounded = rim > S(0) ? S(2) : S(0);
-  const T across = T(bounded) * third * sqrt_(at.q * (w2 * T(spread) + T(S(2) * c)) * inv_d);  // of x, over a pixel
-  const T gq = -gl * T(g[kBeta]) * third / max_(rest, max_(across, T(rim)));
+  const T across = T(bounded) * ninth * sqrt_(at.q * (w2 * T(spread) + T(S(2) * c)) * inv_d);  // of x, over a pixel
+  const T gq = -gl * T(g[kBeta]) * ninth / max_(rest, max_(across, T(rim)));
   const T gnum = gq * inv_d, gd = -(gq * at.q + T(S(0.5)) * gl) * inv_d;
   const T ga = gl / a + two * gd * a;
   const T gc = gnum * (dx * dx + dy * dy) + gd * (w2 * T(spread) + T(S(2) * c));
-  d[kBeta] += gl * log_rest + gc * T(S(kPixelVariance * 2 / (kSupport * kSupport)));
+  d[kBeta] += gl * log_rest + gc * T(S(kPixelVariance * 2 / kSupport2));
   // towards omega, U, V, n, w0 and the coefficients in tr Sigma
   const T inv = one / (w0 * w), u = at.U * inv, v = at.V * inv;
   const T gu = select(u * u < reach * reach, du, zero), gv = select(v * v < reach * reach, dv, zero);

@@ -22,6 +22,13 @@ struct SsimWindow {
   }
 };
 
+// Adds a pixel's share to a window's five means, which are of a, b, a^2, b^2 and a b; k is its weight.
+template <class S>
+BT_HD void add_moments(S k, S a, S b, S* means) {
+  const S ka = k * a, kb = k * b;
+  means[0] += ka, means[1] += kb, means[2] += ka * a, means[3] += kb * b, means[4] += ka * b;
+}
+
 // Weighted means over a window: of a, b, a^2, b^2 and a b. The derivatives are those towards the means of a, a^2 and
 // a b; a pixel p of weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
 template <class S>
@@ -34,6 +41,11 @@ BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
   d[1] = -value / t;
   d[2] = two * p * i;
   return value;
+}
+// The gradient of pixel a from the sums over its windows of k d[0], k d[1] and k d[2].
+template <class S>
+BT_HD S ssim_pixel_gradient(S a, S b, S d0, S d1, S d2) {
+  return d0 + S(2) * a * d1 + b * d2;
 }
 
 }  // namespace bt

@@ -13,7 +13,8 @@
 
 namespace bt {
 
-constexpr double kSupport = 3.0;            // R: the kernel ends at 3 scale units
+constexpr double kSupport = 3.0;  // R: the kernel ends at 3 scale units
+constexpr double kSupport2 = kSupport * kSupport;
 constexpr double kAlphaMax = 0.99;          // sigma is clamped to this
 constexpr double kAlphaMin = 1.0 / 255;     // fragments below this are skipped
 constexpr double kTransmittanceMin = 1e-4;  // a pixel takes no fragment that would leave it less
@@ -49,6 +50,13 @@ BT_HD bool filtered(const S* g) {
     return false;
 }
 
+// The slope of a plane at (dx, dy) pixels from the projected centre: U is slope(g, kU1, ...), W is g[kW0] and that of
+// kW1.
+template <class S, class T>
+BT_HD T slope(const S* g, GeomColumn first, T dx, T dy) {
+  return T(g[first]) * dx + T(g[first + 1]) * dy;
+}
+
 // The geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
 template <class S>
 struct Surfels {
@@ -72,7 +80,7 @@ template <class S>
 BT_HD Rotation<S> rotation(const S* q) {
   Rotation<S> r;
   S big = S(0);
-  for (int i = 0; i < 4; ++i) big = max_(big, q[i] < S(0) ? -q[i] : q[i]);
+  for (int i = 0; i < 4; ++i) big = max_(big, abs_(q[i]));
   r.ok = big > S(0) && finite_(big);
   const S scale = r.ok ? S(1) / big : S(0);
   const S a = q[0] * scale, b = q[1] * scale, c = q[2] * scale, d = q[3] * scale;
@@ -111,24 +119,39 @@ BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
+// Surfel i in the frame of a camera.
+template <class S>
+struct Posed {
+  Rotation<S> rot;           // in the world
+  S su, sv;                  // scales
+  Vec3<S> p, a, b, n;        // centre, tangents, normal
+  S np, sign;                // n.p and its sign
+  S iz, ifx, ify, isu, isv;  // 1 / p.z, 1 / fx, ...
+};
+template <class S>
+BT_HD Posed<S> pose(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i) {
+  Posed<S> s;
+  s.rot = rotation(in.quats + 4 * i);
+  s.su = surfel_scale(in.log_scales[2 * i]), s.sv = surfel_scale(in.log_scales[2 * i + 1]);
+  s.p = to_camera(cam, in.means + 3 * i);
+  s.a = rotate(cam.R, s.rot.tu), s.b = rotate(cam.R, s.rot.tv), s.n = rotate(cam.R, s.rot.n);
+  s.np = dot(s.n, s.p);
+  s.sign = s.np < S(0) ? S(-1) : S(1);
+  s.iz = S(1) / s.p.z, s.ifx = S(1) / cam.fx, s.ify = S(1) / cam.fy, s.isu = S(1) / s.su, s.isv = S(1) / s.sv;
+  return s;
+}
+
 // Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre
 // is nearer than `near` (camera z).
 template <class Kernel, class S>
 BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, S* geom, S* frame) {
-  const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
+  const S* log_scales = in.log_scales + 2 * i;
   const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
-  const Rotation<S> rot = rotation(in.quats + 4 * i);
-  const Vec3<S> m = load3(mean);
-  const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
-  const Vec3<S> p = to_camera(cam, mean);
+  const auto [rot, su, sv, p, a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, in, i);
   if (!rot.ok || !finite_(p.x) || !finite_(p.y) || !finite_(p.z) || !(p.z > near)) return false;
   if (!finite_(log_scales[0]) || !finite_(log_scales[1])) return false;
   if (!finite_(opacity_logit) || !finite_(beta_raw)) return false;
-  const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
   const Vec3<S> pa = cross(p, a), pb = cross(p, b);
-  const S np = dot(n, p);
-  const S sign = np < S(0) ? S(-1) : S(1);
-  const S iz = S(1) / p.z, ifx = S(1) / cam.fx, ify = S(1) / cam.fy, isu = S(1) / su, isv = S(1) / sv;
   S g[kGeom];
   g[kCx] = cam.fx * p.x * iz + cam.cx;
   g[kCy] = cam.fy * p.y * iz + cam.cy;
@@ -145,7 +168,7 @@ BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S nea
   for (int i = 0; i < kGeom; ++i)
     if (!finite_(g[i])) return false;
   for (int i = 0; i < kGeom; ++i) geom[i] = g[i];
-  store3(frame, m);
+  store3(frame, load3(in.means + 3 * i));
   store3(frame + 3, su * rot.tu);
   store3(frame + 6, sv * rot.tv);
   return true;
@@ -166,14 +189,8 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   }
   const S none[kFrame] = {};
   if (!dframe) dframe = none;
-  const S *mean = in.means + 3 * i, *log_scales = in.log_scales + 2 * i;
-  const Rotation<S> rot = rotation(in.quats + 4 * i);
-  const S su = surfel_scale(log_scales[0]), sv = surfel_scale(log_scales[1]);
-  const Vec3<S> p = to_camera(cam, mean);
-  const Vec3<S> a = rotate(cam.R, rot.tu), b = rotate(cam.R, rot.tv), n = rotate(cam.R, rot.n);
-  const S np = dot(n, p);
-  const S sign = np < S(0) ? S(-1) : S(1);
-  const S iz = S(1) / p.z, ifx = S(1) / cam.fx, ify = S(1) / cam.fy, isu = S(1) / su, isv = S(1) / sv;
+  const S* log_scales = in.log_scales + 2 * i;
+  const auto [rot, su, sv, p, a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, in, i);
 
   const Vec3<S> dpb = {-sign * ifx * isu * dgeom[kU1], -sign * ify * isu * dgeom[kU2], S(0)};
   const Vec3<S> dpa = {sign * ifx * isv * dgeom[kV1], sign * ify * isv * dgeom[kV2], S(0)};

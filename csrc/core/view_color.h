@@ -8,8 +8,13 @@
 namespace bt {
 
 constexpr int kMaxTerms = 32;                  // sites or lobes
-constexpr double kShC0 = 0.28209479177387814;  // the harmonic of degree 0, 1 / (2 sqrt(pi))
-constexpr double kLogTauMax = 16;              // temperatures end at 9e6: finite in, finite out
+constexpr double kShC0 = 0.28209479177387814;  // the harmonic of degree 0, 1 / (2 sqrt(pi)); and those of 1 to 3
+constexpr double kShC1 = 0.4886025119029199;
+constexpr double kShC2a = 1.0925484305920792, kShC2b = 0.31539156525252005, kShC2c = 0.5462742152960396;
+constexpr double kShC3a = 0.5900435899266435, kShC3b = 2.890611442640554, kShC3c = 0.4570457994644658;
+constexpr double kShC3e = 0.3731763325901154, kShC3f = 1.445305721320277;
+constexpr double kLogTauMax = 16;    // temperatures end at 9e6: finite in, finite out
+constexpr double kLogPowerMax = 10;  // and the powers of Spherical Beta lobes at 9e4
 
 // Direction from the camera's centre, given in double: far from the origin its rounding to float32 would turn the
 // direction, while the difference is as exact as the surfel's own position.
@@ -19,12 +24,18 @@ BT_HD Unit<S> view_direction(const S* mean, const double* center) {
       Vec3<S>{S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])});
 }
 
+// The temperature of a site or the sharpness of a Gaussian lobe.
+template <class S>
+BT_HD S temperature(S log_tau) {
+  return exp_(min_(log_tau, S(kLogTauMax)));
+}
+
 // c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
 template <class S>
 BT_HD Vec3<S> sv_color(int K, const S* sites, const S* log_tau, const S* rgb, Vec3<S> d) {
   S logits[kMaxTerms], top = S(-1e30);
   for (int k = 0; k < K; ++k) {
-    logits[k] = exp_(min_(log_tau[k], S(kLogTauMax))) * dot(normalize(load3(sites + 3 * k)).n, d);
+    logits[k] = temperature(log_tau[k]) * dot(normalize(load3(sites + 3 * k)).n, d);
     top = max_(top, logits[k]);
   }
   Vec3<S> c = {S(0), S(0), S(0)};
@@ -65,7 +76,7 @@ BT_HD void sv_color_vjp(int K, const S* sites, const S* log_tau, const S* rgb, V
   int first = 0;
   for (int k = 0; k < K; ++k) {
     site[k] = normalize(load3(sites + 3 * k));
-    tau[k] = exp_(min_(log_tau[k], S(kLogTauMax)));
+    tau[k] = temperature(log_tau[k]);
     w[k] = tau[k] * dot(site[k].n, d);
     if (w[k] > top) top = w[k], first = k;
   }
@@ -95,17 +106,17 @@ BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   out[0] = S(kShC0);
   if (terms > 1) {
-    const S a = S(0.4886025119029199);
+    const S a = S(kShC1);
     out[1] = -a * y, out[2] = a * z, out[3] = -a * x;
   }
   if (terms > 4) {
-    const S a = S(1.0925484305920792), b = S(0.31539156525252005), c = S(0.5462742152960396);
+    const S a = S(kShC2a), b = S(kShC2b), c = S(kShC2c);
     out[4] = a * x * y, out[5] = -a * y * z, out[6] = b * (S(2) * zz - xx - yy), out[7] = -a * x * z;
     out[8] = c * (xx - yy);
   }
   if (terms > 9) {
-    const S a = S(0.5900435899266435), b = S(2.890611442640554), c = S(0.4570457994644658);
-    const S e = S(0.3731763325901154), f = S(1.445305721320277);
+    const S a = S(kShC3a), b = S(kShC3b), c = S(kShC3c);
+    const S e = S(kShC3e), f = S(kShC3f);
     out[9] = -a * y * (S(3) * xx - yy), out[10] = b * x * y * z, out[11] = -c * y * (S(4) * zz - xx - yy);
     out[12] = e * z * (S(2) * zz - S(3) * xx - S(3) * yy), out[13] = -c * x * (S(4) * zz - xx - yy);
     out[14] = f * z * (xx - yy), out[15] = -a * x * (xx - S(3) * yy);
@@ -117,18 +128,18 @@ BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, two = S(2), six = S(6);
   Vec3<S> r = {S(0), S(0), S(0)};
   if (terms > 1) {
-    const S a = S(0.4886025119029199);
+    const S a = S(kShC1);
     r.x -= a * g[3], r.y -= a * g[1], r.z += a * g[2];
   }
   if (terms > 4) {
-    const S a = S(1.0925484305920792), b = S(0.31539156525252005), c = S(0.5462742152960396);
+    const S a = S(kShC2a), b = S(kShC2b), c = S(kShC2c);
     r.x += a * y * g[4] - two * b * x * g[6] - a * z * g[7] + two * c * x * g[8];
     r.y += a * x * g[4] - a * z * g[5] - two * b * y * g[6] - two * c * y * g[8];
     r.z += -a * y * g[5] + S(4) * b * z * g[6] - a * x * g[7];
   }
   if (terms > 9) {
-    const S a = S(0.5900435899266435), b = S(2.890611442640554), c = S(0.4570457994644658);
-    const S e = S(0.3731763325901154), f = S(1.445305721320277);
+    const S a = S(kShC3a), b = S(kShC3b), c = S(kShC3c);
+    const S e = S(kShC3e), f = S(kShC3f);
     r.x += -a * six * x * y * g[9] + b * y * z * g[10] + two * c * x * y * g[11] - e * six * x * z * g[12] -
            c * (S(4) * zz - S(3) * xx - yy) * g[13] + two * f * x * z * g[14] - a * S(3) * (xx - yy) * g[15];
     r.y += -a * S(3) * (xx - yy) * g[9] + b * x * z * g[10] - c * (S(4) * zz - xx - S(3) * yy) * g[11] -
@@ -181,7 +192,7 @@ BT_HD BetaLobe<S> beta_lobe(const S* lobe, Vec3<S> d) {
   l.mu = {l.st * l.cp, l.st * l.sp, l.ct};
   l.color = {lobe_softplus(lobe[0]), lobe_softplus(lobe[1]), lobe_softplus(lobe[2])};
   l.cosine = dot(l.mu, d);
-  l.power = S(4) * exp_(min_(lobe[5], S(10)));
+  l.power = S(4) * exp_(min_(lobe[5], S(kLogPowerMax)));
   l.value = l.cosine > S(0) ? exp_(l.power * log_(l.cosine)) : S(0);
   return l;
 }
@@ -208,7 +219,7 @@ BT_HD void sb_color_vjp(int K, const S* lobes, Vec3<S> d, Vec3<S> dc, S* dbase, 
     const bool lit = l.cosine > S(0);
     // value / cosine stays finite: the power is above 0 and a tiny cosine gives value 0 first
     const S dcos = lit ? dvalue * l.power * l.value / max_(l.cosine, S(1e-6)) : S(0);
-    g[5] = lit && lobe[5] < S(10) ? dvalue * l.value * log_(l.cosine) * l.power : S(0);
+    g[5] = lit && lobe[5] < S(kLogPowerMax) ? dvalue * l.value * log_(l.cosine) * l.power : S(0);
     const Vec3<S> dmu = dcos * d;
     g[3] = dmu.x * l.ct * l.cp + dmu.y * l.ct * l.sp - dmu.z * l.st;
     g[4] = -dmu.x * l.st * l.sp + dmu.y * l.st * l.cp;
@@ -222,7 +233,7 @@ BT_HD Vec3<S> sg_color(int K, const S* base, const S* lobes, Vec3<S> d) {
   Vec3<S> c = load3(base);
   for (int k = 0; k < K; ++k) {
     const S* lobe = lobes + 7 * k;
-    const S sharp = exp_(min_(lobe[3], S(kLogTauMax)));
+    const S sharp = temperature(lobe[3]);
     c = c + exp_(sharp * (dot(normalize(load3(lobe)).n, d) - S(1))) * load3(lobe + 4);
   }
   return c;
@@ -234,7 +245,7 @@ BT_HD void sg_color_vjp(int K, const S* lobes, Vec3<S> d, Vec3<S> dc, S* dbase, 
     const S* lobe = lobes + 7 * k;
     S* g = dlobes + 7 * k;
     const Unit<S> mu = normalize(load3(lobe));
-    const S sharp = exp_(min_(lobe[3], S(kLogTauMax))), away = dot(mu.n, d) - S(1);
+    const S sharp = temperature(lobe[3]), away = dot(mu.n, d) - S(1);
     const S value = exp_(sharp * away);
     store3(g + 4, value * dc);
     const S dexponent = value * dot(dc, load3(lobe + 4));
@@ -264,6 +275,8 @@ BT_HD ViewColorWidths view_color_widths(int kind, int K) {
                         : (kind == kSb ? 6 : 7) * K,
           kind == kSv ? 3 * K : 0};
 }
+// Terms of the presets: kernels that unroll their loops are compiled for these.
+constexpr int preset_terms(int kind) { return kind == kSv ? 7 : kind == kSh ? 16 : 2; }
 // Colour of surfel i. kind and K are those of p; a kernel that knows them when it is compiled unrolls its loops.
 template <class S>
 BT_HD Vec3<S> view_color(int kind, int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d) {

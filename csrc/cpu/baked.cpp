@@ -52,7 +52,7 @@ inline void add_textured(const T* patch, int columns, uint32_t lanes, Pack<S> x,
     const Oct<S> column = top + fy[i] * (bottom - top);
     const Quad<S> left = half<0, Quad<S>>(column), right = half<1, Quad<S>>(column);
     const Quad<S> c = colour + scale * (left + fx[i] * (right - left));
-    to[i] += w[i] * (c < S(0) ? Quad<S>{} : c);
+    to[i] += w[i] * relu_quad<S>(c);
   }
 }
 }  // namespace
@@ -147,8 +147,8 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
     }
     for (int pack = 0; pack < kPacks; ++pack)
       for (int lane = 0; lane < kLanes; ++lane) {
-        const int x = tx * kTile + pack % kPacksAcross * kPackSide + lane % kPackSide;
-        const int y = ty * kTile + pack / kPacksAcross * kPackSide + lane / kPackSide;
+        const int x = tx * kTile + pack_column(pack) + lane % kPackSide;
+        const int y = ty * kTile + pack_row(pack) + lane / kPackSide;
         if (x >= width || y >= height) continue;
         const int64_t pixel = int64_t(y) * width + x;
         S* to = image + pixel * channels;

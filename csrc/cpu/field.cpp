@@ -148,12 +148,7 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
             const Vec3<S> dx = enc.position_gradient(*field, p, lanes);
             const int64_t j = who[p], s = f.surfel[j];
             const S u = f.uv[j], v = f.uv[fragments + j];
-            duv[j] = dot(dx, load3(frames + s * kFrame + 3));
-            duv[fragments + j] = dot(dx, load3(frames + s * kFrame + 6));
-            S* to = own.data() + s * columns + 3;
-            store3(to, load3(to) + dx);
-            store3(to + 3, load3(to + 3) + u * dx);
-            store3(to + 6, load3(to + 6) + v * dx);
+            world_point_vjp(frames + s * kFrame, u, v, dx, duv[j], duv[fragments + j], own.data() + s * columns + 3);
           }
           count = 0;
         }

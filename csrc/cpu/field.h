@@ -44,12 +44,12 @@ struct Encoder {
 
   void set(int p, Vec3<S> a) { x[0][p] = a.x, x[1][p] = a.y, x[2][p] = a.z; }
   Vec3<S> point(int p) const { return {x[0][p], x[1][p], x[2][p]}; }
-  static const S* level(const FieldArrays<S>& f, int l) { return f.table + (int64_t(l) << f.log2_size) * kFeatures; }
+  static const S* level(const FieldArrays<S>& f, int l) { return f.table + f.first_entry(l) * kFeatures; }
 
   void encode(const FieldArrays<S>& f, int count) {
-    const uint32_t mask = (1u << f.log2_size) - 1u;
+    const uint32_t mask = f.hash_mask();
     const Vec3<P> c = grid_coordinate(Vec3<P>{load(x[0]), load(x[1]), load(x[2])}, load3(f.mid), f.half, f.contract);
-    for (int l = 0; l < f.levels; ++l) corners(c, P(S(f.min_resolution << l)), mask, at[l]);
+    for (int l = 0; l < f.levels; ++l) corners(c, P(f.resolution(l)), mask, at[l]);
     // all lines are on their way before the first is needed
     for (int l = 0; l < f.levels; ++l)
       for (int k = 0; k < 8; ++k)
@@ -78,7 +78,7 @@ struct Encoder {
         d[k] = S(0);
         for (int j = 0; j < kFeatures; ++j) d[k] += dfeatures[l * kFeatures + j] * entry[j];
       }
-      dc = dc + cell_gradient(c.fx[p], c.fy[p], c.fz[p], S(f.min_resolution << l), d);
+      dc = dc + cell_gradient(c.fx[p], c.fy[p], c.fz[p], f.resolution(l), d);
     }
     return grid_coordinate_vjp(point(p), load3(f.mid), f.half, f.contract, dc);
   }
@@ -111,7 +111,7 @@ struct TableScatter {
   void add(const FieldArrays<S>& f, S* dtable) const {
 #pragma omp parallel for num_threads(std::min(num_threads(), f.levels)) schedule(static, 1)
     for (int l = 0; l < f.levels; ++l) {
-      S* table = dtable + (int64_t(l) << f.log2_size) * kFeatures;
+      S* table = dtable + f.first_entry(l) * kFeatures;
       for (const Batch& b : batches) {
         for (int k = 0; k < 8; ++k)
           for (int p = 0; p < b.count; ++p) __builtin_prefetch(table + int64_t(b.index[l][k][p]) * kFeatures, 1);
@@ -144,8 +144,8 @@ void add_mlp_gradient(const std::vector<Mlp<S, Pack<S>>>& parts, int count, int 
 }
 template <class S>
 void clear_gradients(const FieldArrays<S>& f, const FieldGradients<S>& out) {
-  const int64_t entries = (int64_t(f.levels) << f.log2_size) * kFeatures;
-  parallel_parts(entries, 1 << 16, [&](int, int64_t b, int64_t e) { std::fill(out.table + b, out.table + e, S(0)); });
+  parallel_parts(f.table_size(), 1 << 16,
+                 [&](int, int64_t b, int64_t e) { std::fill(out.table + b, out.table + e, S(0)); });
   std::fill(out.w1, out.w1 + f.levels * kFeatures * kWidth, S(0));
   std::fill(out.w2, out.w2 + kWidth * kWidth, S(0));
   std::fill(out.w3, out.w3 + kWidth * 3, S(0));

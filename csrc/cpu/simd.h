@@ -40,6 +40,12 @@ using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry, or rgba
 template <class S>
 using Oct = typename LaneTypes<S>::O;  // eight: two texels that lie next to each other
 
+// relu of core/common.h; a Quad is no class and finds no function by its name
+template <class S>
+BT_HD Quad<S> relu_quad(Quad<S> a) {
+  return a < S(0) ? Quad<S>{} : a;
+}
+
 template <>
 struct IndexOf<Pack<float>> {
   typedef uint32_t type __attribute__((vector_size(64)));

@@ -15,8 +15,7 @@ void filter_row(const S* a, const S* b, int n, int stride, const S* k, S* const*
   for (int x = 0; x < n; ++x) {
     S m[5] = {};
     for (int t = 0; t < kTaps; ++t) {
-      const S p = a[x + t * stride], q = b[x + t * stride], kp = k[t] * p, kq = k[t] * q;
-      m[0] += kp, m[1] += kq, m[2] += kp * p, m[3] += kq * q, m[4] += kp * q;
+      add_moments(k[t], a[x + t * stride], b[x + t * stride], m);
     }
     for (int j = 0; j < 5; ++j) out[j][x] = m[j];
   }
@@ -87,7 +86,7 @@ S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
             const int at = x + pad - t * channels;
             m0 += k[t] * w0[at], m1 += k[t] * w1[at], m2 += k[t] * w2[at];
           }
-          da[y * line + x] = m0 + S(2) * p[x] * m1 + q[x] * m2;
+          da[y * line + x] = ssim_pixel_gradient(p[x], q[x], m0, m1, m2);
         }
       }
     });

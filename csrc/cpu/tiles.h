@@ -9,6 +9,10 @@ namespace bt {
 
 constexpr int kPackSide = 4, kPacksAcross = kTile / kPackSide, kPacks = kPacksAcross * kPacksAcross;
 
+// A pack's first pixel in its tile.
+inline int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
+inline int pack_row(int pack) { return pack / kPacksAcross * kPackSide; }
+
 // A tile's transmittance while its surfels are drawn front to back.
 template <class S>
 struct TileState {
@@ -29,8 +33,7 @@ struct TileState {
     }
     for (int p = 0; p < kPacks; ++p) {
       transmittance[p] = P(S(1));
-      const P px = P(x0 + S(p % kPacksAcross * kPackSide)) + lane_x;
-      const P py = P(y0 + S(p / kPacksAcross * kPackSide)) + lane_y;
+      const P px = P(x0 + S(pack_column(p))) + lane_x, py = P(y0 + S(pack_row(p))) + lane_y;
       open[p] = (px < P(S(width))) & (py < P(S(height)));
       open_packs += bits(open[p]) != 0;
     }
@@ -49,15 +52,13 @@ struct TileState {
         const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
         if (filtered<Kernel>(g)) {
           const FilteredPlace<P> at = filtered_place<S, P>(g, dx, dy);
-          if (bits(open[pack] & (at.q < P(S(kSupport * kSupport)))))
-            take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
+          if (bits(open[pack] & in_support(at))) take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
           continue;
         }
         // a cheap look first: does any lane lie in the support or near the centre?
-        const M inside = within(planes(g, dx, dy), P(S(kSupport * kSupport))), close = near_centre(dx, dy);
+        const M inside = in_support(planes(g, dx, dy)), close = near_centre(dx, dy);
         if (!bits(open[pack] & (inside | close))) continue;
-        take_fragment(
-            pack, bits(close) ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy), fn);
+        take_fragment(pack, fragment<Kernel>(g, near, dx, dy, bits(close) != 0), fn);
       }
     }
   }

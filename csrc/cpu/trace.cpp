@@ -57,8 +57,8 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
                                        return;
                                      }
                                      const int64_t at = from + count;
-                                     const int32_t corner = (ty * kTile + pack / kPacksAcross * kPackSide) * width +
-                                                            tx * kTile + pack % kPacksAcross * kPackSide;
+                                     const int32_t corner =
+                                         (ty * kTile + pack_row(pack)) * width + tx * kTile + pack_column(pack);
                                      int n = 0;
                                      for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
                                        const int lane = __builtin_ctz(rest);
@@ -69,7 +69,7 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
                                      compress(&a.u[at], f.u, lanes);
                                      compress(&a.v[at], f.v, lanes);
                                      compress(&a.depth[at], f.depth, lanes);
-                                     compress(&a.sigma[at], select(f.low_pass > P(S(0)), -f.sigma, f.sigma), lanes);
+                                     compress(&a.sigma[at], listed_sigma(f), lanes);
                                      count += n;
                                    });
     }
@@ -145,13 +145,12 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
         while (begin > tile_start[tile] && f.surfel[begin - 1] == id) {
           const int64_t i = --begin;
           const int y = f.pixel[i] / width, x = f.pixel[i] - y * width;
-          const S sigma = f.sigma[i] < S(0) ? -f.sigma[i] : f.sigma[i];
           S& rest = behind[(y - y0) * kTile + x - x0];
           const S gw = dweight ? dweight[i] : S(0);
-          dsigma[m] = blend_vjp(f.weight[i], sigma, gw, rest);
+          dsigma[m] = blend_vjp(f.weight[i], abs_(f.sigma[i]), gw, rest);
           du[m] = duv ? duv[i] : S(0), dv[m] = duv ? duv[total + i] : S(0);
           dz[m] = ddepth ? ddepth[i] : S(0);
-          low[m] = f.sigma[i] < S(0) ? S(1) : S(0);
+          low[m] = low_pass_of(f.sigma[i]);
           dx[m] = pixel_centre<S>(x) - g[kCx], dy[m] = pixel_centre<S>(y) - g[kCy];
           ++m;
         }
@@ -164,7 +163,7 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
           P ddx, ddy;
           fragment_vjp<Kernel, S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k),
                                      load(du + k), load(dv + k), load(dz + k), d, ddx, ddy);
-          ax += max_(ddx, -ddx), ay += max_(ddy, -ddy);
+          ax += abs_(ddx), ay += abs_(ddy);
         }
         S* to = sums.data() + int64_t(id) * kSums;
         for (int k = 0; k < kColumns; ++k) to[k] += sum(d[k]);

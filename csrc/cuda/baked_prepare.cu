@@ -6,6 +6,7 @@
 #include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_stages.h"
+#include "cuda/primitives.h"
 
 namespace bt::cuda {
 
@@ -13,27 +14,24 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
 
-// Order of floats as order of unsigned integers.
-__device__ uint32_t depth_key(float z) {
-  uint32_t bits;
-  memcpy(&bits, &z, sizeof bits);
-  return bits >> 31 ? ~bits : bits | 0x80000000u;
+// The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
+template <int kKind>
+__device__ Vec3<float> view_color_of(const ViewColorArrays<const float>& p, int64_t i, Vec3<float> d) {
+  constexpr int kTerms = preset_terms(kKind);
+  return p.terms == kTerms ? view_color(kKind, kTerms, p, i, d) : view_color(kKind, p.terms, p, i, d);
 }
-
-// The paper's numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
-__device__ Vec3<float> view_color(const BakedSurfels& s, int64_t i, Vec3<float> d) {
-  if (s.lean.base) return bt::view_color(s.lean, i, d);
-  const int K = s.terms;
+__device__ Vec3<float> view_color_of(const BakedSurfels& s, int64_t i, Vec3<float> d) {
+  if (s.lean.base) return view_color(s.lean, i, d);
+  const ViewColorArrays<const float> p = {s.kind, s.terms, s.a, s.b, s.c};
   switch (s.kind) {
-    case 0:
-      return K == 7 ? sv_color(7, s.a + 21 * i, s.b + 7 * i, s.c + 21 * i, d)
-                    : sv_color(K, s.a + 3 * K * i, s.b + K * i, s.c + 3 * K * i, d);
-    case 1:
-      return K == 16 ? sh_color(16, s.a + 3 * i, s.b + 45 * i, d) : sh_color(K, s.a + 3 * i, s.b + 3 * (K - 1) * i, d);
-    case 2:
-      return K == 2 ? sb_color(2, s.a + 3 * i, s.b + 12 * i, d) : sb_color(K, s.a + 3 * i, s.b + 6 * K * i, d);
+    case kSv:
+      return view_color_of<kSv>(p, i, d);
+    case kSh:
+      return view_color_of<kSh>(p, i, d);
+    case kSb:
+      return view_color_of<kSb>(p, i, d);
     default:
-      return K == 2 ? sg_color(2, s.a + 3 * i, s.b + 14 * i, d) : sg_color(K, s.a + 3 * i, s.b + 7 * K * i, d);
+      return view_color_of<kSg>(p, i, d);
   }
 }
 
@@ -126,7 +124,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
   }
   seen = seen && count > 0;
   if (i < f.n) {
-    f.memory.depth[at] = seen ? depth_key(z) : kNeverSeen;
+    f.memory.depth[at] = seen ? sort_key(z) : kNeverSeen;
     f.memory.unsorted[at] = int32_t(at);
     f.memory.counts[at] = count;
   }
@@ -135,11 +133,10 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
   __syncthreads();
   if (int(threadIdx.x) >= seen_count) return;
   const int64_t j = block + seen_list[threadIdx.x];
-  const float* m = v.viewmats + 16 * view;
-  double center[3];  // -R^T t
-  for (int k = 0; k < 3; ++k) center[k] = -(double(m[k]) * m[3] + double(m[4 + k]) * m[7] + double(m[8 + k]) * m[11]);
+  double center[3];
+  camera_center(v.viewmats + 16 * view, center);
   const Vec3<float> d = view_direction(s.geometry.means + 3 * j, center).n;
-  const Vec3<float> color = view_base(view_color(s, j, d));
+  const Vec3<float> color = view_base(view_color_of(s, j, d));
   float* to = f.memory.rows + (first + j) * kRow;
   store3(to + kRed, color);
   write_texture(s, j, color, to);

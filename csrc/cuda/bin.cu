@@ -15,29 +15,8 @@ constexpr int kThreads = 128;
 constexpr int kAlone = 64;  // tiles that a thread lists by itself; beyond that its warp helps
 
 template <class S>
-struct KeyOf;
-template <>
-struct KeyOf<float> {
-  using type = uint32_t;
-};
-template <>
-struct KeyOf<double> {
-  using type = uint64_t;
-};
-
-// Unsigned numbers in the order of the reals; the largest is no real's.
-template <class S>
-__device__ typename KeyOf<S>::type ordered(S z) {
-  using Key = typename KeyOf<S>::type;
-  constexpr Key top = Key(1) << (8 * sizeof(Key) - 1);
-  Key bits;
-  memcpy(&bits, &z, sizeof bits);
-  return bits & top ? ~bits : bits | top;
-}
-
-template <class S>
 struct CountSpace {
-  using Key = typename KeyOf<S>::type;
+  using Key = typename SortKey<S>::type;
   static constexpr int kBits = 8 * sizeof(Key);
   Key *keys, *sorted;
   int32_t *rows, *counts, *ranked;
@@ -85,7 +64,7 @@ __global__ void __launch_bounds__(kThreads)
   if (visible)
     for_tile_rows<Kernel>(geom + i * kGeom, width, height,
                           [&](int, int first, int last) { count += last - first + 1; });
-  w.keys[i] = visible ? ordered(geom[i * kGeom + kZ]) : ~typename KeyOf<S>::type(0);
+  w.keys[i] = visible ? sort_key(geom[i * kGeom + kZ]) : ~typename SortKey<S>::type(0);
   w.rows[i] = int32_t(i);
   w.counts[i] = int32_t(count);  // at most the tiles of an image
 }

@@ -5,10 +5,10 @@
 namespace bt::cuda {
 
 namespace {
-template <class S, bool kMaps>
+template <class S>
 struct Taken {
-  S weight, color[3], beta;
-  S depth, normal[3];  // with maps
+  S weight;
+  Blended<S> shown;
 };
 
 template <class S, bool kMaps>
@@ -19,26 +19,11 @@ __global__ void __launch_bounds__(kTileThreads)
   S sum[kChannels];
   for (int c = 0; c < kChannels; ++c) sum[c] = S(0);
   const auto load = [&](int64_t, int32_t id, bool mine, int64_t i) {
-    Taken<S, kMaps> t = {};
-    if (!mine) return t;
-    const S* g = geom + int64_t(id) * kGeom;
-    t.weight = f.weight[i], t.beta = g[kBeta];
-    for (int c = 0; c < 3; ++c) t.color[c] = colors[3 * i + c];
-    if (kMaps) {
-      t.depth = f.depth[i];
-      for (int c = 0; c < 3; ++c) t.normal[c] = g[kNx + c];
-    }
+    Taken<S> t = {};
+    if (mine) t = {f.weight[i], blended<kMaps>(geom + int64_t(id) * kGeom, colors + 3 * i, f.depth + i)};
     return t;
   };
-  const auto use = [&](const Taken<S, kMaps>& t) {
-    for (int c = 0; c < 3; ++c) sum[c] += t.weight * t.color[c];
-    sum[3] += t.weight;
-    sum[4] += t.weight * t.beta;
-    if (kMaps) {
-      sum[kChannels - 4] += t.weight * t.depth;
-      for (int c = 0; c < 3; ++c) sum[kChannels - 3 + c] += t.weight * t.normal[c];
-    }
-  };
+  const auto use = [&](const Taken<S>& t) { add_blended<kMaps>(t.weight, t.shown, sum); };
   walk<4, false>(p, s, load, use);
   if (s.x >= p.width || s.y >= p.height) return;
   S* to = image + (int64_t(s.y) * p.width + s.x) * kChannels;
@@ -55,20 +40,17 @@ __global__ void __launch_bounds__(kRunThreads)
   for (int c = 0; c < kSums; ++c) sums[c] = S(0);
   if (r.begin < r.end) {
     const S* g = geom + int64_t(p.surfel[r.k]) * kGeom;
-    const S beta = g[kBeta], nx = g[kNx], ny = g[kNy], nz = g[kNz];
     for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
       const S w = f.weight[i];
-      const S *d = dimage + int64_t(f.pixel[i]) * kChannels, *c = colors + 3 * i;
-      S gw = d[0] * c[0] + d[1] * c[1] + d[2] * c[2] + d[3] + d[4] * beta;
+      const S* d = dimage + int64_t(f.pixel[i]) * kChannels;
+      dweight[i] = weight_gradient<kMaps>(blended<kMaps>(g, colors + 3 * i, f.depth + i), d);
       for (int k = 0; k < 3; ++k) dcolors[3 * i + k] = w * d[k];
       sums[0] += w * d[4];
       if (kMaps) {
         const S* m = d + kChannels - 4;
-        gw += m[0] * f.depth[i] + m[1] * nx + m[2] * ny + m[3] * nz;
         ddepth[i] = w * m[0];
         for (int k = 1; k < kSums; ++k) sums[k] += w * m[k];
       }
-      dweight[i] = gw;
     }
   }
   const S sum = sum_over_run(sums, r.lane);

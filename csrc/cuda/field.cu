@@ -95,7 +95,7 @@ void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S*
     end_exact(exact, &field, 0, out.table, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
   } else {
     const auto kernel = field_backward_kernel<S, false>;
-    fill_zero(out.table, entries_of(field), stream);
+    fill_zero(out.table, field.table_size(), stream);
     BT_ALLOW_SHARED(kernel, shared);
     BT_LAUNCH(kernel, grid, block, shared, stream, n, field, x, drho, out.table, ExactSums(), work.mlp, dx);
   }

@@ -97,11 +97,7 @@ struct alignas(16) Entry {
 };
 template <class S>
 __device__ Entry<S> entry(const FieldArrays<S>& f, int level, uint32_t index) {
-  return reinterpret_cast<const Entry<S>*>(f.table)[(int64_t(level) << f.log2_size) + index];
-}
-template <class S>
-__device__ S resolution_of(const FieldArrays<S>& f, int level) {
-  return S(f.min_resolution << level);
+  return reinterpret_cast<const Entry<S>*>(f.table)[f.first_entry(level) + index];
 }
 template <class S>
 __device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec3<S> x) {
@@ -111,14 +107,14 @@ __device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec3<S> x) {
 // Interpolated features at a grid position; those of missing levels are 0.
 template <class S>
 __device__ void encode(const FieldArrays<S>& f, Vec3<S> c, S (&features)[kInputs]) {
-  const uint32_t mask = (1u << f.log2_size) - 1u;
+  const uint32_t mask = f.hash_mask();
   BT_UNROLL
   for (int l = 0; l < kMaxLevels; ++l) {
     BT_UNROLL
     for (int j = 0; j < kFeatures; ++j) features[l * kFeatures + j] = S(0);
     if (l >= f.levels) continue;
     Corners<S> at;
-    corners(c, resolution_of(f, l), mask, at);
+    corners(c, f.resolution(l), mask, at);
     BT_UNROLL
     for (int k = 0; k < 8; ++k) {
       const Entry<S> e = entry(f, l, at.index[k]);
@@ -201,18 +197,18 @@ __device__ uint64_t cell_of(Vec3<S> c, S resolution) {
 template <class S, bool kExact>
 __device__ void scatter(const FieldArrays<S>& f, Vec3<S> c, const S (&dfeatures)[kInputs], bool active, int lane,
                         const Adder<S, kExact>& table) {
-  const uint32_t mask = (1u << f.log2_size) - 1u;
+  const uint32_t mask = f.hash_mask();
   BT_UNROLL
   for (int l = 0; l < kMaxLevels; ++l) {
     if (l >= f.levels) continue;
     Corners<S> at;
-    corners(c, resolution_of(f, l), mask, at);
-    const S resolution = resolution_of(f, l);
+    corners(c, f.resolution(l), mask, at);
+    const S resolution = f.resolution(l);
     const unsigned run = run_of(active ? cell_of(c, resolution) : ~uint64_t(0), lane);
     const bool first = active && count_below(run, lane) == 0;
     const unsigned firsts = __ballot_sync(kFullMask, first), all = __ballot_sync(kFullMask, active);
     const bool together = 2 * __popc(firsts) <= __popc(all) && resolution <= S(1 << 21);
-    const int64_t level = int64_t(l) << f.log2_size;
+    const int64_t level = f.first_entry(l);
     BT_UNROLL
     for (int half = 0; half < 8; half += 4) {  // 16 numbers at a time: 32 would not fit in registers
       S value[4 * kFeatures];
@@ -230,13 +226,13 @@ __device__ void scatter(const FieldArrays<S>& f, Vec3<S> c, const S (&dfeatures)
 // d loss / d x from that of the features.
 template <class S>
 __device__ Vec3<S> position_gradient(const FieldArrays<S>& f, Vec3<S> x, Vec3<S> c, const S (&dfeatures)[kInputs]) {
-  const uint32_t mask = (1u << f.log2_size) - 1u;
+  const uint32_t mask = f.hash_mask();
   Vec3<S> dc = {S(0), S(0), S(0)};
   BT_UNROLL
   for (int l = 0; l < kMaxLevels; ++l) {
     if (l >= f.levels) continue;
     Corners<S> at;
-    corners(c, resolution_of(f, l), mask, at);
+    corners(c, f.resolution(l), mask, at);
     S d[8];
     BT_UNROLL
     for (int k = 0; k < 8; ++k) {
@@ -245,7 +241,7 @@ __device__ Vec3<S> position_gradient(const FieldArrays<S>& f, Vec3<S> x, Vec3<S>
       BT_UNROLL
       for (int j = 0; j < kFeatures; ++j) d[k] += dfeatures[l * kFeatures + j] * e.v[j];
     }
-    dc = dc + cell_gradient(at.fx, at.fy, at.fz, resolution_of(f, l), d);
+    dc = dc + cell_gradient(at.fx, at.fy, at.fz, f.resolution(l), d);
   }
   return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
 }
@@ -351,11 +347,5 @@ void end_exact(const ExactSums& exact, const FieldArrays<S>* field, int64_t surf
 // Adds up the blocks' sums of the weights' gradients.
 template <class S>
 void sum_weights(const S* partial, int blocks, int levels, const FieldGradients<S>& out, Stream stream);
-
-// Numbers in the table.
-template <class S>
-int64_t entries_of(const FieldArrays<S>& f) {
-  return (int64_t(f.levels) << f.log2_size) * kFeatures;
-}
 
 }  // namespace bt::cuda

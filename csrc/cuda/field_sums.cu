@@ -89,7 +89,7 @@ __global__ void range_kernel(FieldArrays<S> f, int64_t count, ExactRange* range)
       feature = max_(feature, d);
       level += d;
     }
-    steepest += double(f.min_resolution << l) * 2 * level * entry;  // of each coordinate: two faces of the cell
+    steepest += double(f.resolution(l)) * 2 * level * entry;  // of each coordinate: two faces of the cell
   }
   range->table = scale_for(feature, count);
   // three coordinates, the contraction's slope of at most 1 / half each, and |u|, |v| <= kSupport
@@ -112,7 +112,7 @@ void convert(int64_t n, const unsigned long long* from, const double* scale, S* 
 template <class S>
 ExactSums begin_exact(const FieldWork<S>& work, const FieldArrays<S>* field, int64_t surfels, bool frames,
                       int64_t count, const S* gradients, Stream stream) {
-  const int64_t entries = field ? entries_of(*field) : 0;
+  const int64_t entries = field ? field->table_size() : 0;
   ExactSums e;
   e.table = reinterpret_cast<unsigned long long*>(work.exact);
   e.range = reinterpret_cast<ExactRange*>(e.table + entries);
@@ -131,7 +131,7 @@ ExactSums begin_exact(const FieldWork<S>& work, const FieldArrays<S>* field, int
 template <class S>
 void end_exact(const ExactSums& exact, const FieldArrays<S>* field, int64_t surfels, S* dtable, S* dbase, S* dframes,
                Stream stream) {
-  if (dtable) convert(entries_of(*field), exact.table, &exact.range->table, dtable, stream);
+  if (dtable) convert(field->table_size(), exact.table, &exact.range->table, dtable, stream);
   if (dbase) convert(3 * surfels, exact.base, &exact.range->base, dbase, stream);
   if (dframes) convert(kFrame * surfels, exact.frames, &exact.range->frames, dframes, stream);
 }

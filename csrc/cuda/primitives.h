@@ -2,10 +2,32 @@
 #pragma once
 
 #include <cstdint>
+#include <cstring>
 
+#include "core/common.h"
 #include "cuda/device.h"
 
 namespace bt::cuda {
+
+// Unsigned integers in the order of the reals; the largest is no real's.
+template <class S>
+struct SortKey;
+template <>
+struct SortKey<float> {
+  using type = uint32_t;
+};
+template <>
+struct SortKey<double> {
+  using type = uint64_t;
+};
+template <class S>
+BT_HD typename SortKey<S>::type sort_key(S x) {
+  using Key = typename SortKey<S>::type;
+  constexpr Key top = Key(1) << (8 * sizeof(Key) - 1);
+  Key bits;
+  memcpy(&bits, &x, sizeof bits);
+  return bits & top ? ~bits : bits | top;
+}
 
 // Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint16_t, uint32_t or uint64_t; n below
 // 2^31.

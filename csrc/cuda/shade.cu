@@ -117,9 +117,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
       S g[kFrame] = {};
       if (active) {
         const S* frame = frames + int64_t(f.surfel[j]) * kFrame;
-        const S u = f.uv[j], v = f.uv[f.total + j];
-        out.uv[j] = dot(dx, load3(frame + 3)), out.uv[f.total + j] = dot(dx, load3(frame + 6));
-        store3(g, dx), store3(g + 3, u * dx), store3(g + 6, v * dx);
+        world_point_vjp(frame, f.uv[j], f.uv[f.total + j], dx, out.uv[j], out.uv[f.total + j], g);
       }
       add_to_rows(active ? f.surfel[j] : -1, lane, g, dframes);
     }
@@ -181,7 +179,7 @@ void shade_backward(int64_t n, const FragmentArrays<S>& f, S bound, const S* bas
   } else {
     fill_zero(dbase, 3 * n, stream);
     if (dframes) fill_zero(dframes, kFrame * n, stream);
-    if (learns) fill_zero(out.table, entries_of(arrays), stream);
+    if (learns) fill_zero(out.table, arrays.table_size(), stream);
     learns ? run(backward_kernel<S, false, true>, ExactSums()) : run(backward_kernel<S, false, false>, ExactSums());
   }
   if (learns) sum_weights(work.mlp, blocks, arrays.levels, *dfield, stream);

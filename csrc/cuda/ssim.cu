@@ -43,8 +43,7 @@ __global__ void __launch_bounds__(kThreads<S>)
     S m[5] = {};
     BT_UNROLL
     for (int t = 0; t < kTaps; ++t) {
-      const S p = s.image[0][y][x + t], q = s.image[1][y][x + t], kp = window.k[t] * p, kq = window.k[t] * q;
-      m[0] += kp, m[1] += kq, m[2] += kp * p, m[3] += kq * q, m[4] += kp * q;
+      add_moments(window.k[t], s.image[0][y][x + t], s.image[1][y][x + t], m);
     }
     BT_UNROLL
     for (int j = 0; j < 5; ++j) s.row[j][y][x] = m[j];
@@ -147,7 +146,7 @@ __global__ void __launch_bounds__(kThreads<S>)
   for (int i = 0; i < kRows; ++i) {
     if (x0 + x >= width || y0 + y + i >= height) continue;
     const int64_t at = (int64_t(y0 + y + i) * width + x0 + x) * channels + channel;
-    da[at] = m[0][i] + S(2) * a[at] * m[1][i] + b[at] * m[2][i];
+    da[at] = ssim_pixel_gradient(a[at], b[at], m[0][i], m[1][i], m[2][i]);
   }
 }
 }  // namespace

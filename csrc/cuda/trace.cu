@@ -25,12 +25,6 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// `blur` is the same for a whole warp
-template <class Kernel, class S>
-__device__ Fragment<S> fragment_at(const S* g, S near, S dx, S dy, bool blur) {
-  return blur ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy);
-}
-
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
@@ -64,10 +58,10 @@ __global__ void __launch_bounds__(kTileThreads)
       const S dx = x - g[kCx], dy = y - g[kCy];
       // a cheap look first: does any open pixel lie in the support or near the centre?
       const bool close = near_centre(dx, dy);
-      const bool reached = filtered<Kernel>(g) ? filtered_place<S, S>(g, dx, dy).q < S(kSupport * kSupport)
-                                               : close || within(planes<S, S>(g, dx, dy), S(kSupport * kSupport));
+      const bool reached = filtered<Kernel>(g) ? in_support(filtered_place<S, S>(g, dx, dy))
+                                               : close || in_support(planes<S, S>(g, dx, dy));
       if (!__any_sync(kFullMask, open && reached)) continue;
-      const S sigma = fragment_at<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
+      const S sigma = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
       const S behind = blend(sigma, transmittance).behind;
       const Verdict<S> v = judge(open, sigma, behind, S(kTransmittanceMin));
       open = open && !v.ends;
@@ -106,7 +100,7 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
     S g[kGeom];
     load_shape(geom + int64_t(id) * kGeom, g);
     const S dx = x - g[kCx], dy = y - g[kCy];
-    const Fragment<S> f = fragment_at<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+    const Fragment<S> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
     if (mine) {
       const Blend<S> b = blend(f.sigma, transmittance);
       transmittance = b.behind;
@@ -114,7 +108,7 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
       out.weight[i] = b.weight;
       out.uv[i] = f.u, out.uv[out.total + i] = f.v;
       out.depth[i] = f.depth;
-      out.sigma[i] = f.low_pass > S(0) ? -f.sigma : f.sigma;
+      out.sigma[i] = listed_sigma(f);
     }
     return 0;
   };

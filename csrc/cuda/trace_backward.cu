@@ -29,8 +29,7 @@ __global__ void __launch_bounds__(kTileThreads)
   };
   const auto use = [&](const Step<S>& t) {
     if (!t.mine) return;
-    const S sigma = t.sigma < S(0) ? -t.sigma : t.sigma;
-    dsigma[t.i] = blend_vjp(t.weight, sigma, t.dweight, later);
+    dsigma[t.i] = blend_vjp(t.weight, abs_(t.sigma), t.dweight, later);
   };
   walk<4, true>(p, s, load, use);
 }
@@ -49,9 +48,9 @@ __global__ void __launch_bounds__(kRunThreads)
       const int32_t y = f.pixel[i] / p.width, x = f.pixel[i] - y * p.width;
       S ddx, ddy;
       fragment_vjp<Kernel, S, S>(g, near, rim, pixel_centre<S>(x) - g[kCx], pixel_centre<S>(y) - g[kCy],
-                                 f.sigma[i] < S(0) ? S(1) : S(0), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0),
+                                 low_pass_of(f.sigma[i]), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0),
                                  duv ? duv[f.total + i] : S(0), ddepth ? ddepth[i] : S(0), d, ddx, ddy);
-      ax += ddx < S(0) ? -ddx : ddx, ay += ddy < S(0) ? -ddy : ddy;
+      ax += abs_(ddx), ay += abs_(ddy);
     }
     d[kShape] = ax, d[kShape + 1] = ay;
   }

@@ -57,17 +57,14 @@ __global__ void __launch_bounds__(kThreads)
 // Calls f<kind, terms> with the sizes of the presets, which the compiler unrolls, or with 0 for any other.
 template <class F>
 void dispatch(int kind, int terms, F&& f) {
-  const auto is = [&](int k, int t) { return kind == k && terms == t; };
   using std::integral_constant;
 #define BT_CASE(k, t) f(integral_constant<int, k>(), integral_constant<int, t>())
-  if (is(kSv, 7)) return BT_CASE(kSv, 7);
-  if (is(kSh, 16)) return BT_CASE(kSh, 16);
-  if (is(kSb, 2)) return BT_CASE(kSb, 2);
-  if (is(kSg, 2)) return BT_CASE(kSg, 2);
-  if (kind == kSv) return BT_CASE(kSv, 0);
-  if (kind == kSh) return BT_CASE(kSh, 0);
-  if (kind == kSb) return BT_CASE(kSb, 0);
-  return BT_CASE(kSg, 0);
+#define BT_KIND(k) return terms == preset_terms(k) ? BT_CASE(k, preset_terms(k)) : BT_CASE(k, 0)
+  if (kind == kSv) BT_KIND(kSv);
+  if (kind == kSh) BT_KIND(kSh);
+  if (kind == kSb) BT_KIND(kSb);
+  BT_KIND(kSg);
+#undef BT_KIND
 #undef BT_CASE
 }
 }  // namespace

@@ -1,11 +1,13 @@
 #!/usr/bin/env python
-"""Runs tests with the sanitized build of the CPU kernels: scripts/sanitize.py BUILD_FOLDER TEST...
+"""Runs tests with a build of the CPU kernels other than the installed one: scripts/test_build.py BUILD_FOLDER TEST...
 
-The sanitizers' libraries have to be in the process before Python is, so this starts itself again with them.
+The build may be by another compiler, for another CPU, or with the sanitizers (`--sanitizers`), whose libraries have to
+be in the process before Python is: then this starts itself again with them.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import os
 import subprocess
@@ -32,8 +34,12 @@ def preload() -> str:
 
 def main() -> int:
     """Command line."""
-    build, *tests = sys.argv[1:]
-    if "BITYMI_SANITIZED" not in os.environ:
+    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
+    parser.add_argument("build", type=Path, help="CMake's folder")
+    parser.add_argument("tests", nargs="+", help="what pytest is to run")
+    parser.add_argument("--sanitizers", action="store_true", help="the build has them")
+    options = parser.parse_args()
+    if options.sanitizers and "BITYMI_SANITIZED" not in os.environ:
         environment = {
             **os.environ,
             "BITYMI_SANITIZED": "1",
@@ -43,13 +49,13 @@ def main() -> int:
             "UBSAN_OPTIONS": "print_stacktrace=1",
         }
         return subprocess.run([sys.executable, *sys.argv], env=environment, check=False).returncode
-    (module,) = Path(build).resolve().glob("_cpu*.so")
+    (module,) = options.build.resolve().glob("_cpu.*so")
     spec = importlib.util.spec_from_file_location("bitymi_ns._cpu", module)
     assert spec is not None and spec.loader is not None
     compiled = importlib.util.module_from_spec(spec)
     sys.modules["bitymi_ns._cpu"] = compiled
     spec.loader.exec_module(compiled)
-    # The CUDA kernels on the host are not built with the sanitizers, and their fibers confuse them: left out.
+    # The CUDA kernels on the host belong to the installed build, and their fibers confuse the sanitizers: left out.
     for name in ("bitymi_ns._emulated", "bitymi_ns._cuda"):
         sys.modules[name] = None  # type: ignore[assignment]
 
@@ -57,9 +63,11 @@ def main() -> int:
 
     from bitymi_ns import _cpu
 
-    assert Path(_cpu.__file__) == module, f"{_cpu.__file__} is used instead of the sanitized module"
-    # uncaptured: a finding ends the process and would take its report along
-    return pytest.main(["-q", "-x", "-s", "-p", "no:cacheprovider", *tests])
+    assert Path(_cpu.__file__) == module, f"{_cpu.__file__} is used instead of {module}"
+    print(f"{module}: {_cpu.CPU_FEATURES or 'no extensions of the instruction set'}", flush=True)
+    # uncaptured: a finding of the sanitizers ends the process and would take its report along
+    uncaptured = ["-x", "-s"] if options.sanitizers else []
+    return pytest.main(["-q", *uncaptured, "-p", "no:cacheprovider", *options.tests])
 
 
 if __name__ == "__main__":

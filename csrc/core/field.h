@@ -1,4 +1,5 @@
-// The residual colour field rho(x): contraction of space, multiresolution hash encoding and a small MLP, eq. (color).
+// The residual colour field rho(x): contraction of space, multiresolution hash encoding (Instant NGP,
+// Müller et al. 2022) and a small MLP, eq. (color).
 #pragma once
 
 #include "core/common.h"
@@ -37,7 +38,8 @@ BT_HD uint32_t to_index(float x) { return uint32_t(int32_t(x)); }
 BT_HD uint32_t to_index(double x) { return uint32_t(int32_t(x)); }
 
 // Grid coordinate in [0, 1]^3 of a world position. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
-// (mip-NeRF 360) and the ball of radius 2 fills the cube; without it the cube of half edge `half` does, clamped.
+// (mip-NeRF 360, Barron et al. 2022) and the ball of radius 2 fills the cube; without it the cube of half edge `half`
+// does, clamped.
 template <class S, class T>
 BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
   const T k = T(S(1) / half), one = T(S(1)), zero = T(S(0));

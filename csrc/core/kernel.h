@@ -1,6 +1,6 @@
-// Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel) with a
-// screen-space low pass, sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel, of which
-// core/prefilter.h has the formulas.
+// Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel)
+// (Deformable Beta Splatting, Liu et al. 2025) with a screen-space low pass, as 2D Gaussian Splatting has one, sigma =
+// min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel, of which core/prefilter.h has the formulas.
 #pragma once
 
 #include "core/blend.h"

@@ -1,5 +1,6 @@
 // The Beta kernel seen through a pixel: a prefilter that keeps the total, the centre and the second moments of what a
-// surfel covers, however small or thin it is (docs/numerics.md derives it).
+// surfel covers, however small or thin it is, in the manner of EWA splatting (Zwicker et al. 2002; docs/numerics.md
+// derives it).
 //
 // Sigma = n^2 [[u2^2 + v2^2, -(u1 u2 + v1 v2)], [., u1^2 + v1^2]] is the projected scale ellipse in pixels^2, omega =
 // W / w0 the perspective at the pixel, c = kPixelVariance 2 (beta + 2) / 9 the blur. Then

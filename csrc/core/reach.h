@@ -1,5 +1,5 @@
-// Which pixels a surfel can touch, like bounds.h, but in the reals of the fragments: for devices on which doubles are
-// slow. It solves the three planes of surfel.h for the pixel instead of forming a conic:
+// Which pixels a surfel can touch, like bounds.h, but in the reals of the fragments: for the baked renderer on devices
+// on which doubles are slow. It solves the three planes of surfel.h for the pixel instead of forming a conic:
 //
 //   dx = X.q / (1 + C.q),  dy = Y.q / (1 + C.q)   with q = (u, v) / r on the unit disc,
 //
@@ -31,23 +31,16 @@ BT_HD LevelSet<S> level_set(const S* g) {
   // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x),
   // (1 - x)^beta >= exp(-d^2) holds out to d^2 = ln 255 where k >= beta + ln 255.
   const S reach = S(kLowPassReach);
-  const S w1 = g[kW1] < S(0) ? -g[kW1] : g[kW1], w2 = g[kW2] < S(0) ? -g[kW2] : g[kW2];
-  const S least = g[kW0] - reach * (w1 + w2);
+  const S least = g[kW0] - reach * (abs_(g[kW1]) + abs_(g[kW2]));
   const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];
-  const bool covered =
-      least > S(0) && S(kSupport * kSupport) * least * least >= (g[kBeta] + reach * reach) * S(1.001) * slope;
+  const bool covered = least > S(0) && S(kSupport2) * least * least >= (g[kBeta] + reach * reach) * S(1.001) * slope;
   l.blur2 = covered ? S(0) : level;
   return l;
 }
 
 template <class S>
-struct Reach {
-  bool whole;                // the disc comes near the camera plane: anything on the screen
-  bool ellipse;              // false: the low pass alone
-  S xu, xv, yu, yv, cu, cv;  // X, Y, C
-  S x0, x1, y0, y1;          // box of the ellipse, offsets from the projected centre, pixels
-  S y_left, y_right;         // where its leftmost and its rightmost point lie
-  S blur;                    // radius of the low pass, pixels; -1 without
+struct Reach : Outline<S> {
+  S xu = S(0), xv = S(0), yu = S(0), yv = S(0), cu = S(0), cv = S(0);  // X, Y, C
 };
 
 // Box and outermost points from X, Y and C.
@@ -76,17 +69,12 @@ BT_HD void enclose(Reach<S>& e) {
 template <class S>
 BT_HD Reach<S> reach(const S* g, S r2, S blur2) {
   Reach<S> e;
-  e.whole = false, e.ellipse = false;
-  e.blur = blur2 > S(0) ? sqrt_(blur2) + S(0.01) : S(-1);
-  e.x0 = e.y0 = S(1), e.x1 = e.y1 = S(-1), e.y_left = e.y_right = S(0);
-  e.xu = e.xv = e.yu = e.yv = e.cu = e.cv = S(0);
+  if (blur2 > S(0)) e.blur = low_pass_radius(blur2);
   if (!(g[kW0] > S(0))) return e;  // seen exactly edge-on: no ray hits it
   e.ellipse = true;
-  const S a1 = g[kU1] < S(0) ? -g[kU1] : g[kU1], a2 = g[kU2] < S(0) ? -g[kU2] : g[kU2];
-  const S b1 = g[kV1] < S(0) ? -g[kV1] : g[kV1], b2 = g[kV2] < S(0) ? -g[kV2] : g[kV2];
-  const S mu = S(1) / max_(a1, a2), mv = S(1) / max_(b1, b2);
+  const S mu = S(1) / max_(abs_(g[kU1]), abs_(g[kU2])), mv = S(1) / max_(abs_(g[kV1]), abs_(g[kV2]));
   const S u1 = g[kU1] * mu, u2 = g[kU2] * mu, v1 = g[kV1] * mv, v2 = g[kV2] * mv;  // in [-1, 1]
-  const S det = u1 * v2 - u2 * v1, angle = det < S(0) ? -det : det;
+  const S det = u1 * v2 - u2 * v1, angle = abs_(det);
   const S inv = S(1) / det;
   const S r = sqrt_(r2) * (S(1.0001) + S(1e-6) / angle);
   const S ku = g[kW0] * mu * inv * r, kv = g[kW0] * mv * inv * r;
@@ -113,9 +101,7 @@ BT_HD FilteredReach<S> filtered_reach(const S* geom) {
   FilteredReach<S> f;
   f.visible = x.visible;
   Reach<S>& e = f.reach;
-  e.whole = x.visible && x.whole, e.ellipse = x.visible, e.blur = S(-1);
-  e.x0 = e.y0 = S(1), e.x1 = e.y1 = S(-1), e.y_left = e.y_right = S(0);
-  e.xu = e.xv = e.yu = e.yv = e.cu = e.cv = S(0);
+  e.whole = x.visible && x.whole, e.ellipse = x.visible;
   if (!x.visible || x.whole) return f;
   // d^T Q d <= r^2 is the disc's image under r L with L L^T = Q^-1
   const double r2 = -x.qf * 1.0003, inv = r2 / (x.qa * x.qc - x.qb * x.qb), top = x.qc * inv;
@@ -124,9 +110,9 @@ BT_HD FilteredReach<S> filtered_reach(const S* geom) {
   return f;
 }
 
-// Widens [x0, x1] by where the line y crosses the ellipse.
+// Adds where the line y crosses the ellipse.
 template <class S>
-BT_HD void widen_by_crossing(const Reach<S>& e, S y, S& x0, S& x1) {
+BT_HD void add_crossings(const Reach<S>& e, S y, Interval<S>& r) {
   const S mu = e.yu - y * e.cu, mv = e.yv - y * e.cv, mm = mu * mu + mv * mv;
   if (!(mm > S(0)) || !(y * y <= mm)) return;
   const S k = S(1) / mm, at = y * k, half = sqrt_(max_(S(1) - y * at, S(0)) * k);
@@ -134,7 +120,7 @@ BT_HD void widen_by_crossing(const Reach<S>& e, S y, S& x0, S& x1) {
     const S h = side ? half : -half;
     const S qu = at * mu - h * mv, qv = at * mv + h * mu;
     const S x = (e.xu * qu + e.xv * qv) / (S(1) + e.cu * qu + e.cv * qv);
-    x0 = min_(x0, x), x1 = max_(x1, x);
+    r.add(x, x);
   }
 }
 

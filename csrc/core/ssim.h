@@ -1,4 +1,5 @@
-// Structural similarity of one window from its moments, and the part of its gradient that all its pixels share.
+// Structural similarity (Wang et al. 2004) of one window from its moments, and the part of its gradient that all its
+// pixels share.
 #pragma once
 
 #include "core/common.h"

@@ -4,9 +4,9 @@
 // offset from the projected centre is (dx, dy) pixels, the ray meets the disc's plane at depth n.p / n.r, and
 //   u = U / W,  v = V / W,  W = n.r = n.p/z + n.x dx/fx + n.y dy/fy,
 //   U = -((p x b).x dx/fx + (p x b).y dy/fy) / s_u,   V = ((p x a).x dx/fx + (p x a).y dy/fy) / s_v.
-// This is the 2DGS homography's solution divided by fx fy s_u s_v. No coefficient is a difference of large numbers: the
-// principal point has cancelled, and n comes from the rotation and not from a determinant; float32 suffices. All are
-// multiplied by the sign of n.p, so that W > 0 means "in front".
+// This is the solution of the homography of 2D Gaussian Splatting (Huang et al. 2024) divided by fx fy s_u s_v. No
+// coefficient is a difference of large numbers: the principal point has cancelled, and n comes from the rotation and
+// not from a determinant; float32 suffices. All are multiplied by the sign of n.p, so that W > 0 means "in front".
 #pragma once
 
 #include "core/camera.h"

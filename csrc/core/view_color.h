@@ -1,6 +1,7 @@
-// View-dependent surfel colour f_view(d), without the offset 0.5: Spherical Voronoi (sv), spherical harmonics (sh),
-// Spherical Beta (sb) and spherical Gaussians (sg), each with its vector-Jacobian product. d is the unit vector from
-// the camera centre to the surfel, world frame.
+// View-dependent surfel colour f_view(d), without the offset 0.5: Spherical Voronoi (sv, Di Sario et al. 2025),
+// spherical harmonics (sh, as in 3D Gaussian Splatting, Kerbl et al. 2023), Spherical Beta (sb, Deformable Beta
+// Splatting, Liu et al. 2025) and spherical Gaussians (sg), each with its vector-Jacobian product. d is the unit vector
+// from the camera centre to the surfel, world frame.
 #pragma once
 
 #include "core/common.h"

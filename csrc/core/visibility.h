@@ -17,16 +17,17 @@ BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
 // Rows of surfel i in geom, frames and radii (half extents of the level set's box in pixels); all 0 where the camera
 // does not see it. False when that is because a parameter is not finite.
 template <class Kernel, class S>
-BT_HD bool see(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near, S* geom,
-               S* frames, S* radii) {
+BT_HD bool project_visible(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near,
+                           S* geom, S* frames, S* radii) {
   S g[kGeom], f[kFrame], r[2] = {S(0), S(0)};
   const bool projected = project<Kernel>(cam, in, i, near, g, f);
   bool seen = projected;
   if (projected) {
     const Extent e = extent<Kernel>(g);
-    seen = e.visible && g[kCx] + e.x1 >= 0 && g[kCx] + e.x0 <= width && g[kCy] + e.y1 >= 0 && g[kCy] + e.y0 <= height;
+    const Interval<double> x = columns_of(e), y = rows_of(e);
+    seen = e.visible && g[kCx] + x.x1 >= 0 && g[kCx] + x.x0 <= width && g[kCy] + y.x1 >= 0 && g[kCy] + y.x0 <= height;
     const double most = 1e6;
-    if (seen) r[0] = S(min_(most, max_(e.x1, -e.x0))), r[1] = S(min_(most, max_(e.y1, -e.y0)));
+    if (seen) r[0] = S(min_(most, max_(x.x1, -x.x0))), r[1] = S(min_(most, max_(y.x1, -y.x0)));
   }
   for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = seen ? g[k] : S(0);
   for (int k = 0; k < kFrame; ++k) frames[i * kFrame + k] = seen ? f[k] : S(0);

@@ -28,7 +28,7 @@ int64_t project_forward(bool through_pixel, const Pinhole<S>& cam, int width, in
   with_kernel(through_pixel, [&](auto kernel) {
     parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i)
-        broken[thread] += !see<decltype(kernel)>(cam, width, height, in, i, near, geom, frames, radii);
+        broken[thread] += !project_visible<decltype(kernel)>(cam, width, height, in, i, near, geom, frames, radii);
     });
   });
   return std::accumulate(broken.begin(), broken.end(), int64_t(0));

@@ -86,9 +86,10 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
       area = footprint<Kernel>(row, v.height);
       const Reach<float>& e = area.reach;
-      const float x0 = e.ellipse ? min_(e.x0, -e.blur) - area.pad : -e.blur;
-      const float x1 = e.ellipse ? max_(e.x1, e.blur) + area.pad : e.blur;
-      seen = level.visible && area.top <= area.bottom && (e.whole || (area.cx + x1 >= 0 && area.cx + x0 <= v.width));
+      const Interval<float> x = columns_of(e);
+      const float pad = e.ellipse ? area.pad : 0;
+      seen = level.visible && area.top <= area.bottom &&
+             (e.whole || (area.cx + x.x1 + pad >= 0 && area.cx + x.x0 - pad <= v.width));
       z = geom[kZ];
     }
     if (seen) {

@@ -51,14 +51,14 @@ struct Row {
 // that it filters alone.
 template <bool kMaps, class Kernel, bool kBlur>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel& p) {
-  bool near_it = p.transmittance > 0;
+  bool reached = p.transmittance > 0;
   if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
     const Planes<float> at = planes(s.g, dx, dy);
     bool inside = within(at, s.r2) && at.W > 0;
     if (kBlur) inside = inside || dx * dx + dy * dy < s.blur2;
-    near_it = near_it && inside;
+    reached = reached && inside;
   }
-  if (!near_it) return;
+  if (!reached) return;
   const Fragment<Fast> f = fragment<Kernel, kBlur>(s.g, a.near, Fast(dx), Fast(dy));
   const float sigma = f.sigma.v;
   const auto [weight, behind] = bt::blend(sigma, p.transmittance);

@@ -80,14 +80,13 @@ BT_HD Footprint footprint(const float* row, int height) {
     f.reach = reach(row, row[kR2], row[kBlur2]);
   }
   f.cx = row[kCx], f.cy = row[kCy];
-  const float far = (f.cx < 0 ? -f.cx : f.cx) + (f.cy < 0 ? -f.cy : f.cy);
-  f.pad = 0.01f + 1e-6f * far;
+  f.pad = float(kBoundPad) + 1e-6f * (abs_(f.cx) + abs_(f.cy));
   const Reach<float>& e = f.reach;
-  float y0 = 1, y1 = -1;
-  if (e.ellipse) y0 = e.y0 - f.pad, y1 = e.y1 + f.pad;
-  if (e.blur > 0) y0 = e.ellipse ? min_(y0, -e.blur) : -e.blur, y1 = e.ellipse ? max_(y1, e.blur) : e.blur;
-  const int first = e.whole ? 0 : pixel_from(f.cy + y0, height),
-            last = e.whole ? height - 1 : pixel_to(f.cy + y1, height);
+  Interval<float> y;
+  if (e.ellipse) y.add(e.y0 - f.pad, e.y1 + f.pad);
+  if (e.blur > 0) y.add(-e.blur, e.blur);
+  const int first = e.whole ? 0 : pixel_from(f.cy + y.x0, height),
+            last = e.whole ? height - 1 : pixel_to(f.cy + y.x1, height);
   f.top = first / kTile, f.bottom = last / kTile;
   if (first > last) f.top = 0, f.bottom = -1;
   return f;
@@ -102,27 +101,24 @@ BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
   TileRow r;
   const Reach<float>& e = f.reach;
   int from = width, to = -1;
-  float upper0 = 1e30f, upper1 = -1e30f;  // crossings with the line above a band; below it those of the next
-  if (e.ellipse && !e.whole) widen_by_crossing(e, ty * kTile - f.cy, upper0, upper1);
+  Interval<float> upper;  // crossings with the line above a band; below it those of the next
+  if (e.ellipse && !e.whole) add_crossings(e, ty * kTile - f.cy, upper);
   for (int band = 0; band < kBands; ++band) {
     const float lo = ty * kTile + band * kBandRows - f.cy, hi = lo + kBandRows;
-    float x0 = 1e30f, x1 = -1e30f;
+    Interval<float> x;
     if (e.whole) {
-      x0 = -1e30f, x1 = 1e30f;
+      x.add(-1e30f, 1e30f);
     } else if (e.ellipse) {
-      float lower0 = 1e30f, lower1 = -1e30f;
-      widen_by_crossing(e, hi, lower0, lower1);
-      x0 = min_(upper0, lower0), x1 = max_(upper1, lower1);
-      upper0 = lower0, upper1 = lower1;
-      // the outermost points count when they lie in the band, generously
-      const float slack = f.pad + 1e-3f * (e.y1 - e.y0);
-      if (e.y_left >= lo - slack && e.y_left <= hi + slack) x0 = min_(x0, e.x0), x1 = max_(x1, e.x0);
-      if (e.y_right >= lo - slack && e.y_right <= hi + slack) x0 = min_(x0, e.x1), x1 = max_(x1, e.x1);
-      x0 -= f.pad, x1 += f.pad;
+      Interval<float> lower;
+      add_crossings(e, hi, lower);
+      x.add(min_(upper.x0, lower.x0), max_(upper.x1, lower.x1));
+      upper = lower;
+      add_outermost(e, lo, hi, f.pad + float(kBoundSlack) * (e.y1 - e.y0), x);
+      x.x0 -= f.pad, x.x1 += f.pad;
     }
-    if (!e.whole && e.blur > 0 && hi >= -e.blur && lo <= e.blur) x0 = min_(x0, -e.blur), x1 = max_(x1, e.blur);
-    r.from[band] = x0 > x1 ? width : pixel_from(f.cx + x0, width);
-    r.to[band] = x0 > x1 ? -1 : pixel_to(f.cx + x1, width);
+    if (!e.whole) add_low_pass(e, lo, hi, x);
+    r.from[band] = x.empty() ? width : pixel_from(f.cx + x.x0, width);
+    r.to[band] = x.empty() ? -1 : pixel_to(f.cx + x.x1, width);
     if (r.from[band] <= r.to[band]) from = min_(from, r.from[band]), to = max_(to, r.to[band]);
   }
   r.left = from / kTile, r.right = to / kTile;

@@ -14,7 +14,7 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.n) return;
   const Pinhole<S> cam = pinhole(viewmat, K);
-  if (!see<Kernel>(cam, width, height, in, i, near, geom, frames, radii)) atomicAdd(broken, 1);
+  if (!project_visible<Kernel>(cam, width, height, in, i, near, geom, frames, radii)) atomicAdd(broken, 1);
 }
 
 template <class S>

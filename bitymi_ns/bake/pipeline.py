@@ -142,7 +142,7 @@ def bake(
     drawable = surfels
     transmittance = views = None
     if cameras and options.looks_at_views:
-        views = visibility(surfels, cameras, near, prefilter, progress)
+        views = visibility(surfels, cameras, near, getattr(scene.config, "through_pixel", False), progress)
         if options.drop_unseen:
             seen = views.transmittance > 0
             left_out["unseen"] = int((~seen).sum())

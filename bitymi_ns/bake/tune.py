@@ -145,7 +145,7 @@ class TexelScene:
         scene, camera = self._baked.scene, view.camera.to("cpu")
         p = scene.surfels
         geometry = (p[name] for name in GEOMETRY)
-        projection = project(*geometry, camera, scene.near, scene.prefilter == "pixel")
+        projection = project(*geometry, camera, scene.near, scene.through_pixel)
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
         drawn: list[Tensor] = []
 

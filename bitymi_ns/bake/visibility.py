@@ -41,7 +41,7 @@ def visibility(
     surfels: Mapping[str, Tensor],
     cameras: Sequence[Camera],
     near: float,
-    prefilter: str = "low_pass",
+    through_pixel: bool = False,
     progress: Progress = no_progress,
 ) -> Visibility:
     """Which views see every surfel, and through what.
@@ -50,7 +50,7 @@ def visibility(
         surfels: the per-surfel parameters of docs/architecture.md, N rows, all of them finite and drawable.
         cameras: the views.
         near: nearest drawn depth.
-        prefilter: as the scene is drawn, low_pass or pixel.
+        through_pixel: how the scene is drawn, see `ops.project`.
         progress: called after every view.
     """
     means = surfels["means"]
@@ -58,7 +58,7 @@ def visibility(
     largest = means.new_zeros(len(means))
     seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        projection = project(means, *geometry, camera.to(means.device), near, prefilter == "pixel")
+        projection = project(means, *geometry, camera.to(means.device), near, through_pixel)
         for fragments in fitting_lists(projection):
             in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
             rows = fragments.surfel.long()

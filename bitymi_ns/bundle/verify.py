@@ -85,7 +85,7 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
     near, weight_bound = render.near, render.weight_bound
     transmittance = None
     if cameras and options.looks_at_views:
-        transmittance = visibility(bundle.scene.surfels, cameras, near, render.prefilter).in_front
+        transmittance = visibility(bundle.scene.surfels, cameras, near, bundle.scene.through_pixel).in_front
     plan = make_plan(bundle.scene.surfels, field, options, cameras, transmittance, near, weight_bound)
     tiled = bundle.scene.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
@@ -122,7 +122,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     means, render = bundle.scene.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
-        views = visibility(trained, cameras, render.near, render.prefilter)
+        views = visibility(trained, cameras, render.near, bundle.scene.through_pixel)
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)

@@ -46,7 +46,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     for i in range(min(COUNTED_VIEWS, len(cameras))):
         camera = cameras[i * len(cameras) // min(COUNTED_VIEWS, len(cameras))]
         geometry = (p[name] for name in GEOMETRY)
-        most = max(most, count(project(*geometry, camera, scene.near, scene.config.prefilter == "pixel")))
+        most = max(most, count(project(*geometry, camera, scene.near, scene.config.through_pixel)))
     return min(int(MARGIN * most), bound or MOST)
 
 

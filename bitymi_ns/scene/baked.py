@@ -115,9 +115,14 @@ class BakedScene:
             self.mean_residual,
             self.near,
             self.weight_bound,
-            self.prefilter == "pixel",
+            self.through_pixel,
             self.transmittance_min,
         )
+
+    @property
+    def through_pixel(self) -> bool:
+        """Whether the kernel is seen through a pixel."""
+        return self.prefilter == "pixel"
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -146,7 +151,7 @@ class BakedScene:
         p = self.surfels
         means = p["means"]
         geometry = (means, p["quats"], p["log_scales"], p["opacity_logits"], p["beta_raw"])
-        projection = project(*geometry, camera, self.near, self.prefilter == "pixel")
+        projection = project(*geometry, camera, self.near, self.through_pixel)
         base = view_color(self.view_color, p, means, camera.exact_center, projection.visible)
         is_bytes = self.atlas is not None and self.atlas.dtype == torch.uint8
         image, overdraw = baked_cpu.draw(

@@ -44,3 +44,8 @@ class SceneConfig:
     GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
+
+    @property
+    def through_pixel(self) -> bool:
+        """Whether the kernel is seen through a pixel: the choice of the kernels (csrc/core/surfel.h)."""
+        return self.prefilter == "pixel"

@@ -138,7 +138,7 @@ class Scene(nn.Module):
             TooManyFragments: a single row of tiles has too many.
         """
         p = self.surfels
-        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter == "pixel")
+        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.through_pixel)
         geometry, weights = None, ()
         if self.field is not None and field_mode != "off":
             geometry, weights = self.field.geometry, self.field.weights

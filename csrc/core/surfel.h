@@ -30,7 +30,7 @@ enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBe
 constexpr int kFrame = 9;
 
 // How a launch draws surfels, known when its code is compiled: united with the low pass (core/kernel.h), or seen
-// through a pixel (core/prefilter.h), where rows without kArea are as with the low pass. with_kernel is the one place
+// through a pixel (PixelKernel), where rows without kArea are as with the low pass. with_kernel is the one place
 // that chooses.
 struct LowPassKernel {
   static constexpr bool kPixel = false;

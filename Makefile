@@ -5,6 +5,8 @@
 #              and baking resume): make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"]
 #              [METHODS="bitymi bitymi-quality"] [PLANS="atlas overdraw"]
 # make sanitize  the kernels' tests under the address and undefined-behaviour sanitizers (minutes)
+# make clang-test  the same tests with the CPU kernels as Clang compiles them (CLANG=clang++)
+# make baseline-test  the same tests with the CPU kernels for any CPU of this kind: on x86-64 without AVX
 # make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
 # make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
 #              with the committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
@@ -21,6 +23,7 @@ SEEDS  ?=
 METHODS ?= bitymi bitymi-quality
 PLANS  ?= atlas overdraw
 WORK   ?= outputs/bench
+CLANG  ?= clang++
 TESTS  ?= tests/ops tests/stress tests/scene
 
 TORCH       := torch==2.13.0
@@ -34,7 +37,7 @@ CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test gate gate-accept wheel-test sanitize bench lint format clean
+.PHONY: setup demo test gate gate-accept wheel-test sanitize clang-test baseline-test bench lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -91,11 +94,24 @@ gate gate-accept: setup
 wheel-test: setup
 	$(BIN)/python scripts/wheel_test.py
 
+# A build of the CPU kernels in build/$(1) with CMake's options $(2), and their tests with it and the options $(3).
+define test_build
+$(BIN)/cmake -S . -B build/$(1) -G Ninja $(2) -DBITYMI_CUDA=OFF \
+  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja >/dev/null
+$(BIN)/cmake --build build/$(1)
+$(BIN)/python scripts/test_build.py $(3) build/$(1) $(TESTS)
+endef
+
 sanitize: setup
-	$(BIN)/cmake -S . -B build/sanitize -G Ninja -DBITYMI_SANITIZE=ON -DBITYMI_CUDA=OFF \
-	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja >/dev/null
-	$(BIN)/cmake --build build/sanitize
-	$(BIN)/python scripts/sanitize.py build/sanitize $(TESTS)
+	$(call test_build,sanitize,-DBITYMI_SANITIZE=ON,--sanitizers)
+
+clang-test: setup
+	@command -v $(CLANG) >/dev/null || { \
+	  echo "No '$(CLANG)' found (on Debian and Ubuntu: apt install clang libomp-dev). Another: make $@ CLANG=..." >&2; exit 1; }
+	$(call test_build,clang,-DCMAKE_CXX_COMPILER=$(CLANG),)
+
+baseline-test: setup
+	$(call test_build,baseline,-DBITYMI_MARCH=default,)
 
 $(WORK)/captures/demo/transforms.json: | setup
 	$(BIN)/bitymi sample --output-dir $(@D)

@@ -119,25 +119,32 @@ BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
-// Surfel i in the frame of a camera.
+// Surfel i in the world, its centre in the camera's frame.
 template <class S>
-struct Posed {
-  Rotation<S> rot;           // in the world
-  S su, sv;                  // scales
-  Vec3<S> p, a, b, n;        // centre, tangents, normal
-  S np, sign;                // n.p and its sign
-  S iz, ifx, ify, isu, isv;  // 1 / p.z, 1 / fx, ...
+struct Place {
+  Rotation<S> rot;
+  S su, sv;  // scales
+  Vec3<S> p;
 };
 template <class S>
-BT_HD Posed<S> pose(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i) {
-  Posed<S> s;
-  s.rot = rotation(in.quats + 4 * i);
-  s.su = surfel_scale(in.log_scales[2 * i]), s.sv = surfel_scale(in.log_scales[2 * i + 1]);
-  s.p = to_camera(cam, in.means + 3 * i);
-  s.a = rotate(cam.R, s.rot.tu), s.b = rotate(cam.R, s.rot.tv), s.n = rotate(cam.R, s.rot.n);
-  s.np = dot(s.n, s.p);
+BT_HD Place<S> place(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i) {
+  return {rotation(in.quats + 4 * i), surfel_scale(in.log_scales[2 * i]), surfel_scale(in.log_scales[2 * i + 1]),
+          to_camera(cam, in.means + 3 * i)};
+}
+// And what else a camera sees of it: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and
+// scales.
+template <class S>
+struct Pose {
+  Vec3<S> a, b, n;
+  S np, sign, iz, ifx, ify, isu, isv;
+};
+template <class S>
+BT_HD Pose<S> pose(const Pinhole<S>& cam, const Place<S>& at) {
+  Pose<S> s;
+  s.a = rotate(cam.R, at.rot.tu), s.b = rotate(cam.R, at.rot.tv), s.n = rotate(cam.R, at.rot.n);
+  s.np = dot(s.n, at.p);
   s.sign = s.np < S(0) ? S(-1) : S(1);
-  s.iz = S(1) / s.p.z, s.ifx = S(1) / cam.fx, s.ify = S(1) / cam.fy, s.isu = S(1) / s.su, s.isv = S(1) / s.sv;
+  s.iz = S(1) / at.p.z, s.ifx = S(1) / cam.fx, s.ify = S(1) / cam.fy, s.isu = S(1) / at.su, s.isv = S(1) / at.sv;
   return s;
 }
 
@@ -147,10 +154,12 @@ template <class Kernel, class S>
 BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, S* geom, S* frame) {
   const S* log_scales = in.log_scales + 2 * i;
   const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
-  const auto [rot, su, sv, p, a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, in, i);
+  const Place<S> at = place(cam, in, i);
+  const auto& [rot, su, sv, p] = at;
   if (!rot.ok || !finite_(p.x) || !finite_(p.y) || !finite_(p.z) || !(p.z > near)) return false;
   if (!finite_(log_scales[0]) || !finite_(log_scales[1])) return false;
   if (!finite_(opacity_logit) || !finite_(beta_raw)) return false;
+  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, at);
   const Vec3<S> pa = cross(p, a), pb = cross(p, b);
   S g[kGeom];
   g[kCx] = cam.fx * p.x * iz + cam.cx;
@@ -190,7 +199,9 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   const S none[kFrame] = {};
   if (!dframe) dframe = none;
   const S* log_scales = in.log_scales + 2 * i;
-  const auto [rot, su, sv, p, a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, in, i);
+  const Place<S> at = place(cam, in, i);
+  const auto& [rot, su, sv, p] = at;
+  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, at);
 
   const Vec3<S> dpb = {-sign * ifx * isu * dgeom[kU1], -sign * ify * isu * dgeom[kU2], S(0)};
   const Vec3<S> dpa = {sign * ifx * isv * dgeom[kV1], sign * ify * isv * dgeom[kV2], S(0)};

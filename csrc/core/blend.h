@@ -48,36 +48,23 @@ BT_HD S blend_vjp(S weight, S sigma, S dweight, S& later) {
   return dsigma;
 }
 
-// What is blended of a fragment: the sums of a pixel are over these times the weight, in this order with a 1 after the
-// colour; depth and normal in maps alone.
-template <class S>
-struct Blended {
-  Vec3<S> color;
-  S beta, depth;
-  Vec3<S> normal;
-};
+// Adds a fragment to the sums of its pixel; depth and normal with maps alone. By reference: each number is read where
+// it is needed.
 template <bool kMaps, class S>
-BT_HD Blended<S> blended(const S* g, const S* color, const S* depth) {
-  Blended<S> b = {};
-  b.color = load3(color), b.beta = g[kBeta];
-  if constexpr (kMaps) b.depth = *depth, b.normal = load3(g + kNx);
-  return b;
-}
-template <bool kMaps, class S>
-BT_HD void add_blended(S weight, const Blended<S>& b, S* sums) {
-  sums[0] += weight * b.color.x, sums[1] += weight * b.color.y, sums[2] += weight * b.color.z;
+BT_HD void add_blended(S weight, const S* color, const S& beta, const S& depth, const S* normal, S* sums) {
+  sums[0] += weight * color[0], sums[1] += weight * color[1], sums[2] += weight * color[2];
   sums[3] += weight;
-  sums[4] += weight * b.beta;
+  sums[4] += weight * beta;
   if constexpr (kMaps) {
-    sums[5] += weight * b.depth;
-    sums[6] += weight * b.normal.x, sums[7] += weight * b.normal.y, sums[8] += weight * b.normal.z;
+    sums[5] += weight * depth;
+    sums[6] += weight * normal[0], sums[7] += weight * normal[1], sums[8] += weight * normal[2];
   }
 }
 // dL/dweight from the gradient of the sums.
 template <bool kMaps, class S>
-BT_HD S weight_gradient(const Blended<S>& b, const S* d) {
-  S gradient = d[0] * b.color.x + d[1] * b.color.y + d[2] * b.color.z + d[3] + d[4] * b.beta;
-  if constexpr (kMaps) gradient += d[5] * b.depth + d[6] * b.normal.x + d[7] * b.normal.y + d[8] * b.normal.z;
+BT_HD S weight_gradient(const S* d, const S* color, const S& beta, const S& depth, const S* normal) {
+  S gradient = d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] + d[4] * beta;
+  if constexpr (kMaps) gradient += d[5] * depth + d[6] * normal[0] + d[7] * normal[1] + d[8] * normal[2];
   return gradient;
 }
 

@@ -12,8 +12,9 @@ void composite_forward(int64_t pixels, const S* geom, const int64_t* tile_start,
   std::fill(image, image + pixels * channels, S(0));
   parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     for (int64_t i = tile_start[first]; i < tile_start[last]; ++i) {
-      const auto b = blended<kMaps>(geom + int64_t(f.surfel[i]) * kGeom, colors + 3 * i, f.depth + i);
-      add_blended<kMaps>(f.weight[i], b, image + int64_t(f.pixel[i]) * channels);
+      const S* g = geom + int64_t(f.surfel[i]) * kGeom;
+      S* to = image + int64_t(f.pixel[i]) * channels;
+      add_blended<kMaps>(f.weight[i], colors + 3 * i, g[kBeta], f.depth[i], g + kNx, to);
     }
   });
 }
@@ -29,10 +30,10 @@ void composite_backward(int64_t n, const S* geom, const int64_t* tile_start, int
     sums.assign(n * kSums, S(0));
     for (int64_t i = tile_start[first]; i < tile_start[last]; ++i) {
       const S w = f.weight[i];
-      const auto b = blended<kMaps>(geom + int64_t(f.surfel[i]) * kGeom, colors + 3 * i, f.depth + i);
+      const S* g = geom + int64_t(f.surfel[i]) * kGeom;
       const S* d = dimage + int64_t(f.pixel[i]) * channels;
       S* to = sums.data() + int64_t(f.surfel[i]) * kSums;
-      dweight[i] = weight_gradient<kMaps>(b, d);
+      dweight[i] = weight_gradient<kMaps>(d, colors + 3 * i, g[kBeta], f.depth[i], g + kNx);
       dcolors[3 * i] = w * d[0], dcolors[3 * i + 1] = w * d[1], dcolors[3 * i + 2] = w * d[2];
       to[0] += w * d[4];
       if (kMaps) {

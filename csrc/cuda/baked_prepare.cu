@@ -15,23 +15,21 @@ constexpr int kThreads = 128;
 constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
 
 // The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
-template <int kKind>
-__device__ Vec3<float> view_color_of(const ViewColorArrays<const float>& p, int64_t i, Vec3<float> d) {
-  constexpr int kTerms = preset_terms(kKind);
-  return p.terms == kTerms ? view_color(kKind, kTerms, p, i, d) : view_color(kKind, p.terms, p, i, d);
-}
 __device__ Vec3<float> view_color_of(const BakedSurfels& s, int64_t i, Vec3<float> d) {
   if (s.lean.base) return view_color(s.lean, i, d);
-  const ViewColorArrays<const float> p = {s.kind, s.terms, s.a, s.b, s.c};
+  const int K = s.terms;
+  const ViewColorWidths w = view_color_widths(s.kind, K);
+  const float *a = s.a + w.a * i, *b = s.b + w.b * i;
   switch (s.kind) {
     case kSv:
-      return view_color_of<kSv>(p, i, d);
+      return K == preset_terms(kSv) ? sv_color(preset_terms(kSv), a, b, s.c + w.c * i, d)
+                                    : sv_color(K, a, b, s.c + w.c * i, d);
     case kSh:
-      return view_color_of<kSh>(p, i, d);
+      return K == preset_terms(kSh) ? sh_color(preset_terms(kSh), a, b, d) : sh_color(K, a, b, d);
     case kSb:
-      return view_color_of<kSb>(p, i, d);
+      return K == preset_terms(kSb) ? sb_color(preset_terms(kSb), a, b, d) : sb_color(K, a, b, d);
     default:
-      return view_color_of<kSg>(p, i, d);
+      return K == preset_terms(kSg) ? sg_color(preset_terms(kSg), a, b, d) : sg_color(K, a, b, d);
   }
 }
 

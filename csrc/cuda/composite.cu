@@ -7,8 +7,8 @@ namespace bt::cuda {
 namespace {
 template <class S>
 struct Taken {
-  S weight;
-  Blended<S> shown;
+  S weight, color[3], beta;
+  S depth, normal[3];  // with maps
 };
 
 template <class S, bool kMaps>
@@ -20,10 +20,17 @@ __global__ void __launch_bounds__(kTileThreads)
   for (int c = 0; c < kChannels; ++c) sum[c] = S(0);
   const auto load = [&](int64_t, int32_t id, bool mine, int64_t i) {
     Taken<S> t = {};
-    if (mine) t = {f.weight[i], blended<kMaps>(geom + int64_t(id) * kGeom, colors + 3 * i, f.depth + i)};
+    if (!mine) return t;
+    const S* g = geom + int64_t(id) * kGeom;
+    t.weight = f.weight[i], t.beta = g[kBeta];
+    for (int c = 0; c < 3; ++c) t.color[c] = colors[3 * i + c];
+    if (kMaps) {
+      t.depth = f.depth[i];
+      for (int c = 0; c < 3; ++c) t.normal[c] = g[kNx + c];
+    }
     return t;
   };
-  const auto use = [&](const Taken<S>& t) { add_blended<kMaps>(t.weight, t.shown, sum); };
+  const auto use = [&](const Taken<S>& t) { add_blended<kMaps>(t.weight, t.color, t.beta, t.depth, t.normal, sum); };
   walk<4, false>(p, s, load, use);
   if (s.x >= p.width || s.y >= p.height) return;
   S* to = image + (int64_t(s.y) * p.width + s.x) * kChannels;
@@ -40,10 +47,11 @@ __global__ void __launch_bounds__(kRunThreads)
   for (int c = 0; c < kSums; ++c) sums[c] = S(0);
   if (r.begin < r.end) {
     const S* g = geom + int64_t(p.surfel[r.k]) * kGeom;
+    const S beta = g[kBeta], normal[3] = {g[kNx], g[kNy], g[kNz]};
     for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
       const S w = f.weight[i];
       const S* d = dimage + int64_t(f.pixel[i]) * kChannels;
-      dweight[i] = weight_gradient<kMaps>(blended<kMaps>(g, colors + 3 * i, f.depth + i), d);
+      dweight[i] = weight_gradient<kMaps>(d, colors + 3 * i, beta, f.depth[i], normal);
       for (int k = 0; k < 3; ++k) dcolors[3 * i + k] = w * d[k];
       sums[0] += w * d[4];
       if (kMaps) {

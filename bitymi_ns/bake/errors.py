@@ -9,9 +9,19 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.evaluate import size_classes, texel_index
-from bitymi_ns.bake.plan import STEPS, Field, Plan, along_axes, interpolation, references, weighted_rms
+from bitymi_ns.bake.options import STEPS
+from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.bake.plan import Field, Plan
 from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.reference import references
+from bitymi_ns.bake.resample import read_at
+
+
+def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
+    """Root mean square of difference [n, 3, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n]."""
+    count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
+    square = (difference.square().sum(1) * weight.square()).flatten(1).sum(1)
+    return STEPS * (square / count).sqrt()
 
 
 @dataclass
@@ -71,7 +81,7 @@ def tile_errors(
             for r_u, r_v, at in size_classes(places[rows]):
                 index = texel_index(places[rows[at]], (r_u, r_v), residuals.shape[2], residuals.shape[1])
                 stored = flat[index].permute(0, 3, 1, 2).contiguous()
-                rebuilt[at] = along_axes(stored, interpolation(part.size[0], r_u), interpolation(part.size[1], r_v))
+                rebuilt[at] = read_at(stored, part.size)
         difference = rebuilt.to(part.values) - part.values
         rms[rows] = weighted_rms(difference, part.weight).cpu()
         weighted = STEPS * difference.abs().amax(1) * part.weight

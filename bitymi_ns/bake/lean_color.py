@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.limits import beyond
-from bitymi_ns.bake.plan import STEPS
+from bitymi_ns.bake.options import STEPS
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
 from bitymi_ns.ops import view_color

@@ -8,10 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.geometry import tangent_vectors
-from bitymi_ns.bake.plan import STEPS, SUPPORT, kernel_parameters
+from bitymi_ns.bake.options import STEPS
+from bitymi_ns.bake.plan import kernel_parameters
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field import field as evaluate
 from bitymi_ns.scene.field import HashField
+from bitymi_ns.train.rotations import tangents
 
 LEVEL_SHARE = 0.1
 """Levels are left out while they change the residual by no more than this share of the tolerance."""
@@ -46,7 +48,7 @@ def level_changes(
     """
     means = surfels["means"]
     opacity, beta = kernel_parameters(surfels, transmittance)
-    edges = tangent_vectors(surfels["quats"]) * surfels["log_scales"].exp()[:, None]
+    edges = tangents(surfels["quats"]) * surfels["log_scales"].exp()[:, None]
     g = torch.Generator().manual_seed(0)
     radius, angle = SUPPORT * torch.rand(POINTS, generator=g).sqrt(), 2 * torch.pi * torch.rand(POINTS, generator=g)
     uv = torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1).to(means)  # [P, 2]

@@ -13,16 +13,17 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.errors import tile_errors
-from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
 from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
 from bitymi_ns.bake.lean_field import lean_field
 from bitymi_ns.bake.limits import within
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
+from bitymi_ns.bake.pages import tile_means
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.reduce import reduce_tiles
+from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of

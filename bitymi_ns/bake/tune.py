@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.evaluate import size_classes, texel_index
+from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops import (

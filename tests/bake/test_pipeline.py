@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake, rich_progress
-from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.train.rotations import tangents
 
 
 def bilinear(bundle, surfel, u, v, extent=3.0):
@@ -27,7 +27,7 @@ def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format,
     export(bake(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     scales = bundle.scene.surfels["log_scales"].exp()
-    axes = tangent_vectors(bundle.scene.surfels["quats"]) * scales[:, None]
+    axes = tangents(bundle.scene.surfels["quats"]) * scales[:, None]
     errors = []
     for i in torch.nonzero(scales.amax(1) < 0.08).squeeze(1).tolist():
         uv = torch.rand(50, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2

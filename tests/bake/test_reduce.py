@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.geometry import tangent_vectors
-from bitymi_ns.bake.plan import fit, interpolation, kernel_parameters, make_plan, references, visible_extent
+from bitymi_ns.bake.plan import kernel_parameters, make_plan, visible_extent
+from bitymi_ns.bake.reference import references
+from bitymi_ns.bake.resample import fit, interpolation
 from bitymi_ns.ops.reference.texel import texel, texel_centers
+from bitymi_ns.train.rotations import tangents
 
 OPTIONS = BakeOptions(format="fp16")
 BOUND = 0.02
@@ -41,7 +43,7 @@ def discs(scene):
         made.surfels["opacity_logits"].fill_(2.0)
         made.surfels["beta_raw"].fill_(2.0)
         made.config.weight_bound = BOUND
-        return made, tangent_vectors(made.surfels["quats"])[0]
+        return made, tangents(made.surfels["quats"])[0]
 
     return make
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy.typing as npt
 import torch
@@ -15,6 +14,7 @@ from bitymi_ns.bake.plan import Field, Plan
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.reference import references
 from bitymi_ns.bake.resample import read_at
+from bitymi_ns.bake.statistics import Percentiles, TileError
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
@@ -38,15 +38,14 @@ class TileErrors:
     largest: Tensor
     shown: Tensor
 
-    def summary(self) -> dict[str, Any]:
-        """Percentiles over the surfels that get a residual at all, for bundle.json."""
-        result: dict[str, Any] = {"unit": "8-bit steps, weighted by the blending weight; stored atlas against field"}
-        for name, values in (("rms", self.rms), ("largest", self.largest)):
-            values = values[self.shown].double().sort().values if self.shown.any() else torch.zeros(1)
-            for percent in (50, 90, 99, 100):
-                at = round((len(values) - 1) * percent / 100)
-                result.setdefault(name, {})[f"p{percent}"] = round(float(values[at]), 4)
-        return result
+    def summary(self, tolerance: float) -> TileError:
+        """Percentiles over the surfels that get a residual at all, and the tolerance that was asked for."""
+        unit = "8-bit steps, weighted by the blending weight; stored atlas against field"
+        rms, largest = (
+            Percentiles.of(values[self.shown] if self.shown.any() else torch.zeros(1))
+            for values in (self.rms, self.largest)
+        )
+        return TileError(tolerance=tolerance, unit=unit, rms=rms, largest=largest)
 
 
 @torch.no_grad()

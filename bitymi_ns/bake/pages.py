@@ -43,11 +43,11 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
     return origin[:, None, None] + (j[:, None] * width + i[None, :])
 
 
-def tile_means(texels: Tensor, packing: Packing, chunk: int = 1 << 20) -> Tensor:
-    """Mean of every tile of `texels` [layers, height, width, 3]: [N, 3], 0 without a tile."""
+def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None, chunk: int = 1 << 20) -> Tensor:
+    """Mean of every tile of `texels` [layers, height, width, 3]: [N, 3]; `constant` [N, 3] or 0 without one."""
     tiles = torch.from_numpy(packing.tiles)
     flat = texels.reshape(-1, 3)
-    means = torch.zeros(len(tiles), 3)
+    means = torch.zeros(len(tiles), 3) if constant is None else constant.clone()
     for r_u, r_v, rows in size_classes(tiles):
         for part in rows.split(max(1, chunk // (r_u * r_v))):
             index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.resolution import max_projected_extent, nyquist_resolution, voxel_along_axes
+from bitymi_ns.bake.statistics import KeptTexels
 from bitymi_ns.ops.constants import ALPHA_MAX, BETA_MAX, SUPPORT
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.rotations import tangents
@@ -48,8 +49,7 @@ class Plan:
         probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
         limit: [N, 2] int32, the finest tile of use, at most `probes`.
         weight_bound: fragments of smaller weight get no residual.
-        texels: how many texels the rules before the tolerance give: nyquist, after_cap_by_views, and
-            within_visible_part, where tiles cover `extent` only.
+        texels: how many texels the rules before the tolerance give.
     """
 
     means: Tensor
@@ -60,7 +60,7 @@ class Plan:
     probes: Tensor
     limit: Tensor
     weight_bound: float
-    texels: dict[str, int] = field(default_factory=dict)
+    texels: KeptTexels
 
     def __len__(self) -> int:
         return len(self.means)
@@ -96,24 +96,26 @@ def make_plan(
     transmittance: Tensor | None = None,
     near: float = 0.2,
     weight_bound: float = 0.0,
+    whole: bool = False,
 ) -> Plan:
     """Extents and grids of all tiles.
 
     Args:
         surfels: per-surfel parameters, N rows, all finite and drawable.
         field: the residual field, for its voxel size.
-        options: sizes and tolerance; without a tolerance every tile has the extent of the options and is probed at the
-            texels of the rule.
+        options: sizes.
         cameras: training views, for the cap.
         transmittance: [N] of `Visibility`, None = 1.
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
+        whole: every tile has the extent of the options and is probed at the texels of the rule; else it covers what
+            reaches the weight bound and is probed at the Nyquist rate.
     """
     means, scales = surfels["means"], surfels["log_scales"].exp()
     axes = tangents(surfels["quats"])
     opacity, beta = kernel_parameters(surfels, transmittance)
     extent = torch.full_like(opacity, options.extent)
-    if options.tolerance > 0:
+    if not whole:
         extent = torch.minimum(extent, visible_extent(opacity, beta, weight_bound))
     voxel = torch.cat([field.voxel_size(part) for part in means.split(options.chunk)])
     delta = (
@@ -131,14 +133,13 @@ def make_plan(
 
     share = extent[:, None] / options.extent
     limit = grids(share, pixels)
-    probes = grids(share, None) if options.tolerance > 0 else limit
-    whole = torch.ones_like(share)
-    texels = {
-        "nyquist": grids(whole, None),
-        "after_cap_by_views": grids(whole, pixels),
-        "within_visible_part": limit,
-    }
-    counts = {name: int(sizes.long().prod(1).sum()) for name, sizes in texels.items()}
+    probes = limit if whole else grids(share, None)
+    full = torch.ones_like(share)
+    counts = KeptTexels(
+        nyquist=_texels(grids(full, None)),
+        after_cap_by_views=_texels(grids(full, pixels)),
+        within_visible_part=_texels(limit),
+    )
     edges = axes * scales[:, None, :]
     return Plan(means, edges, opacity, beta, extent, probes, limit, weight_bound, counts)
 
@@ -154,7 +155,12 @@ def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptio
     scales = surfels["log_scales"].exp()
     finest = torch.stack([field.voxel_size(part).amin() for part in surfels["means"].split(options.chunk)]).amin()
     sides = nyquist_resolution(scales, finest.expand(scales.shape), PAPER_EXTENT, options.r_min, options.r_max)
-    return int(sides.long().prod(1).sum())
+    return _texels(sides)
+
+
+def _texels(sizes: Tensor) -> int:
+    """Texels of all tiles of sizes [N, 2]."""
+    return int(sizes.long().prod(1).sum())
 
 
 def _center(field: Field) -> Tensor | None:

@@ -19,8 +19,8 @@ def test_levels_without_content_at_the_ends_are_left_out(surfels, empty, kept):
     for level in empty:
         scene.field.field_table.data[level] = 0
     field, found = lean_field(scene.field, scene.surfels, None, 0.0, 0.5)
-    assert tuple(found["kept"]) == kept and found["levels"] == 4 and found["change"] <= 1e-3
-    assert [change > 0.05 for change in found["change_of_each"]] == [level not in empty for level in range(4)]
+    assert found.kept == kept and found.levels == 4 and found.change <= 1e-3
+    assert [change > 0.05 for change in found.change_of_each] == [level not in empty for level in range(4)]
     x = 3 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(field(x), scene.field(x), rtol=1e-4, atol=1e-6)
     assert field.field_table.shape[0] == kept[1]  # the loads of a point: eight entries a level

@@ -118,6 +118,8 @@ class ExportAtlas(BakeOptions):
                 f"Fine-tuning has {self.finetune_steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
                 "for each: more may gain (--finetune-steps)."
             )
+        if finetunes and model.device.type != "cpu":
+            say("The texels are fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
             state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
         try:

@@ -223,6 +223,12 @@ def test_too_few_views_leave_the_atlas_alone(wrong: Baked, views: list[View]) ->
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
 
 
+def test_a_bake_on_another_device_is_refused_and_not_copied(wrong: Baked, views: list[View]) -> None:
+    moved = replace(wrong, scene=wrong.scene.to("meta"))
+    with pytest.raises(RuntimeError, match="the fine-tuning runs on the CPU only.*'meta': give it the bake as it was"):
+        tune_atlas(moved, views, BACKGROUND, OPTIONS)
+
+
 def test_a_scene_without_texture_is_refused(scene, views: list[View]) -> None:
     with pytest.raises(ValueError, match="without texture"):
         tune_atlas(bake(scene(20, field=None)), views, BACKGROUND)

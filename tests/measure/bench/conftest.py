@@ -40,11 +40,8 @@ if name == "ns-train":
 elif name == "ns-export":
     bundle = pathlib.Path(given("--output-dir"))
     bundle.mkdir(parents=True)
-    files = {{name: dict(bytes=size, sha256="0" * 64) for name, size in (("surfels.ply", 1000), ("atlas.ktx2", 5000))}}
-    atlas = dict(format=given("--format"), width=4, height=4, layers=1, offset=0, scale=1)
-    info = dict(format="bitymi-bundle", version="1.0", surfels=dict(count=100, view_color="sv"), render=dict(
-        near=0.2, weight_bound=0.02, background=[0, 0, 0]), world=dict(transform=[[1, 0, 0, 0]] * 3, scale=1),
-        bounds=dict(min=[0, 0, 0], max=[1, 1, 1]), files=files, atlas=atlas, statistics=dict(
+    files = dict(zip(["surfels.ply", "atlas.ktx2"], [dict(bytes=1000), dict(bytes=5000)]))
+    info = dict(files=files, atlas=dict(format=given("--format"), file="atlas.ktx2"), statistics=dict(
         surfels=dict(kept=100), texels=dict(nyquist=9999, after_cap_by_views=1600),
         held_out=dict(psnr_baked_against_neural=50.0)))
     (bundle / "bundle.json").write_text(json.dumps(info))

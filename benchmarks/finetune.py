@@ -14,7 +14,6 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")
 
@@ -56,7 +55,7 @@ def measure(run: Path, formats: list[str], bake_options: BakeOptions, tune_optio
     train, evaluation = data.train_views, data.eval_views
     plain = bake(model.scene, [view.camera for view in train], replace(bake_options, format="uint8"))
     tuned = tune_atlas(plain, train, background, tune_options)
-    cost: dict[str, Any] = tuned.statistics["finetune"]
+    cost = tuned.statistics.finetune
     rows = []
     for form in formats:
         options = replace(bake_options, format=form)  # type: ignore[arg-type]
@@ -66,8 +65,8 @@ def measure(run: Path, formats: list[str], bake_options: BakeOptions, tune_optio
         texels = int(plain.packing.tiles[:, 3].astype("int64") @ plain.packing.tiles[:, 4].astype("int64"))
         gain = difference(after["psnr"] - before["psnr"], 2)
         scene = run.resolve().parents[2].name
-        seconds = number(cost["cpu_seconds"], 0)
-        rows.append([scene, form, number(texels, 0), *figures, gain, str(cost["best_step"]), seconds])
+        seconds = number(cost.cpu_seconds, 0)
+        rows.append([scene, form, number(texels, 0), *figures, gain, str(cost.best_step), seconds])
         say(" ".join(rows[-1]))
     return rows
 

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.evaluate import size_classes, texel_index
-from bitymi_ns.bake.plan import STEPS, Field, Plan, along_axes, interpolation, references, weighted_rms
+from bitymi_ns.bake.options import STEPS
+from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.bake.plan import Field, Plan
 from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.reference import references
+from bitymi_ns.bake.resample import read_at
+from bitymi_ns.bake.statistics import Percentiles, TileError
+
+
+def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
+    """Root mean square of difference [n, 3, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n]."""
+    count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
+    square = (difference.square().sum(1) * weight.square()).flatten(1).sum(1)
+    return STEPS * (square / count).sqrt()
 
 
 @dataclass
@@ -28,15 +38,14 @@ class TileErrors:
     largest: Tensor
     shown: Tensor
 
-    def summary(self) -> dict[str, Any]:
-        """Percentiles over the surfels that get a residual at all, for bundle.json."""
-        result: dict[str, Any] = {"unit": "8-bit steps, weighted by the blending weight; stored atlas against field"}
-        for name, values in (("rms", self.rms), ("largest", self.largest)):
-            values = values[self.shown].double().sort().values if self.shown.any() else torch.zeros(1)
-            for percent in (50, 90, 99, 100):
-                at = round((len(values) - 1) * percent / 100)
-                result.setdefault(name, {})[f"p{percent}"] = round(float(values[at]), 4)
-        return result
+    def summary(self, tolerance: float) -> TileError:
+        """Percentiles over the surfels that get a residual at all, and the tolerance that was asked for."""
+        unit = "8-bit steps, weighted by the blending weight; stored atlas against field"
+        rms, largest = (
+            Percentiles.of(values[self.shown] if self.shown.any() else torch.zeros(1))
+            for values in (self.rms, self.largest)
+        )
+        return TileError(tolerance=tolerance, unit=unit, rms=rms, largest=largest)
 
 
 @torch.no_grad()
@@ -71,7 +80,7 @@ def tile_errors(
             for r_u, r_v, at in size_classes(places[rows]):
                 index = texel_index(places[rows[at]], (r_u, r_v), residuals.shape[2], residuals.shape[1])
                 stored = flat[index].permute(0, 3, 1, 2).contiguous()
-                rebuilt[at] = along_axes(stored, interpolation(part.size[0], r_u), interpolation(part.size[1], r_v))
+                rebuilt[at] = read_at(stored, part.size)
         difference = rebuilt.to(part.values) - part.values
         rms[rows] = weighted_rms(difference, part.weight).cpu()
         weighted = STEPS * difference.abs().amax(1) * part.weight

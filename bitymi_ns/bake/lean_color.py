@@ -12,8 +12,9 @@ from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.limits import beyond
-from bitymi_ns.bake.plan import STEPS
+from bitymi_ns.bake.options import STEPS
 from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
@@ -194,18 +195,20 @@ def view_color_errors(
     return error
 
 
-def describe(kind: str, surfels: Mapping[str, Tensor], lean: LeanColor, error: Tensor, tolerance: float) -> dict:
-    """What was left out and what it costs, for bundle.json."""
+def describe(
+    kind: str, surfels: Mapping[str, Tensor], lean: LeanColor, error: Tensor, tolerance: float
+) -> ViewColorError:
+    """What was left out and what it costs."""
     entry = VIEW_COLORS[kind]
     before = sum(each[0].numel() for each in entry.of(surfels)) if len(lean.base) else 0
     sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms
     after = 4 * (4 * len(lean.base) + lean.terms.numel())
-    ordered = error.double().sort().values
-    return {
-        "tolerance": tolerance,
-        "unit": "8-bit steps, largest over the directions and channels, weighted by the blending weight",
-        "sites": {"before": sites * len(lean.base), "after": len(lean.base) + len(lean.terms)},
-        "one_color": int((lean.span[:, 1] == 0).sum()),
-        "bytes": {"before": 4 * before * len(lean.base), "after": after},
-        "error": {f"p{p}": round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)},
-    }
+    return ViewColorError(
+        kind=kind,
+        tolerance=tolerance,
+        unit="8-bit steps, largest over the directions and channels, weighted by the blending weight",
+        sites=Kept(before=sites * len(lean.base), after=len(lean.base) + len(lean.terms)),
+        one_color=int((lean.span[:, 1] == 0).sum()),
+        bytes=Kept(before=4 * before * len(lean.base), after=after),
+        error=Percentiles.of(error),
+    )

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.geometry import tangent_vectors
-from bitymi_ns.bake.plan import STEPS, SUPPORT, kernel_parameters
+from bitymi_ns.bake.options import STEPS
+from bitymi_ns.bake.plan import kernel_parameters
+from bitymi_ns.bake.statistics import FieldLevels
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field import field as evaluate
 from bitymi_ns.scene.field import HashField
+from bitymi_ns.train.rotations import tangents
 
 LEVEL_SHARE = 0.1
 """Levels are left out while they change the residual by no more than this share of the tolerance."""
@@ -46,7 +48,7 @@ def level_changes(
     """
     means = surfels["means"]
     opacity, beta = kernel_parameters(surfels, transmittance)
-    edges = tangent_vectors(surfels["quats"]) * surfels["log_scales"].exp()[:, None]
+    edges = tangents(surfels["quats"]) * surfels["log_scales"].exp()[:, None]
     g = torch.Generator().manual_seed(0)
     radius, angle = SUPPORT * torch.rand(POINTS, generator=g).sqrt(), 2 * torch.pi * torch.rand(POINTS, generator=g)
     uv = torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1).to(means)  # [P, 2]
@@ -75,7 +77,7 @@ def lean_field(
     transmittance: Tensor | None,
     weight_bound: float,
     tolerance: float,
-) -> tuple[HashField, dict[str, Any]]:
+) -> tuple[HashField, FieldLevels]:
     """The field without its finest and coarsest levels, as far as no surfel needs them.
 
     The levels that stay are a run of neighbours, which is a field again: finest levels go first, then coarsest, while
@@ -89,7 +91,7 @@ def lean_field(
         tolerance: of the bake, 8-bit steps.
 
     Returns:
-        the field, and what was left out, for bundle.json.
+        the field, and what was left out.
     """
     every = range(field.levels)
     at = (surfels, [(level,) for level in every], transmittance, weight_bound)
@@ -105,11 +107,11 @@ def lean_field(
         else:
             break
     kept = field if end - first == field.levels else field.only(first, end - first)
-    return kept, {
-        "unit": "8-bit steps, weighted root mean square over a surfel, largest of all surfels",
-        "levels": field.levels,
-        "kept": [first, end - first],
-        "change_of_each": single,
-        "change": round(change, 4),
-        "tolerance": round(LEVEL_SHARE * tolerance, 6),
-    }
+    return kept, FieldLevels(
+        unit="8-bit steps, weighted root mean square over a surfel, largest of all surfels",
+        levels=field.levels,
+        kept=(first, end - first),
+        change_of_each=single,
+        change=round(change, 4),
+        tolerance=round(LEVEL_SHARE * tolerance, 6),
+    )

@@ -10,6 +10,9 @@ from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Format, Profile, RangeRule,
 from bitymi_ns.bake.resolution import check_sides
 from bitymi_ns.ops.constants import SUPPORT
 
+STEPS = 255.0
+"""8-bit steps in a colour of 1: the unit of errors and of the tolerance."""
+
 
 @dataclass
 class BakeOptions:
@@ -61,8 +64,8 @@ class BakeOptions:
         """Refuses values that the bake would stumble over later."""
         if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
             raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
-        if not 0 <= self.tolerance < 255:
-            raise ValueError(f"the tolerance must be from 0 to below 255 steps, not {self.tolerance}")
+        if not 0 <= self.tolerance < STEPS:
+            raise ValueError(f"the tolerance must be from 0 to below {STEPS:g} steps, not {self.tolerance}")
         for name in ("range_samples", "chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")

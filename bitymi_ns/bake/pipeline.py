@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bitymi_ns.bake.errors import tile_errors
-from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
-from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
-from bitymi_ns.bake.lean_field import lean_field
-from bitymi_ns.bake.limits import within
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.packing import Packing, pack
-from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
+from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.pages import tile_means
+from bitymi_ns.bake.plan import Field, paper_texels
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
-from bitymi_ns.bake.reduce import reduce_tiles
-from bitymi_ns.bake.visibility import Visibility, visibility
-from bitymi_ns.ops.constants import ALPHA_MIN
-from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
+from bitymi_ns.bake.subject import Subject, drawable
+from bitymi_ns.bake.ways import Tiles, Way, way_of
+from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.field import HashField
 
 
 class BakeableScene(Protocol):
@@ -37,7 +31,7 @@ class BakeableScene(Protocol):
     surfels: Mapping[str, Tensor]
     field: Field | None
     near: float
-    config: Any  # weight_bound, prefilter
+    config: Any  # weight_bound, prefilter, through_pixel
 
 
 @dataclass
@@ -61,7 +55,7 @@ class Baked:
     texels: Tensor | None
     atlas: EncodedAtlas | None
     options: BakeOptions
-    statistics: dict[str, Any] = field(default_factory=dict)
+    statistics: Statistics = field(default_factory=Statistics)
 
     @property
     def mean_residual(self) -> Tensor:
@@ -100,11 +94,10 @@ class Baked:
         if self.texels is None or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         texels = texels.detach().float().cpu().contiguous()
-        atlas = _encode(texels.numpy(), self.packing, self.options, progress)
-        statistics = {**self.statistics, "atlas": _atlas_statistics(self.packing, atlas)}
-        statistics.pop("error", None)  # the field is no longer what the texels are meant to hold
-        tiled = torch.from_numpy(self.packing.tiles[:, 3:4] > 0)
-        means = torch.where(tiled, tile_means(texels, self.packing), self.mean_residual)
+        atlas = _encode(texels, self.packing, self.options, progress)
+        means = tile_means(texels, self.packing, self.mean_residual)
+        # no error: the field is no longer what the texels are meant to hold
+        statistics = self.statistics.but(atlas=_cost(self.packing, atlas), error=None)
         return replace(self.with_mean_residual(means), texels=texels, atlas=atlas, statistics=statistics)
 
 
@@ -133,135 +126,91 @@ def bake(
     """
     options, progress = options or BakeOptions(), progress or no_progress
     options.check()
-    started = time.perf_counter()
-    kept, left_out = _drawable(scene.surfels)
-    near = scene.near
-    weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
-    prefilter = str(getattr(scene.config, "prefilter", "low_pass"))
-    surfels = {name: value.detach()[kept].float() for name, value in scene.surfels.items()}
-    drawable = surfels
-    transmittance = views = None
-    if cameras and options.looks_at_views:
-        views = visibility(surfels, cameras, near, getattr(scene.config, "through_pixel", False), progress)
-        if options.drop_unseen:
-            seen = views.transmittance > 0
-            left_out["unseen"] = int((~seen).sum())
-            kept, views = kept[seen], views.of(seen)
-            surfels = {name: value[seen] for name, value in surfels.items()}
-        transmittance = views.in_front
-    if len(kept) == 0:
-        raise ValueError(f"no surfel is left to bake of {len(scene.surfels['means'])}: left out {left_out}")
-    statistics: dict[str, Any] = {"surfels": {"trained": len(scene.surfels["means"]), "kept": len(kept)}}
-    statistics["surfels"]["left_out"] = left_out
-
-    packing = pack(np.zeros((len(kept), 2), dtype=np.int32))
-    extent = torch.full((len(kept),), options.extent)
-    mean_residual = torch.zeros(len(kept), 3)
-    texels = atlas = None
-    if scene.field is not None:
-        field = scene.field
-        paper = paper_texels(drawable, field, options)
-        if options.tolerance > 0 and isinstance(field, HashField):
-            field, statistics["field"] = lean_field(field, surfels, transmittance, weight_bound, options.tolerance)
-        plan = make_plan(surfels, field, options, cameras, transmittance, near, weight_bound)
-        if options.tolerance > 0:
-            reduced = reduce_tiles(field, plan, options.tolerance, options.r_min, options.chunk, progress)
-            packing, nonfinite = pack(reduced.sizes, options.page_width, options.page_rows), reduced.nonfinite
-            texels, mean_residual = reduced.pages(packing), reduced.constant
-            extent = torch.where(plan.extent > 0, plan.extent, extent.to(plan.extent)).cpu()
-        else:
-            packing = pack(plan.limit.cpu(), options.page_width, options.page_rows)
-            geometry = (surfels["means"], surfels["quats"], surfels["log_scales"].exp())
-            texels, nonfinite = evaluate_tiles(field, *geometry, packing, options.extent, options.chunk, progress)
-        tiled = torch.from_numpy(packing.tiles[:, 3] > 0)
-        statistics["surfels"]["without_tile"] = int((~tiled).sum())
-        statistics["texels"] = {"paper": paper, **plan.texels, "kept": packing.texels, "not_finite": nonfinite}
-        if tiled.any():
-            mean_residual = torch.where(tiled[:, None], tile_means(texels, packing), mean_residual)
-            atlas = _encode(texels.numpy(), packing, options, progress)
-            statistics["atlas"] = _atlas_statistics(packing, atlas)
-        else:
-            texels = None
-        stored = None if atlas is None else atlas.decoded()
-        errors = tile_errors(field, plan, packing.tiles, mean_residual, stored, options.chunk, progress)
-        statistics["error"] = {"tolerance": options.tolerance, **errors.summary()}
-    kind = kind_of(surfels)
-    if options.tolerance > 0:
-        surfels, statistics["view_color"] = _lean_surfels(surfels, views, cameras, options.tolerance, progress)
-    statistics["seconds"] = round(time.perf_counter() - started, 3)
-    surfels = {name: value.cpu() for name, value in surfels.items()}
+    started, way = time.perf_counter(), way_of(options)
+    rows, left_out = drawable(scene.surfels)
+    candidates = _subject(scene, rows, cameras)
+    subject = candidates.looked_at(options, progress)
+    if subject.views is not None and options.drop_unseen:
+        seen = subject.views.transmittance > 0
+        left_out = left_out.but(unseen=int((~seen).sum()))
+        rows, subject = rows[seen], subject.of(seen)
+    trained = len(scene.surfels["means"])
+    if len(rows) == 0:
+        raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
+    statistics = Statistics(surfels=KeptSurfels(trained=trained, kept=len(rows), left_out=left_out))
+    if scene.field is None:
+        tiles, atlas = Tiles.none(len(rows), options.extent), None
+    else:
+        paper = paper_texels(candidates.surfels, scene.field, options)
+        tiles, atlas, statistics = _textured(way, scene.field, subject, paper, statistics, options, progress)
+    surfels, view_color = way.view_color(subject, progress)
     baked = BakedScene(
-        surfels,
-        kind,
-        torch.from_numpy(packing.tiles),
-        extent=extent,
-        mean_residual=mean_residual,
-        near=near,
-        weight_bound=weight_bound,
-        prefilter=prefilter,
+        {name: value.cpu() for name, value in surfels.items()},
+        kind_of(scene.surfels),
+        torch.from_numpy(tiles.packing.tiles),
+        extent=tiles.extent,
+        mean_residual=tiles.mean_residual,
+        near=subject.near,
+        weight_bound=subject.weight_bound,
+        prefilter=getattr(scene.config, "prefilter", "low_pass"),
     )
-    return Baked(baked, kept.cpu(), packing, texels, atlas, options, statistics)
+    statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
+    return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics)
 
 
-def _lean_surfels(
-    surfels: Mapping[str, Tensor],
-    views: Visibility | None,
-    cameras: Sequence[Camera],
-    tolerance: float,
-    progress: Progress = no_progress,
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Surfels with lean view colours, and what was left out; see `lean_color.reduce_view_color`.
+def _subject(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> Subject:
+    surfels = {name: value.detach()[rows].float() for name, value in scene.surfels.items()}
+    weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
+    return Subject(surfels, cameras, scene.near, weight_bound, getattr(scene.config, "through_pixel", False))
+
+
+def _textured(
+    way: Way,
+    field: Field,
+    subject: Subject,
+    paper: int,
+    statistics: Statistics,
+    options: BakeOptions,
+    progress: Progress,
+) -> tuple[Tiles, EncodedAtlas | None, Statistics]:
+    """The tiles of a scene with a field, their atlas where any surfel needs a tile, and what that saved and cost.
 
     Args:
-        surfels: N rows.
-        views: what the cameras see of them; None without cameras.
-        cameras: training views.
-        tolerance: 8-bit steps.
-        progress: called after every chunk of work.
+        paper: texels that the paper's rule gives.
+        statistics: with the numbers of surfels.
     """
-    kind, means = kind_of(surfels), surfels["means"]
-    seen = means.new_zeros(0, len(means), dtype=torch.bool) if views is None else views.seen
-    opacity, _ = kernel_parameters(surfels, None if views is None else views.in_front)
-    at = (seen, centers_of(cameras, means), opacity)
-    lean = reduce_view_color(surfels, kind, *at, tolerance, progress)
-    error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
-    kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind].names}
-    return kept | lean.parameters(), {"kind": kind, **describe(kind, surfels, lean, error, tolerance)}
+    field, levels = way.field(field, subject)
+    plan = way.plan(field, subject)
+    tiles = way.tiles(field, plan, subject, progress)
+    packing = tiles.packing
+    atlas = None if tiles.texels is None else _encode(tiles.texels, packing, options, progress)
+    stored = None if atlas is None else atlas.decoded()
+    errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
+    return (
+        tiles,
+        atlas,
+        statistics.but(
+            surfels=statistics.surfels.but(without_tile=int((packing.tiles[:, 3] == 0).sum())),
+            texels=plan.texels.but(paper=paper, kept=packing.texels, not_finite=tiles.nonfinite),
+            field=levels,
+            atlas=None if atlas is None else _cost(packing, atlas),
+            error=errors.summary(options.tolerance),
+        ),
+    )
 
 
-def _drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, int]]:
-    """Rows that can be drawn, [N] int64, and how many were left out for which reason."""
-    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
-    scales = surfels["log_scales"].exp()
-    finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
-    turned = surfels["quats"].norm(dim=1)
-    finite &= torch.isfinite(turned) & (turned > 1e-12)
-    storable = finite & within(surfels, kind_of(surfels))
-    transparent = storable & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
-    kept = torch.nonzero(storable & ~transparent).squeeze(1)
-    counts = {"not_finite": ~finite, "beyond_limits": finite & ~storable, "transparent": transparent}
-    return kept, {name: int(rows.sum()) for name, rows in counts.items()}
-
-
-def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
-    """Every parameter with at least two dimensions."""
-    return [value.detach() if value.dim() > 1 else value.detach()[:, None] for value in surfels.values()]
-
-
-def _encode(
-    texels: npt.NDArray[np.float32], packing: Packing, options: BakeOptions, progress: Callable[[str, int, int], None]
-) -> EncodedAtlas:
+def _encode(texels: Tensor, packing: Packing, options: BakeOptions, progress: Progress) -> EncodedAtlas:
     value_range = None
     if options.format != "fp16":
-        value_range = choose_range(texels, packing, options.range, options.range_samples, options.seed)
-    return encode(texels, packing, options.format, value_range, options.bc7_profile, progress=progress)
+        value_range = choose_range(texels.numpy(), packing, options.range, options.range_samples, options.seed)
+    return encode(texels.numpy(), packing, options.format, value_range, options.bc7_profile, progress=progress)
 
 
-def _atlas_statistics(packing: Packing, atlas: EncodedAtlas) -> dict[str, Any]:
-    return {
-        "bytes": atlas.nbytes,
-        "pages": [packing.layers, packing.height, packing.width],
-        "occupancy": packing.occupancy,
-        "psnr": atlas.psnr,
-        "clipped_fraction": atlas.clipped_fraction,
-    }
+def _cost(packing: Packing, atlas: EncodedAtlas) -> AtlasCost:
+    return AtlasCost(
+        bytes=atlas.nbytes,
+        pages=(packing.layers, packing.height, packing.width),
+        occupancy=packing.occupancy,
+        psnr=atlas.psnr,
+        clipped_fraction=atlas.clipped_fraction,
+    )

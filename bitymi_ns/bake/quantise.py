@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.bake.evaluate import coverage
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.pages import coverage
 from bitymi_ns.bake.progress import Progress, no_progress
 
 Format = Literal["bc7", "uint8", "fp16"]

@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.evaluate import texel_index
+from bitymi_ns.bake.errors import weighted_rms
 from bitymi_ns.bake.packing import Packing
-from bitymi_ns.bake.plan import Field, Plan, Reference, along_axes, fit, interpolation, references, weighted_rms
+from bitymi_ns.bake.pages import texel_index
+from bitymi_ns.bake.plan import Field, Plan
 from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.reference import Reference, references
+from bitymi_ns.bake.resample import fit, fitted, interpolation, read_at
 
 _FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a grid may be for it to be tried
 
@@ -77,7 +80,7 @@ def reduce_tiles(
         for size, at in _grids(part, textured, tolerance, r_min):
             rows = part.rows[at].cpu()
             reduced.sizes[rows] = torch.tensor(size, dtype=torch.int32)
-            texels = part.values[at] if size == part.size else _fitted(part.values[at], size)
+            texels = part.values[at] if size == part.size else fitted(part.values[at], size)
             reduced.parts.append((rows, texels.cpu()))
         done += len(part.rows)
         progress("choosing the tiles", done, n)
@@ -115,18 +118,9 @@ def _grids(part: Reference, rows: Tensor, tolerance: float, r_min: int) -> list[
         promising = open_ & (along_u[size[0]] + along_v[size[1]] <= (_FORESIGHT * tolerance) ** 2)
         at = torch.nonzero(promising).squeeze(1)
         if size != part.size and len(at):
-            coarse = _fitted(values[at], size)
-            rebuilt = along_axes(
-                coarse, *(interpolation(p, r).to(coarse) for p, r in zip(part.size, size, strict=True))
-            )
+            rebuilt = read_at(fitted(values[at], size), part.size)
             at = at[weighted_rms(rebuilt - values[at], weight[at]) <= tolerance]
         if len(at):
             open_[at] = False
             found.append((size, rows[at]))
     return found
-
-
-def _fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Tiles [n, 3, v, u] on a coarser grid (u, v)."""
-    u, v = values.shape[3], values.shape[2]
-    return along_axes(values, fit(u, size[0]).to(values), fit(v, size[1]).to(values))

@@ -6,14 +6,14 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.evaluate import size_classes, texel_index
+from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.bake.statistics import FineTuning, Gain
 from bitymi_ns.ops import (
     Fragments,
     TexelFragments,
@@ -26,6 +26,7 @@ from bitymi_ns.ops import (
     texel_image,
     view_color,
 )
+from bitymi_ns.ops.backend import require
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room
@@ -105,12 +106,18 @@ class TexelScene:
     def __init__(self, baked: Baked, background: Tensor) -> None:
         """
         Args:
-            baked: with an atlas.
-            background: [3] colour behind the scene.
+            baked: with an atlas, on the CPU.
+            background: [3] colour behind the scene, on any device.
+
+        Raises:
+            ValueError: there is no atlas.
+            RuntimeError: the scene of the bake was moved to another device.
         """
         if baked.texels is None:
             raise ValueError("a scene without texture has no texels to tune")
-        self._baked, self._background = baked, background
+        advice = "give it the bake as it was made, or move its scene there"
+        require("the fine-tuning", "cpu", baked.scene.tiles.device, advice)
+        self._baked, self._background = baked, background.cpu()
         rectangles = torch.from_numpy(baked.packing.tiles)
         self.tiles = TexelTiles.of_sizes(rectangles[:, 3:].clamp(min=1), baked.extent.float())
         self.texels = torch.empty(self.tiles.count, 3)
@@ -217,6 +224,9 @@ def tune_atlas(
     loss's gradient for the residual: it needs no second moments, and a texel that is hardly seen hardly moves. The
     texels kept are those that show the set-aside views best, the baked ones where none are better.
 
+    It runs on the CPU, which alone has kernels for `ops.texel_image` and its gradient, and where a bake is whatever the
+    device it was made on. Photographs and cameras may lie elsewhere: each view is copied when it is traced.
+
     Args:
         baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
         views: training views; every `held_in_every`-th is set aside.
@@ -226,13 +236,13 @@ def tune_atlas(
         eval_views: views of which the gain is stated; they decide nothing.
 
     Returns:
-        a new bake, encoded, with `statistics["finetune"]`; `baked` itself without change where there are fewer than 4
+        a new bake, encoded, with `statistics.finetune`; `baked` itself without change where there are fewer than 4
         views.
     """
     options = options or TuneOptions()
     options.check()
     if len(views) < FEWEST_VIEWS:
-        return replace(baked, statistics={**baked.statistics, "finetune": {"steps": 0, "views": len(views)}})
+        return replace(baked, statistics=baked.statistics.but(finetune=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
     scene = TexelScene(baked, background)
     room, every = Room(options.cache_bytes), options.held_in_every
@@ -241,25 +251,28 @@ def tune_atlas(
         for rows in (range(0, len(views), every), [i for i in range(len(views)) if i % every])
     )
     texels, curve = _descend(scene, tuned, held_in, options, progress)
-    statistics: dict[str, Any] = {
-        "views": len(tuned),
-        "held_in_views": len(held_in),
-        "steps": curve[-1][0],
-        "steps_asked": options.steps,
-        "best_step": max(curve, key=lambda point: point[1])[0],
-        "psnr_held_in": {"before": round(curve[0][1], 4), "after": round(max(psnr for _, psnr in curve), 4)},
-        "curve": [[step, round(psnr, 4)] for step, psnr in curve],
-        "seconds": round(time.perf_counter() - started, 2),
-        "cpu_seconds": round(time.process_time() - cpu_started, 2),
-    }
-    if "error" in baked.statistics:
-        statistics["error_before"] = baked.statistics["error"]  # of the texels as baked, against the field
-    if eval_views:
-        held_out = TexelViews(scene, eval_views, Room(0))
-        both = {"before": held_out.psnr(scene.texels), "after": held_out.psnr(texels)}
-        statistics["psnr_held_out"] = {name: round(value, 4) for name, value in both.items()}
+    statistics = FineTuning(
+        views=len(tuned),
+        held_in_views=len(held_in),
+        steps=curve[-1][0],
+        steps_asked=options.steps,
+        best_step=max(curve, key=lambda point: point[1])[0],
+        psnr_held_in=_gain(curve[0][1], max(psnr for _, psnr in curve)),
+        curve=[(step, round(psnr, 4)) for step, psnr in curve],
+        seconds=round(time.perf_counter() - started, 2),
+        cpu_seconds=round(time.process_time() - cpu_started, 2),
+    )
+    held_out = TexelViews(scene, eval_views, Room(0))
+    statistics = statistics.but(
+        error_before=baked.statistics.error,
+        psnr_held_out=_gain(held_out.psnr(scene.texels), held_out.psnr(texels)) if eval_views else None,
+    )
     result = scene.baked(texels, progress)
-    return replace(result, statistics={**result.statistics, "finetune": statistics})
+    return replace(result, statistics=result.statistics.but(finetune=statistics))
+
+
+def _gain(before: float, after: float) -> Gain:
+    return Gain(before=round(before, 4), after=round(after, 4))
 
 
 def _descend(

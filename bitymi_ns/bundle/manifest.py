@@ -7,12 +7,12 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
-from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.quantise import Format
+from bitymi_ns.bake.statistics import Decibels, Part, Share, Statistics, Whole
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
@@ -58,31 +58,14 @@ def _only(value: float) -> Any:
     return Annotated[float, AfterValidator(check)]
 
 
-Whole = Annotated[int, Field(ge=0, le=2**31 - 1)]
-Count = Annotated[int, Field(ge=0, le=2**60)]
 Positive = Annotated[float, Field(gt=0, le=1e12)]
-NotNegative = Annotated[float, Field(ge=0, le=1e12)]
-Share = Annotated[float, Field(ge=0, le=1)]
-Decibels = Annotated[float, Field(ge=-1e3, le=1e3)]
 Side = Annotated[int, Field(ge=1, le=1 << 20)]
 Coordinate = Annotated[float, Field(ge=-LIMITS["means"][0], le=LIMITS["means"][0])]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
-class _Part(BaseModel):
-    """An object of bundle.json. Keys that it does not know are kept and ignored; numbers are finite, and no bool or
-    text is taken for one."""
-
-    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
-
-    @model_serializer(mode="wrap")
-    def _without_what_was_not_given(self, serialize: Any) -> dict[str, Any]:
-        given = self.model_fields_set
-        return {key: value for key, value in serialize(self).items() if value is not None or key in given}
-
-
-class Surfels(_Part):
+class Surfels(Part):
     """What surfels.ply holds, and how it is to be read."""
 
     file: Literal["surfels.ply"] = SURFELS
@@ -100,7 +83,7 @@ class Surfels(_Part):
     """How a lean view colour is evaluated."""
 
 
-class Atlas(_Part):
+class Atlas(Part):
     """What atlas.ktx2 holds: residual = offset + scale * value, value = stored / 255 for bc7 and uint8."""
 
     file: Literal["atlas.ktx2"] = ATLAS
@@ -116,7 +99,7 @@ class Atlas(_Part):
     range: str | None = None
     clipped_fraction: Share | None = None
     encoder: str | None = None
-    psnr: Decibels | None = None
+    psnr: Decibels = None
 
     @model_validator(mode="after")
     def _half_floats_are_residuals(self) -> Atlas:
@@ -125,7 +108,7 @@ class Atlas(_Part):
         return self
 
 
-class Render(_Part):
+class Render(Part):
     """What the renderers draw with."""
 
     alpha_max: _only(ALPHA_MAX) = ALPHA_MAX  # type: ignore[valid-type]
@@ -138,96 +121,28 @@ class Render(_Part):
     background: tuple[Share, Share, Share]
 
 
-class Place(_Part):
+class Place(Part):
     """How the scene lies in the capture's own frame: x_scene = scale * (transform @ [x_capture, 1])."""
 
     transform: tuple[Row, Row, Row]
     scale: Positive
 
 
-class Bounds(_Part):
+class Bounds(Part):
     """Corners of the box around the surfels' means."""
 
     min: Point
     max: Point
 
 
-class FileEntry(_Part):
+class FileEntry(Part):
     """Size and hash of a file of the bundle."""
 
     bytes: Annotated[int, Field(ge=0, le=2**50)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class Percentiles(_Part):
-    """Of an error over the surfels; p100 is the largest."""
-
-    p100: NotNegative | None = None
-
-
-class TileError(_Part):
-    """Error of the stored tiles against the field, 8-bit steps."""
-
-    tolerance: NotNegative
-    rms: Percentiles
-    largest: Percentiles
-
-
-class KeptSites(_Part):
-    """Numbers of sites, coefficients or lobes."""
-
-    after: Count
-
-
-class ViewColorError(_Part):
-    """What the view colours kept, and their error in 8-bit steps."""
-
-    tolerance: NotNegative
-    sites: KeptSites
-    one_color: Whole
-    error: Percentiles
-
-
-class KeptSurfels(_Part):
-    """Numbers of surfels."""
-
-    kept: Whole | None = None
-    without_tile: Whole | None = None
-
-
-class KeptTexels(_Part):
-    """Numbers of texels."""
-
-    kept: Count | None = None
-
-
-class FieldLevels(_Part):
-    """Which levels of the field the bake evaluated."""
-
-    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]
-    """The first one and how many."""
-
-
-class HeldOut(_Part):
-    """PSNR over the held-out views, dB."""
-
-    psnr_baked_against_neural_worst: Decibels | None = None
-
-
-class Statistics(_Part):
-    """What the bake left out and what that cost: for people and reports, and for `bitymi verify` to measure again. The
-    fields are what this package reads back; there is more."""
-
-    surfels: KeptSurfels | None = None
-    texels: KeptTexels | None = None
-    error: TileError | None = None
-    view_color: ViewColorError | None = None
-    field: FieldLevels | None = None
-    options: BakeOptions | None = None
-    held_out: HeldOut | None = None
-
-
-class Manifest(_Part):
+class Manifest(Part):
     """bundle.json."""
 
     format: Literal["bitymi-bundle"] = FORMAT

@@ -81,7 +81,7 @@ def export(
         baked.atlas,
         background=background,
         world=world,
-        statistics={**baked.statistics, **(statistics or {})},
+        statistics={**baked.statistics.model_dump(), **(statistics or {})},
         extra_files=extra_files,
         loose_files=loose_files,
         overwrite=overwrite,

@@ -26,8 +26,9 @@ from rich.table import Table
 
 from bitymi_ns.bake import BakeOptions, TuneOptions, bake, rich_progress, tune_atlas
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
+from bitymi_ns.bake.statistics import FineTuning, HeldOut, Percentiles
 from bitymi_ns.bundle import BundleError, export, read_bundle
-from bitymi_ns.bundle.manifest import MANIFEST, SURFELS, HeldOut, dump
+from bitymi_ns.bundle.manifest import MANIFEST, SURFELS, Manifest, dump
 from bitymi_ns.bundle.write import World
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
@@ -117,6 +118,8 @@ class ExportAtlas(BakeOptions):
                 f"Fine-tuning has {self.finetune_steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
                 "for each: more may gain (--finetune-steps)."
             )
+        if finetunes and model.device.type != "cpu":
+            say("The texels are fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
             state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
         try:
@@ -143,9 +146,9 @@ class ExportAtlas(BakeOptions):
         if self.compare and len(datamanager.eval_dataset):
             scene = bundle.scene
             held_out = compare(model, datamanager, lambda c: scene.render(c, background=torch.tensor(background)).rgb)
-            bundle.info.statistics.held_out = HeldOut(**held_out)
+            bundle.info.statistics.held_out = held_out
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
-        print_summary(self.output_dir, bundle.info.model_dump(mode="json"))
+        print_summary(self.output_dir, bundle.info)
 
 
 def default_export() -> ExportAtlas:
@@ -199,14 +202,14 @@ def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera]) -> 
 
 
 @torch.no_grad()
-def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> dict[str, float]:
+def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
     """PSNR in dB over the held-out views, of bundle, trained scene and photographs against each other: means, and the
     view in which the bundle is farthest from the trained scene."""
     rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
     means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
     worst = round(min(row[0] for row in rows), 4)
-    return {"views": len(rows), **dict(zip(names, means, strict=True)), "psnr_baked_against_neural_worst": worst}
+    return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
 
 
 @torch.no_grad()
@@ -248,96 +251,103 @@ def replace_file(path: Path, data: bytes) -> None:
         fail(f"{path} could not be written: {reason(error, path)}.", error)
 
 
-def print_summary(folder: Path, info: dict[str, Any]) -> None:
+def print_summary(folder: Path, info: Manifest) -> None:
     """What was written, what was left out, and what it cost."""
-    statistics = info["statistics"]
-    surfels, texels = statistics["surfels"], statistics.get("texels")
+    statistics = info.statistics
+    surfels = statistics.surfels
     table = Table("", "", title=escape(f"Bundle {folder}"), show_header=False)
-    table.add_row("Surfels", f"{surfels['trained']:,} -> {info['surfels']['count']:,}")
-    left_out = {k: v for k, v in surfels["left_out"].items() if v}
+    table.add_row("Surfels", f"{surfels.trained:,} -> {info.surfels.count:,}")
+    left_out = {name: count for name, count in surfels.left_out if count}
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
-    if texels is not None:
+    if statistics.texels is not None:
         print_savings(table, info)
-    if "field" in statistics:
-        levels = statistics["field"]
-        alone = ", ".join(f"{change:.2f}" for change in levels["change_of_each"])
-        table.add_row("Levels of the field", f"{levels['levels']} -> {levels['kept'][1]}")
-        table.add_row("", f"(each alone changes a surfel by up to {alone} steps; tolerance {levels['tolerance']:g})")
+    levels = statistics.field
+    if levels is not None:
+        alone = ", ".join(f"{change:.2f}" for change in levels.change_of_each)
+        table.add_row("Levels of the field", f"{levels.levels} -> {levels.kept[1]}")
+        table.add_row("", f"(each alone changes a surfel by up to {alone} steps; tolerance {levels.tolerance:g})")
     print_view_color(table, info)
-    atlas = statistics.get("atlas")
+    atlas = statistics.atlas
     if atlas is None:
-        table.add_row("Atlas", "none (the scene has no texture)" if texels is None else "none (no tile is needed)")
+        why = "the scene has no texture" if statistics.texels is None else "no tile is needed"
+        table.add_row("Atlas", f"none ({why})")
     else:
-        layers, height, width = atlas["pages"]
-        size = info["files"][info["atlas"]["file"]]["bytes"]
-        table.add_row("Atlas", f"{size / 1e6:.2f} MB {info['atlas']['format']}, {layers} x {width} x {height} texels")
-        table.add_row("Occupancy", f"{100 * atlas['occupancy']:.1f} %")
-        if atlas.get("psnr") is not None:
-            table.add_row("Quantisation", f"{atlas['psnr']:.2f} dB over the texels")
-    tuned = statistics.get("finetune")
-    if tuned and tuned["steps"]:
-        table.add_row("Fine-tuning", f"{tuned['steps']} steps, {tuned['seconds']:.0f} s")
-        if tuned["steps"] < tuned["steps_asked"]:
-            without = tuned["steps"] - tuned["best_step"]
-            table.add_row("", f"(stopped early at step {tuned['steps']} of {tuned['steps_asked']}: no gain on the")
-            table.add_row("", f"set-aside training views for {without} steps)")
-        for name, views in (("psnr_held_in", "... set-aside training views"), ("psnr_held_out", "... held-out views")):
-            if name in tuned:
-                table.add_row(views, f"{tuned[name]['before']:.2f} -> {tuned[name]['after']:.2f} dB")
-    elif tuned:
-        table.add_row("Fine-tuning", f"none: {tuned['views']} training views are too few to set some aside")
-    table.add_row("Files", f"{sum(f['bytes'] for f in info['files'].values()) / 1e6:.2f} MB in total")
-    held_out = statistics.get("held_out")
-    if held_out:
-        table.add_row("Held-out views", f"{held_out['views']}")
-        table.add_row("Bundle against trained scene", f"{held_out['psnr_baked_against_neural']:.2f} dB")
-        table.add_row("Trained scene against photographs", f"{held_out['psnr_neural_against_photos']:.2f} dB")
-        table.add_row("Bundle against photographs", f"{held_out['psnr_baked_against_photos']:.2f} dB")
+        layers, height, width = atlas.pages
+        size = info.files[info.atlas.file].bytes
+        table.add_row("Atlas", f"{size / 1e6:.2f} MB {info.atlas.format}, {layers} x {width} x {height} texels")
+        table.add_row("Occupancy", f"{100 * atlas.occupancy:.1f} %")
+        if atlas.psnr is not None:
+            table.add_row("Quantisation", f"{atlas.psnr:.2f} dB over the texels")
+    if statistics.finetune is not None:
+        print_tuning(table, statistics.finetune)
+    table.add_row("Files", f"{sum(entry.bytes for entry in info.files.values()) / 1e6:.2f} MB in total")
+    held_out = statistics.held_out
+    if held_out is not None:
+        table.add_row("Held-out views", f"{held_out.views}")
+        table.add_row("Bundle against trained scene", f"{held_out.psnr_baked_against_neural:.2f} dB")
+        table.add_row("Trained scene against photographs", f"{held_out.psnr_neural_against_photos:.2f} dB")
+        table.add_row("Bundle against photographs", f"{held_out.psnr_baked_against_photos:.2f} dB")
     CONSOLE.print(table)
     say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
 
 
-def print_savings(table: Table, info: dict[str, Any]) -> None:
+def print_savings(table: Table, info: Manifest) -> None:
     """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
-    statistics = info["statistics"]
-    texels = statistics["texels"]
-    error = statistics.get("error") or statistics["finetune"]["error_before"]
-    kept, count, options = texels["kept"], info["surfels"]["count"], statistics["options"]
-    table.add_row("Tiles", f"{statistics['surfels']['trained']:,} -> {count - statistics['surfels']['without_tile']:,}")
-    table.add_row("Texels by the paper's rule", f"{texels['paper']:,}")
-    voxel = "local voxel" if options["local_voxel"] else "smallest voxel"
-    table.add_row(f"... by the {voxel}, extent {options['extent']:g}", f"{texels['nyquist']:,}")
-    table.add_row("... no finer than a view sees", f"{texels['after_cap_by_views']:,}")
-    table.add_row("... only where they are seen", f"{texels['within_visible_part']:,}")
-    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels['paper']):.1f} %)")
-    rule = texels["paper"] * BYTES_PER_TEXEL[options["format"]]
-    stored = info["files"][info["atlas"]["file"]]["bytes"] if info["atlas"] else 0
+    statistics, options = info.statistics, info.statistics.options
+    texels, tuned = statistics.texels, statistics.finetune
+    error = statistics.error or tuned.error_before
+    kept, count = texels.kept, info.surfels.count
+    table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
+    table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
+    voxel = "local voxel" if options.local_voxel else "smallest voxel"
+    table.add_row(f"... by the {voxel}, extent {options.extent:g}", f"{texels.nyquist:,}")
+    table.add_row("... no finer than a view sees", f"{texels.after_cap_by_views:,}")
+    table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
+    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels.paper):.1f} %)")
+    rule = texels.paper * BYTES_PER_TEXEL[options.format]
+    stored = info.files[info.atlas.file].bytes if info.atlas else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
-    tolerance = f"tolerance {error['tolerance']:g}" if error["tolerance"] else "no tolerance"
-    rms = error["rms"]
-    table.add_row("Error of a tile", f"median {rms['p50']:.2f}, 99 % {rms['p99']:.2f}, at most {rms['p100']:.2f} steps")
-    when = "as stored" if "error" in statistics else "before the fine-tuning"
+    tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
+    table.add_row("Error of a tile", percentiles_text(error.rms))
+    when = "before the fine-tuning" if statistics.error is None else "as stored"
     table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
 
 
-def print_view_color(table: Table, info: dict[str, Any]) -> None:
+def print_view_color(table: Table, info: Manifest) -> None:
     """What the surfels keep of their view colours, and what that saves and costs."""
-    lean, stored = info["statistics"].get("view_color"), info["files"][SURFELS]["bytes"]
+    lean, stored = info.statistics.view_color, info.files[SURFELS].bytes
     if lean is None:
         table.add_row("View colour", "all of it is kept")
         table.add_row("Surfel bytes", f"{stored:,}")
         return
-    sites, error, count = lean["sites"], lean["error"], info["surfels"]["count"]
-    share = 100 * sites["after"] / sites["before"]
-    table.add_row(VIEW_COLORS[lean["kind"]].kept, f"{sites['before']:,} -> {sites['after']:,} ({share:.1f} %)")
-    table.add_row("Surfels of one colour", f"{lean['one_color']:,} ({100 * lean['one_color'] / count:.1f} %)")
-    whole = stored + lean["bytes"]["before"] - lean["bytes"]["after"]
+    sites, count = lean.sites, info.surfels.count
+    share = 100 * sites.after / sites.before
+    table.add_row(VIEW_COLORS[lean.kind].kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
+    table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
+    whole = stored + lean.bytes.before - lean.bytes.after
     table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
-    table.add_row(
-        "Error of a view colour",
-        f"median {error['p50']:.2f}, 99 % {error['p99']:.2f}, at most {error['p100']:.2f} steps",
-    )
-    table.add_row("", f"(tolerance {lean['tolerance']:g}; weighted, largest over directions and channels)")
+    table.add_row("Error of a view colour", percentiles_text(lean.error))
+    table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
+
+
+def print_tuning(table: Table, tuned: FineTuning) -> None:
+    """What the fine-tuning gained, and why it ended."""
+    if not tuned.steps:
+        table.add_row("Fine-tuning", f"none: {tuned.views} training views are too few to set some aside")
+        return
+    table.add_row("Fine-tuning", f"{tuned.steps} steps, {tuned.seconds:.0f} s")
+    if tuned.steps < tuned.steps_asked:
+        table.add_row("", f"(stopped early at step {tuned.steps} of {tuned.steps_asked}: no gain on the")
+        table.add_row("", f"set-aside training views for {tuned.steps - tuned.best_step} steps)")
+    gains = {"... set-aside training views": tuned.psnr_held_in, "... held-out views": tuned.psnr_held_out}
+    for views, gain in gains.items():
+        if gain is not None:
+            table.add_row(views, f"{gain.before:.2f} -> {gain.after:.2f} dB")
+
+
+def percentiles_text(error: Percentiles) -> str:
+    """Of an error in 8-bit steps."""
+    return f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.bake import Baked, BakeOptions, bake, rich_progress
+from bitymi_ns.bake.options import STEPS
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.export import load_trained, replace_file
@@ -147,8 +148,8 @@ def measure(held_out: HeldOut, settings: Sequence[Setting], repeats: int) -> lis
                 setting.renderer,
                 setting.exact,
                 setting.default,
-                round(255.0 * float(errors.max()), 4),
-                round(255.0 * float(errors.mean()), 6),
+                round(STEPS * float(errors.max()), 4),
+                round(STEPS * float(errors.mean()), 6),
                 round(psnr(torch.tensor(mse).sqrt(), torch.tensor(0.0)), 4),
                 round(held_out.psnr(images), 4),
                 round(ms, 3),

@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.files import reason
 from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.export import load_trained, replace_file
@@ -21,6 +20,7 @@ from bitymi_ns.host.target import see_writable
 from bitymi_ns.measure.report.views import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.ops import composite
 from bitymi_ns.scene import RenderOutput, Scene
+from bitymi_ns.train.rotations import tangents
 
 RESIDUAL_GAIN = 4.0
 """Residuals are small; the pictures of them are brightened by this factor."""
@@ -58,7 +58,7 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
             textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
             surfel = fragments.surfel[textured].long()
             u, v = fragments.uv[:, textured]
-            axes = tangent_vectors(p["quats"][surfel])
+            axes = tangents(p["quats"][surfel])
             size = p["log_scales"][surfel].exp()
             x = p["means"][surfel] + (u * size[:, 0])[:, None] * axes[..., 0] + (v * size[:, 1])[:, None] * axes[..., 1]
             rho[textured] = scene.field(x)

@@ -26,18 +26,18 @@ def facing(normals: Tensor, angles: Tensor) -> Tensor:
     return torch.stack([w * cos - k * sin, i * cos + j * sin, j * cos - i * sin, k * cos + w * sin], -1)
 
 
-def tangents(quats: Tensor) -> tuple[Tensor, Tensor]:
-    """The two tangent vectors of surfels, the first two columns of their rotation matrices.
+def tangents(quats: Tensor) -> Tensor:
+    """The two tangent directions of surfels: the first two columns of their rotation matrices.
 
     Args:
         quats: [N, 4], not normalised; a zero quaternion counts as no rotation.
 
     Returns:
-        [N, 3] and [N, 3] unit vectors.
+        [N, 3, 2] unit vectors; [..., 0] is the u axis, [..., 1] the v axis.
     """
     norm = quats.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
     w, x, y, z = torch.where(norm > 0, quats / norm.clamp(min=torch.finfo(quats.dtype).tiny), identity).unbind(-1)
     u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
     v = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)
-    return u, v
+    return torch.stack([u, v], -1)

@@ -201,7 +201,7 @@ class Strategy:
         halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
         scales = halves["log_scales"].exp()  # [2S, 2]
         offset = torch.randn(scales.shape, generator=self.generator).to(scales) * scales
-        u, v = tangents(halves["quats"])
+        u, v = tangents(halves["quats"]).unbind(-1)
         halves["means"] = halves["means"] + offset[:, :1] * u + offset[:, 1:] * v
         halves["log_scales"] = halves["log_scales"] - math.log(SPLIT_SHRINK)
         return halves

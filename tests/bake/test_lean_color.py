@@ -146,7 +146,7 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     check = check_view_color(bundle, made.surfels, cameras)
     assert check.ok and "stated" in check.detail
     full = bake(made, cameras, BakeOptions(format="uint8", tolerance=0.0))
-    assert "view_color" not in full.statistics and set(full.scene.surfels) == set(made.surfels)
+    assert full.statistics.view_color is None and set(full.scene.surfels) == set(made.surfels)
     export(full, tmp_path / "full")
     whole = read_bundle(tmp_path / "full")
     assert whole.info.version == "1.2" and check_view_color(whole, made.surfels, cameras).ok

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bitymi_ns.bake.evaluate import coverage
 from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.pages import coverage
 
 sides = st.sampled_from([4, 8, 16, 32, 64])
 sizes = hnp.arrays(np.int32, st.tuples(st.integers(0, 120), st.just(2)), elements=sides)

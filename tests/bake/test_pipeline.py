@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake, rich_progress
-from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.train.rotations import tangents
 
 
 def bilinear(bundle, surfel, u, v, extent=3.0):
@@ -27,7 +27,7 @@ def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format,
     export(bake(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     scales = bundle.scene.surfels["log_scales"].exp()
-    axes = tangent_vectors(bundle.scene.surfels["quats"]) * scales[:, None]
+    axes = tangents(bundle.scene.surfels["quats"]) * scales[:, None]
     errors = []
     for i in torch.nonzero(scales.amax(1) < 0.08).squeeze(1).tolist():
         uv = torch.rand(50, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2
@@ -54,7 +54,7 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
     made.surfels["sv_rgb"][11, 0, 0] = 1e4  # no bundle holds that
     made.surfels["means"][12, 2] = -1e12
     baked = bake(made)
-    assert baked.statistics["surfels"] == {
+    assert baked.statistics.surfels.model_dump() == {
         "trained": 100,
         "kept": 87,
         "left_out": {"not_finite": 4, "beyond_limits": 2, "transparent": 7},
@@ -64,7 +64,7 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
     torch.testing.assert_close(baked.scene.surfels["means"], made.surfels["means"][13:])
     export(baked, tmp_path / "b", statistics={"psnr": 30.0})
     info = read_bundle(tmp_path / "b").info
-    assert info.statistics.surfels.left_out["transparent"] == 7 and info.statistics.psnr == 30.0
+    assert info.statistics.surfels.left_out.transparent == 7 and info.statistics.psnr == 30.0
     assert info.render.near == 0.25 and info.atlas.extent == 3.0
 
 
@@ -78,22 +78,22 @@ def test_nothing_left_is_an_error(scene):
 def test_views_cap_the_tiles_and_say_what_that_saved(scene, camera):
     made = scene(300)
     rule = BakeOptions(tolerance=0, drop_unseen=False)
-    free = bake(made, [camera()], replace(rule, cap_by_views=False)).statistics["texels"]
-    capped = bake(made, [camera()], rule).statistics["texels"]
-    assert free["nyquist"] == free["after_cap_by_views"] == free["kept"] == capped["nyquist"]
-    assert capped["after_cap_by_views"] == capped["kept"] < free["nyquist"] / 2
-    assert bake(made, [], rule).statistics["texels"] == free  # no views, no cap
+    free = bake(made, [camera()], replace(rule, cap_by_views=False)).statistics.texels
+    capped = bake(made, [camera()], rule).statistics.texels
+    assert free.nyquist == free.after_cap_by_views == free.kept == capped.nyquist
+    assert capped.after_cap_by_views == capped.kept < free.nyquist / 2
+    assert bake(made, [], rule).statistics.texels == free  # no views, no cap
 
 
 def test_the_papers_rule_has_one_voxel_size_and_wider_tiles(scene):
     made = scene(200)
     made.field.voxel_size = lambda x: (0.02 * (1 + x.square().sum(-1, keepdim=True))).expand(-1, 2)
     rule = BakeOptions(tolerance=0, drop_unseen=False, cap_by_views=False, r_max=1024)
-    local = bake(made, [], rule).statistics["texels"]
-    finest = bake(made, [], replace(rule, local_voxel=False)).statistics["texels"]
-    paper = bake(made, [], replace(rule, local_voxel=False, extent=4.0)).statistics["texels"]
-    assert local["kept"] < finest["kept"] < paper["kept"]
-    assert paper["kept"] == paper["nyquist"] == paper["paper"] == finest["paper"] == local["paper"]
+    local = bake(made, [], rule).statistics.texels
+    finest = bake(made, [], replace(rule, local_voxel=False)).statistics.texels
+    paper = bake(made, [], replace(rule, local_voxel=False, extent=4.0)).statistics.texels
+    assert local.kept < finest.kept < paper.kept
+    assert paper.kept == paper.nyquist == paper.paper == finest.paper == local.paper
 
 
 def test_the_papers_count_does_not_depend_on_what_is_left_out(scene, camera):
@@ -101,7 +101,7 @@ def test_the_papers_count_does_not_depend_on_what_is_left_out(scene, camera):
     made.surfels["means"][::2, 2] -= 100.0  # behind the camera
     whole, part = (bake(made, [camera()], BakeOptions(drop_unseen=drop)) for drop in (False, True))
     assert len(part.rows) < len(whole.rows)
-    assert part.statistics["texels"]["paper"] == whole.statistics["texels"]["paper"]
+    assert part.statistics.texels.paper == whole.statistics.texels.paper
 
 
 def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
@@ -116,7 +116,7 @@ def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     assert (within.scene.surfels["view_span"][::2, 1] > 0).any()
     dropped = bake(made, [camera()])
     assert dropped.rows.tolist() == list(range(1, 50, 2))
-    assert dropped.statistics["surfels"]["left_out"]["unseen"] == 25
+    assert dropped.statistics.surfels.left_out.unseen == 25
 
 
 def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
@@ -135,7 +135,7 @@ def test_fine_tuned_texels_are_encoded_anew(scene):
     tiled = torch.from_numpy(baked.packing.tiles[:, 3:4] > 0)
     assert tiled.any() and not tiled.all()
     torch.testing.assert_close(tuned.mean_residual, baked.mean_residual + tiled.float())
-    assert "error" in baked.statistics and "error" not in tuned.statistics
+    assert baked.statistics.error is not None and tuned.statistics.error is None
     assert tuned.atlas.range.offset == pytest.approx(baked.atlas.range.offset + 1.0, abs=1e-4)
     with pytest.raises(ValueError, match="do not fit"):
         baked.with_texels(baked.texels[:, :4])
@@ -144,9 +144,9 @@ def test_fine_tuned_texels_are_encoded_anew(scene):
 def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
     made = scene(200)
     made.field.voxel_size = lambda x: torch.tensor([0.4, 0.05]).expand(len(x), 2)
-    isotropic = bake(made).statistics["texels"]["nyquist"]
+    isotropic = bake(made).statistics.texels.nyquist
     made.field.geometry = SimpleNamespace(mid=(0.0, 0.0, 0.0))
-    assert bake(made).statistics["texels"]["nyquist"] < isotropic
+    assert bake(made).statistics.texels.nyquist < isotropic
 
 
 @pytest.mark.parametrize(

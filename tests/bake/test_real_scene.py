@@ -6,13 +6,13 @@ import torch
 pytest.importorskip("bitymi_ns._cpu")
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.rotations import tangents
 
 
 def real_scene(surfels, count=80, kind="sv", min_resolution=8):
@@ -41,7 +41,7 @@ def test_tiles_at_the_nyquist_rate_hold_the_field(surfels, tmp_path):
     export(baked, tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     scales = bundle.scene.surfels["log_scales"].exp()
-    axes = tangent_vectors(bundle.scene.surfels["quats"]) * scales[:, None]
+    axes = tangents(bundle.scene.surfels["quats"]) * scales[:, None]
     errors, values = [], []
     for i, (x, y, layer, r_u, r_v) in enumerate(bundle.scene.tiles.tolist()):
         uv = torch.rand(100, 2, generator=torch.Generator().manual_seed(i)) * 4 - 2

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.geometry import tangent_vectors
-from bitymi_ns.bake.plan import fit, interpolation, kernel_parameters, make_plan, references, visible_extent
+from bitymi_ns.bake.plan import kernel_parameters, make_plan, visible_extent
+from bitymi_ns.bake.reference import references
+from bitymi_ns.bake.resample import fit, interpolation
 from bitymi_ns.ops.reference.texel import texel, texel_centers
+from bitymi_ns.train.rotations import tangents
 
 OPTIONS = BakeOptions(format="fp16")
 BOUND = 0.02
@@ -41,7 +43,7 @@ def discs(scene):
         made.surfels["opacity_logits"].fill_(2.0)
         made.surfels["beta_raw"].fill_(2.0)
         made.config.weight_bound = BOUND
-        return made, tangent_vectors(made.surfels["quats"])[0]
+        return made, tangents(made.surfels["quats"])[0]
 
     return make
 
@@ -72,7 +74,7 @@ def test_a_constant_residual_needs_no_tile(discs):
     baked = bake(made, options=OPTIONS)
     assert baked.atlas is None and not baked.packing.tiles.any()
     torch.testing.assert_close(baked.mean_residual, torch.full((8, 3), 0.25))
-    assert baked.statistics["error"]["rms"]["p100"] == 0 and baked.statistics["surfels"]["without_tile"] == 8
+    assert baked.statistics.error.rms.p100 == 0 and baked.statistics.surfels.without_tile == 8
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -89,7 +91,7 @@ def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(
     sizes = {}
     for tolerance in (0.1, 0.5, 2.0, 20.0):
         baked = bake(made, options=replace(OPTIONS, tolerance=tolerance))
-        assert baked.statistics["error"]["rms"]["p100"] <= tolerance + 0.02  # half floats
+        assert baked.statistics.error.rms.p100 <= tolerance + 0.02  # half floats
         sizes[tolerance] = baked.packing.texels
     assert sizes[0.1] > sizes[0.5] > sizes[2.0] > sizes[20.0] == 0
 
@@ -109,7 +111,7 @@ def test_the_error_is_the_one_that_independent_points_show(discs):
     weight = opacity * (1 - uv.square().sum(1) / 9) ** beta
     exact = made.field((uv * made.surfels["log_scales"][0].exp()) @ axes.T)
     error = 255 * weight[:, None] * (texel(tile, uv * 3 / extent) - exact)  # the reference's tiles reach to 3
-    stated = baked.statistics["error"]["rms"]["p50"]
+    stated = baked.statistics.error.rms.p50
     assert 0.3 < stated <= float(error.square().mean().sqrt()) < 1.2 * stated
 
 
@@ -117,7 +119,7 @@ def test_no_tolerance_gives_the_sizes_of_the_rule(discs):
     made, axes = discs()
     made.field = PlaneField(axes[:, 0], 1.0)
     exact = bake(made, options=replace(OPTIONS, tolerance=0.0))
-    assert exact.statistics["texels"]["kept"] == exact.statistics["texels"]["nyquist"]
+    assert exact.statistics.texels.kept == exact.statistics.texels.nyquist
     assert exact.extent.tolist() == [3.0] * 8
 
 

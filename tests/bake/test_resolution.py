@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake.geometry import tangent_vectors, texel_centres, tile_points
 from bitymi_ns.bake.resolution import max_projected_extent, next_power_of_two, nyquist_resolution, voxel_along_axes
+from bitymi_ns.bake.texels import texel_centres, tile_points
+from bitymi_ns.train.rotations import tangents
 
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]])  # u along x, v along y
 
@@ -39,7 +40,7 @@ def test_resolution_bounds_must_be_powers_of_two(r_min, r_max):
 
 
 def test_voxels_are_longer_along_the_ray_from_the_centre():
-    axes = tangent_vectors(FACING)
+    axes = tangents(FACING)
     voxel = torch.tensor([[9.0, 2.0]])
     along_x = voxel_along_axes(voxel, axes, torch.tensor([[5.0, 0.0, 0.0]]), torch.zeros(3))
     torch.testing.assert_close(along_x, torch.tensor([[9.0, 2.0]]))
@@ -51,28 +52,26 @@ def test_voxels_are_longer_along_the_ray_from_the_centre():
 
 def test_projected_extent_of_a_facing_disc(camera):
     means, scales = torch.zeros(1, 3), torch.tensor([[0.1, 0.2]])
-    pixels, views = max_projected_extent(means, tangent_vectors(FACING), scales, [camera(6.0), camera(12.0)])
+    pixels, views = max_projected_extent(means, tangents(FACING), scales, [camera(6.0), camera(12.0)])
     torch.testing.assert_close(pixels, torch.tensor([[6 * 0.1 * 60 / 6, 6 * 0.2 * 50 / 6]]))
     assert views.tolist() == [2]
 
 
 def test_surfels_behind_the_camera_or_far_outside_the_image_are_unseen(camera):
     means = torch.tensor([[0.0, 0.0, -7.0], [0.0, 0.0, -5.9], [50.0, 0.0, 0.0], [3.3, 0.0, 0.0]])
-    pixels, views = max_projected_extent(
-        means, tangent_vectors(FACING.expand(4, 4)), torch.full((4, 2), 0.1), [camera(6.0)]
-    )
+    pixels, views = max_projected_extent(means, tangents(FACING.expand(4, 4)), torch.full((4, 2), 0.1), [camera(6.0)])
     assert views.tolist() == [0, 0, 0, 1]  # the last one's centre is outside, its edge is not
     assert (pixels[:3] == 0).all() and (pixels[3] > 0).all()
 
 
 def test_texel_centres_leave_half_a_texel_at_both_ends():
-    torch.testing.assert_close(texel_centres(4, 3.0), torch.tensor([-2.25, -0.75, 0.75, 2.25]))
+    torch.testing.assert_close(texel_centres(4, torch.tensor([3.0])), torch.tensor([-2.25, -0.75, 0.75, 2.25]))
 
 
 def test_tile_points_run_u_along_rows():
     quats = torch.randn(5, 4, generator=torch.Generator().manual_seed(0))
     means, scales = torch.randn(5, 3), torch.rand(5, 2)
-    axes = tangent_vectors(quats)
+    axes = tangents(quats)
     torch.testing.assert_close(axes.transpose(1, 2) @ axes, torch.eye(2).expand(5, 2, 2))
     points = tile_points(means, axes * scales[:, None], (8, 4), 3.0)
     assert points.shape == (5, 4, 8, 3)

@@ -69,15 +69,15 @@ def wrong(truth: Baked) -> Baked:
 
 def test_tuning_finds_what_the_photographs_show(truth: Baked, wrong: Baked, views: list[View]) -> None:
     tuned = tune_atlas(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
-    statistics = tuned.statistics["finetune"]
-    assert statistics["views"] == 7 and statistics["held_in_views"] == 3
-    for which in ("psnr_held_in", "psnr_held_out"):
-        assert statistics[which]["after"] > statistics[which]["before"] + 3
+    statistics = tuned.statistics.finetune
+    assert statistics.views == 7 and statistics.held_in_views == 3
+    for gain in (statistics.psnr_held_in, statistics.psnr_held_out):
+        assert gain.after > gain.before + 3
     error = (tuned.mean_residual - truth.mean_residual)[0].abs()
     assert (error < 0.05).all()  # a surfel without a tile gets its constant
     assert tuned.atlas.psnr is not None and tuned.atlas.payload != wrong.atlas.payload
-    assert (wrong.texels == 0.1).all() and "finetune" not in wrong.statistics  # the bake itself is as it was
-    stated = statistics["psnr_held_out"]["after"]
+    assert (wrong.texels == 0.1).all() and wrong.statistics.finetune is None  # the bake itself is as it was
+    stated = statistics.psnr_held_out.after
     seen = [((render(tuned, v.camera).clamp(0, 1) - v.image) ** 2).mean().log10() * -10 for v in views[10:]]
     assert float(sum(seen) / 2) == pytest.approx(stated, abs=0.01)
 
@@ -114,11 +114,11 @@ def test_masked_pixels_are_not_seen(wrong: Baked, views: list[View]) -> None:
 
 def test_it_ends_with_the_best_texels_of_the_held_in_views(wrong: Baked, views: list[View]) -> None:
     wild = replace(OPTIONS, rate=50.0, steps=40, patience=2)
-    statistics = tune_atlas(wrong, views, BACKGROUND, wild).statistics["finetune"]
-    assert statistics["steps"] < 40  # no gain: it gives up
+    statistics = tune_atlas(wrong, views, BACKGROUND, wild).statistics.finetune
+    assert statistics.steps < 40  # no gain: it gives up
     perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
     kept = tune_atlas(wrong, perfect, BACKGROUND, wild)
-    assert kept.statistics["finetune"]["best_step"] == 0
+    assert kept.statistics.finetune.best_step == 0
     torch.testing.assert_close(kept.texels, wrong.texels, rtol=0, atol=0)
 
 
@@ -138,7 +138,7 @@ def test_the_texels_kept_are_those_of_the_best_look(
     tuned = tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, patience=99))
     best = max(range(len(seen)), key=lambda i: seen[i][0])
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5
-    assert tuned.statistics["finetune"]["psnr_held_in"]["after"] == pytest.approx(seen[best][0], abs=1e-4)
+    assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
     torch.testing.assert_close(TexelScene(tuned, BACKGROUND).texels, seen[best][1], rtol=0, atol=0)
 
 
@@ -151,9 +151,9 @@ def test_its_progress_ends_with_it(wrong: Baked, views: list[View], patience: in
             told.append((done, total))
 
     wild = replace(OPTIONS, rate=50.0, steps=40, patience=patience)
-    statistics = tune_atlas(wrong, views, BACKGROUND, wild, progress).statistics["finetune"]
-    assert (statistics["steps"] < 40) == (patience == 2) and statistics["steps_asked"] == 40
-    assert told[0] == (1, 40) and told[-1] == (statistics["steps"], statistics["steps"])
+    statistics = tune_atlas(wrong, views, BACKGROUND, wild, progress).statistics.finetune
+    assert (statistics.steps < 40) == (patience == 2) and statistics.steps_asked == 40
+    assert told[0] == (1, 40) and told[-1] == (statistics.steps, statistics.steps)
 
 
 def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: list[View]) -> None:
@@ -210,8 +210,8 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
     spoilt = [View(v.camera, torch.where(mask, v.image, float("nan")), mask) for v in views]
     tuned = tune_atlas(wrong, spoilt, BACKGROUND, few)
     assert tuned.texels.isfinite().all() and not torch.equal(tuned.texels, wrong.texels)
-    statistics = tuned.statistics["finetune"]["psnr_held_in"]
-    assert statistics["after"] > statistics["before"]
+    statistics = tuned.statistics.finetune.psnr_held_in
+    assert statistics.after > statistics.before
     clear = [View(v.camera, torch.cat([v.image, torch.zeros(40, 48, 1)], -1)) for v in views]
     plain = [View(v.camera, BACKGROUND.expand(40, 48, 3)) for v in views]
     same = [tune_atlas(wrong, each, BACKGROUND, few).texels for each in (clear, plain)]
@@ -220,7 +220,13 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
 
 def test_too_few_views_leave_the_atlas_alone(wrong: Baked, views: list[View]) -> None:
     same = tune_atlas(wrong, views[:3], BACKGROUND)
-    assert same.texels is wrong.texels and same.statistics["finetune"] == {"steps": 0, "views": 3}
+    assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
+
+
+def test_a_bake_on_another_device_is_refused_and_not_copied(wrong: Baked, views: list[View]) -> None:
+    moved = replace(wrong, scene=wrong.scene.to("meta"))
+    with pytest.raises(RuntimeError, match="the fine-tuning runs on the CPU only.*'meta': give it the bake as it was"):
+        tune_atlas(moved, views, BACKGROUND, OPTIONS)
 
 
 def test_a_scene_without_texture_is_refused(scene, views: list[View]) -> None:

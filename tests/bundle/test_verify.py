@@ -58,8 +58,8 @@ def test_percentiles_count_surfels_that_show_a_residual(scene):
         each.surfels["opacity_logits"][::2] = -4.5  # never reach the weight bound
     few.surfels = {name: value[1::2] for name, value in few.surfels.items()}
     options = BakeOptions(format="fp16", drop_unseen=False)
-    errors = [bake(each, [], options).statistics["error"]["rms"] for each in (made, few)]
-    assert errors[0] == errors[1] and errors[0]["p50"] > 0
+    errors = [bake(each, [], options).statistics.error.rms for each in (made, few)]
+    assert errors[0] == errors[1] and errors[0].p50 > 0
 
 
 def test_every_damaged_file_is_named(made, capsys):

@@ -127,7 +127,7 @@ def test_fine_tuning_mends_an_atlas_that_is_too_dark(
     def too_dark(*arguments: Any) -> Any:
         baked = make(*arguments)
         dark = baked.with_mean_residual(baked.mean_residual - 0.3).with_texels(baked.texels - 0.3)
-        return replace(dark, statistics={**dark.statistics, "error": baked.statistics["error"]})
+        return replace(dark, statistics=dark.statistics.but(error=baked.statistics.error))
 
     monkeypatch.setattr(host_export, "bake", too_dark)
     run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=100)

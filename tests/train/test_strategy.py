@@ -149,7 +149,7 @@ def test_children_lie_in_the_disc_of_their_parent(bench):
         halves = b.strategy._halves(b.scene.surfels, torch.tensor([0]))
         offsets.append(halves["means"] - parent["means"])
     offsets = torch.cat(offsets)
-    u, v = module.tangents(parent["quats"])
+    u, v = module.tangents(parent["quats"]).unbind(-1)
     assert (offsets @ torch.linalg.cross(u, v).T).abs().max() < 1e-5
     assert (offsets @ u.T).std().item() == pytest.approx(0.2, rel=0.1)
     assert (offsets @ v.T).std().item() == pytest.approx(0.05, rel=0.1)

@@ -118,6 +118,8 @@ BUNDLE_NOTES = (
 
 def bundles_table(matrix: Matrix, cells: Cells) -> str:
     """What sets the bundles of each run apart: size and error beside the first of them, and what they leave out."""
+    from bitymi_ns.bake.statistics import Statistics  # with torch, which nothing else of the benchmark needs
+
     lines = []
     for run in matrix.runs():
         neural = cells.get(Stage(run, "eval").key)
@@ -128,10 +130,11 @@ def bundles_table(matrix: Matrix, cells: Cells) -> str:
             if exported is None or cell is None or neural is None:
                 continue
             results, before = cell["value"]["results"], neural["value"]["results"]
-            statistics = exported["value"]["statistics"]
-            kept, texels = statistics["surfels"]["kept"], statistics.get("texels", {})
-            texels = texels.get("kept", texels.get("after_cap_by_views"))
-            size, lean = results.get("atlas_bytes"), statistics.get("view_color")
+            statistics = Statistics.model_validate(exported["value"]["statistics"], strict=False)
+            kept, texels = statistics.surfels.kept, statistics.texels
+            texels = None if texels is None else texels.after_cap_by_views if texels.kept is None else texels.kept
+            size, lean = results.get("atlas_bytes"), statistics.view_color
+            held_out, error = statistics.held_out, statistics.error
             first = size if first is None else first
             flips = (results.get("flip"), before.get("flip"))
             lines.append(
@@ -139,17 +142,17 @@ def bundles_table(matrix: Matrix, cells: Cells) -> str:
                     *_names(run),
                     bundle.name,
                     number(kept, 0),
-                    number(lean["sites"]["after"] / kept if lean else None, 2),
-                    number(lean["one_color"] / kept if lean else None, 3),
+                    number(lean.sites.after / kept if lean else None, 2),
+                    number(lean.one_color / kept if lean else None, 3),
                     number(None if texels is None else texels / kept, 0),
                     number(size, 0),
                     number(size / first, 3) if size and first else "",
                     difference(results["psnr"] - before["psnr"]),
-                    number(statistics.get("held_out", {}).get("psnr_baked_against_neural")),
+                    number(held_out.psnr_baked_against_neural if held_out else None),
                     "" if None in flips else difference(flips[0] - flips[1], 4),
                     number(results.get("render_ms"), 1),
-                    number(statistics.get("error", {}).get("rms", {}).get("p99")),
-                    number(lean["error"]["p99"] if lean else None),
+                    number(error.rms.p99 if error else None),
+                    number(lean.error.p99 if lean else None),
                 ]
             )
     return _without_empty(BUNDLE_HEADER, lines)

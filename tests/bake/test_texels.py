@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake.evaluate import evaluate_tiles, tile_means
-from bitymi_ns.bake.geometry import tangent_vectors
 from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.pages import tile_means
+from bitymi_ns.bake.texels import evaluate_tiles
+from bitymi_ns.train.rotations import tangents
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def test_every_texel_holds_the_field_at_its_centre(tiles):
     params, scales, packing = tiles
     texels, nonfinite = evaluate_tiles(lambda x: x, params["means"], params["quats"], scales, packing, chunk=100)
     assert texels.shape == (packing.layers, packing.height, packing.width, 3) and nonfinite == 0
-    axes = tangent_vectors(params["quats"])
+    axes = tangents(params["quats"])
     means = tile_means(texels, packing)
     for i, (x, y, layer, r_u, r_v) in enumerate(packing.tiles.tolist()):
         u = (torch.arange(r_u) + 0.5) / max(r_u, 1) * 6 - 3

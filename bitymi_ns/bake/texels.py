@@ -1,54 +1,51 @@
-"""Evaluation of the residual field at the texel centres of every tile."""
+"""The residual field at the texel centres of every tile: the paper's bake."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.geometry import tangent_vectors, tile_points
 from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene.field import HashField
+from bitymi_ns.train.rotations import tangents
 
 
-def size_classes(tiles: Tensor) -> list[tuple[int, int, Tensor]]:
-    """Tiles grouped by size.
-
-    Args:
-        tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
-
-    Returns:
-        a list of (r_u, r_v, rows [M] int64), sizes ascending; surfels without a tile are left out.
-    """
-    sizes, inverse = torch.unique(tiles[:, 3:], dim=0, return_inverse=True)
-    return [
-        (int(r_u), int(r_v), torch.nonzero(inverse == i).squeeze(1))
-        for i, (r_u, r_v) in enumerate(sizes.tolist())
-        if r_u > 0 and r_v > 0
-    ]
-
-
-def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
-    """Flat index, (layer * height + y) * width + x, of every texel of tiles that share one size.
+def texel_centres(count: int, extent: Tensor) -> Tensor:
+    """Surfel coordinates of the texel centres along one axis: (i + 0.5) / count * 2 extent - extent.
 
     Args:
-        tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
-        size: (r_u, r_v).
-        width, height: page size in texels.
+        count: texels along the axis.
+        extent: [...] half sides of tiles in scale units (e; 3 covers exactly the support), [1] or broadcast with it.
 
     Returns:
-        [N, r_v, r_u] int64.
+        [..., count] of the extents' type.
     """
-    x, y, layer = tiles[:, 0].long(), tiles[:, 1].long(), tiles[:, 2].long()
-    origin = (layer * height + y) * width + x  # [N]
-    i, j = torch.arange(size[0]), torch.arange(size[1])
-    return origin[:, None, None] + (j[:, None] * width + i[None, :])
+    return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
+
+
+def tile_points(means: Tensor, axes: Tensor, size: tuple[int, int], extent: float) -> Tensor:
+    """World positions of the texel centres of tiles that share one size: mean + u s_u R[:,0] + v s_v R[:,1].
+
+    Args:
+        means: [N, 3] world positions.
+        axes: [N, 3, 2] tangent directions times the scales, world units.
+        size: (r_u, r_v) texels along u and v.
+        extent: half side of the tile in scale units.
+
+    Returns:
+        [N, r_v, r_u, 3] world positions; rows run along v.
+    """
+    u, v = (texel_centres(count, means.new_tensor([extent])) for count in size)  # [r_u], [r_v]
+    across = u[:, None] * axes[:, None, :, 0]  # [N, r_u, 3]
+    down = v[:, None] * axes[:, None, :, 1]  # [N, r_v, 3]
+    return means[:, None, None, :] + across[:, None, :, :] + down[:, :, None, :]
 
 
 @torch.no_grad()
@@ -79,7 +76,7 @@ def evaluate_tiles(
             is not finite.
         nonfinite: number of texels whose value was not finite.
     """
-    axes = tangent_vectors(quats) * scales[:, None, :]  # [N, 3, 2]
+    axes = tangents(quats) * scales[:, None, :]  # [N, 3, 2]
     if isinstance(field, HashField) and cuda_backend(means.device):
         return _evaluate_on_device(field, means, axes, packing, extent, progress)
     tiles = torch.from_numpy(packing.tiles)
@@ -113,25 +110,3 @@ def _evaluate_on_device(
     total = int(tiles[:, 3:].long().prod(dim=1).sum())
     progress("evaluating texels", total, total)
     return texels.float().cpu(), int(nonfinite)
-
-
-def tile_means(texels: Tensor, packing: Packing, chunk: int = 1 << 20) -> Tensor:
-    """Mean of every tile of `texels` [layers, height, width, 3]: [N, 3], 0 without a tile."""
-    tiles = torch.from_numpy(packing.tiles)
-    flat = texels.reshape(-1, 3)
-    means = torch.zeros(len(tiles), 3)
-    for r_u, r_v, rows in size_classes(tiles):
-        for part in rows.split(max(1, chunk // (r_u * r_v))):
-            index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)
-            means[part] = flat[index].mean(dim=(1, 2))
-    return means
-
-
-def coverage(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:
-    """Which 4 x 4 blocks belong to a tile: [layers, height / 4, width / 4] bool."""
-    blocks = torch.from_numpy(np.ascontiguousarray(tiles)).clone()
-    blocks[:, [0, 1, 3, 4]] //= 4
-    mask = torch.zeros(layers * (height // 4) * (width // 4), dtype=torch.bool)
-    for r_u, r_v, rows in size_classes(blocks):
-        mask[texel_index(blocks[rows], (r_u, r_v), width // 4, height // 4).reshape(-1)] = True
-    return mask.reshape(layers, height // 4, width // 4).numpy()

@@ -1,0 +1,65 @@
+"""Where the texels of tiles lie in the pages of an atlas."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.packing import Packing
+
+
+def size_classes(tiles: Tensor) -> list[tuple[int, int, Tensor]]:
+    """Tiles grouped by size.
+
+    Args:
+        tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
+
+    Returns:
+        a list of (r_u, r_v, rows [M] int64), sizes ascending; surfels without a tile are left out.
+    """
+    sizes, inverse = torch.unique(tiles[:, 3:], dim=0, return_inverse=True)
+    return [
+        (int(r_u), int(r_v), torch.nonzero(inverse == i).squeeze(1))
+        for i, (r_u, r_v) in enumerate(sizes.tolist())
+        if r_u > 0 and r_v > 0
+    ]
+
+
+def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
+    """Flat index, (layer * height + y) * width + x, of every texel of tiles that share one size.
+
+    Args:
+        tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
+        size: (r_u, r_v).
+        width, height: page size in texels.
+
+    Returns:
+        [N, r_v, r_u] int64.
+    """
+    x, y, layer = tiles[:, 0].long(), tiles[:, 1].long(), tiles[:, 2].long()
+    origin = (layer * height + y) * width + x  # [N]
+    i, j = torch.arange(size[0]), torch.arange(size[1])
+    return origin[:, None, None] + (j[:, None] * width + i[None, :])
+
+
+def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None, chunk: int = 1 << 20) -> Tensor:
+    """Mean of every tile of `texels` [layers, height, width, 3]: [N, 3]; `constant` [N, 3] or 0 without one."""
+    tiles = torch.from_numpy(packing.tiles)
+    flat = texels.reshape(-1, 3)
+    means = torch.zeros(len(tiles), 3) if constant is None else constant.clone()
+    for r_u, r_v, rows in size_classes(tiles):
+        for part in rows.split(max(1, chunk // (r_u * r_v))):
+            index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)
+            means[part] = flat[index].mean(dim=(1, 2))
+    return means
+
+
+def coverage(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:
+    """Which 4 x 4 blocks belong to a tile: [layers, height / 4, width / 4] bool."""
+    blocks = torch.from_numpy(np.ascontiguousarray(tiles)).clone()
+    blocks[:, [0, 1, 3, 4]] //= 4
+    mask = torch.zeros(layers * (height // 4) * (width // 4), dtype=torch.bool)
+    for r_u, r_v, rows in size_classes(blocks):
+        mask[texel_index(blocks[rows], (r_u, r_v), width // 4, height // 4).reshape(-1)] = True
+    return mask.reshape(layers, height // 4, width // 4).numpy()

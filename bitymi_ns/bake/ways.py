@@ -1,0 +1,140 @@
+"""The two ways to bake: the paper's rule, which keeps everything, and the least that a tolerance allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
+from bitymi_ns.bake.lean_field import lean_field
+from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.packing import Packing, pack
+from bitymi_ns.bake.pages import tile_means
+from bitymi_ns.bake.plan import Field, Plan, kernel_parameters, make_plan
+from bitymi_ns.bake.progress import Progress
+from bitymi_ns.bake.reduce import reduce_tiles
+from bitymi_ns.bake.statistics import FieldLevels, ViewColorError
+from bitymi_ns.bake.subject import Subject
+from bitymi_ns.bake.texels import evaluate_tiles
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.scene.field import HashField
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """The tiles of N surfels and what they hold, on the CPU.
+
+    Attributes:
+        packing: where they lie.
+        texels: [layers, height, width, 3] float32 residual colours, None where there is no tile.
+        extent: [N] half side in scale units.
+        mean_residual: [N, 3] mean of every tile; the residual of a surfel without one.
+        nonfinite: points at which the field was not finite.
+    """
+
+    packing: Packing
+    texels: Tensor | None
+    extent: Tensor
+    mean_residual: Tensor
+    nonfinite: int = 0
+
+    @classmethod
+    def none(cls, count: int, extent: float) -> Tiles:
+        """Those of surfels that all go without."""
+        return cls(pack(torch.zeros(count, 2)), None, torch.full((count,), extent), torch.zeros(count, 3))
+
+
+class Way(Protocol):
+    """How a scene is baked, step by step."""
+
+    def field(self, field: Field, subject: Subject) -> tuple[Field, FieldLevels | None]:
+        """The field that the bake evaluates, and what was left out of it; None = nothing is looked for."""
+
+    def plan(self, field: Field, subject: Subject) -> Plan:
+        """What the tiles have to hold."""
+
+    def tiles(self, field: Field, plan: Plan, subject: Subject, progress: Progress) -> Tiles:
+        """The tiles, packed, with their texels."""
+
+    def view_color(self, subject: Subject, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError | None]:
+        """The surfels with the view colours that are kept, and what that costs; None = all are."""
+
+
+@dataclass(frozen=True)
+class ByTheRule:
+    """The paper's bake: sizes by the Nyquist rule, the field at the texel centres, all of the view colours."""
+
+    options: BakeOptions
+
+    def field(self, field: Field, subject: Subject) -> tuple[Field, None]:
+        """The field as it is."""
+        return field, None
+
+    def plan(self, field: Field, subject: Subject) -> Plan:
+        """Tiles of the extent and the texels that the options give."""
+        return _plan(field, subject, self.options, whole=True)
+
+    def tiles(self, field: Field, plan: Plan, subject: Subject, progress: Progress) -> Tiles:
+        """One for every surfel."""
+        o, p = self.options, subject.surfels
+        packing = pack(plan.limit.cpu(), o.page_width, o.page_rows)
+        geometry = (p["means"], p["quats"], p["log_scales"].exp())
+        texels, nonfinite = evaluate_tiles(field, *geometry, packing, o.extent, o.chunk, progress)
+        extent = torch.full((len(plan),), o.extent)
+        return Tiles(packing, texels, extent, tile_means(texels, packing), nonfinite)
+
+    def view_color(self, subject: Subject, progress: Progress) -> tuple[dict[str, Tensor], None]:
+        """All of it."""
+        return dict(subject.surfels), None
+
+
+@dataclass(frozen=True)
+class WithinTolerance:
+    """The least that keeps the tolerance: levels of the field, extents and grids of tiles, sites of view colours."""
+
+    options: BakeOptions
+
+    def field(self, field: Field, subject: Subject) -> tuple[Field, FieldLevels | None]:
+        """The levels that some surfel needs."""
+        if not isinstance(field, HashField):
+            return field, None
+        at = (subject.surfels, subject.transmittance, subject.weight_bound)
+        return lean_field(field, *at, self.options.tolerance)
+
+    def plan(self, field: Field, subject: Subject) -> Plan:
+        """Tiles of what can be seen."""
+        return _plan(field, subject, self.options, whole=False)
+
+    def tiles(self, field: Field, plan: Plan, subject: Subject, progress: Progress) -> Tiles:
+        """Of the smallest grid that holds the field, or none."""
+        o = self.options
+        reduced = reduce_tiles(field, plan, o.tolerance, o.r_min, o.chunk, progress)
+        packing = pack(reduced.sizes, o.page_width, o.page_rows)
+        texels = reduced.pages(packing)
+        extent = torch.where(plan.extent > 0, plan.extent, o.extent).cpu()
+        means = tile_means(texels, packing, reduced.constant)
+        return Tiles(packing, texels if packing.texels else None, extent, means, reduced.nonfinite)
+
+    def view_color(self, subject: Subject, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError]:
+        """As few sites as hold every surfel's colour; see `lean_color.reduce_view_color`."""
+        surfels, tolerance = subject.surfels, self.options.tolerance
+        kind, means = kind_of(surfels), surfels["means"]
+        opacity, _ = kernel_parameters(surfels, subject.transmittance)
+        at = (subject.seen, centers_of(subject.cameras, means), opacity)
+        lean = reduce_view_color(surfels, kind, *at, tolerance, progress)
+        error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
+        kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind].names}
+        return kept | lean.parameters(), describe(kind, surfels, lean, error, tolerance)
+
+
+def way_of(options: BakeOptions) -> Way:
+    """The way that the options ask for: nothing after this asks whether there is a tolerance."""
+    return WithinTolerance(options) if options.tolerance > 0 else ByTheRule(options)
+
+
+def _plan(field: Field, subject: Subject, options: BakeOptions, whole: bool) -> Plan:
+    at = (subject.cameras, subject.transmittance, subject.near, subject.weight_bound)
+    return make_plan(subject.surfels, field, options, *at, whole)

@@ -42,6 +42,11 @@ class Group:
     pictures: tuple[Picture, ...]
     left_out: int
 
+    @property
+    def broad(self) -> bool:
+        """Whether a picture needs half of the page's width."""
+        return any(picture.width > 2.2 * picture.height for picture in self.pictures)
+
 
 def open_image(path: Path) -> Image.Image:
     """Read an image as RGB, or as RGBA where it has transparency.

@@ -1,6 +1,6 @@
 """The memory that training or an export will take on the CPU, stated before it starts.
 
-What decides is the fragment list of one view (docs/architecture.md, Memory), whose length is found by counting those of
+What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
 a few views. The other numbers are measured; they belong to the default preset.
 """
 

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("bitymi_ns.measure", "templates"),
-        autoescape=select_autoescape(("html",)),
+        autoescape=select_autoescape(("html.j2",)),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -24,7 +24,7 @@ def _environment() -> Environment:
 
 
 def rendered(template: str, **values: Any) -> str:
-    """The template with its values. In .html templates every value is escaped; a name without a value is an error."""
+    """The template with its values. In .html.j2 templates every value is escaped; a name without a value is an error."""
     return _environment().get_template(template).render(**values)
 
 

@@ -8,10 +8,10 @@ from bitymi_ns.measure.templates import rendered
 
 def test_a_value_that_is_missing_is_an_error() -> None:
     with pytest.raises(jinja2.UndefinedError, match="content"):
-        rendered("report.html", generator="")
+        rendered("report.html.j2", generator="")
 
 
 def test_markdown_is_not_escaped() -> None:
     values = dict.fromkeys(("rim", "probes", "accurate", "steps", "allowance", "picture"), "<1")
-    page = rendered("stability.md", backend="<a>", sweeps=[], cases="| a | b |", **values)
+    page = rendered("stability.md.j2", backend="<a>", sweeps=[], cases="| a | b |", **values)
     assert "backend `<a>`" in page and page.endswith("## Cases\n\n| a | b |\n")

@@ -90,7 +90,7 @@ def _sections(plots: list[Plot]) -> list[Section]:
 def to_page(content: Content) -> str:
     """The report as a single HTML document that needs no other file."""
     return rendered(
-        "report.html",
+        "report.html.j2",
         content=content,
         sections=_sections(content.plots),
         knobs=KNOBS,

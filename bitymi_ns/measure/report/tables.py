@@ -1,4 +1,4 @@
-"""The tables of a report, as data and as Markdown; their HTML is in templates/report.html."""
+"""The tables of a report, as data and as Markdown; their HTML is in templates/report.html.j2."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
 
 def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:
     return rendered(
-        "stability.md",
+        "stability.md.j2",
         backend=backend.name,
         rim=f"{RIM:g}",
         probes=PROBES,

@@ -24,7 +24,7 @@ def _environment() -> Environment:
 
 
 def rendered(template: str, **values: Any) -> str:
-    """The template with its values. In .html.j2 templates every value is escaped; a name without a value is an error."""
+    """The template with its values. In .html.j2 every value is escaped; a name without a value is an error."""
     return _environment().get_template(template).render(**values)
 
 

@@ -42,7 +42,7 @@ from bitymi_ns.train.losses import psnr
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
-"""With fewer steps of fine-tuning per photograph than this the number of steps is a bound, and is said to be."""
+"""Steps of fine-tuning per photograph; with fewer than this a line says that more may gain."""
 
 
 @dataclass(kw_only=True)

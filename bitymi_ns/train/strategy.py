@@ -32,7 +32,7 @@ DrawViews = Callable[[int, torch.Generator], list[View]]
 """(k, CPU generator) -> k different training views, or all when there are fewer."""
 
 SPLIT_SHRINK = 1.6
-"""The two halves of a split surfel are smaller by this factor."""
+"""Factor by which the two halves of a split surfel are smaller."""
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 

@@ -16,7 +16,7 @@ MAX_WORST = 16
 """Worst views that a page shows."""
 MAX_IMAGES = 48
 MAX_WIDTH = 1200
-"""Wider images are scaled down."""
+"""Width in pixels to which wider images are scaled down."""
 MAX_PNG_BYTES = 400_000
 """Images that are larger as PNG are embedded as JPEG of quality 92."""
 

@@ -119,7 +119,7 @@ def _numbers(evaluations: list[Evaluation], everyone: list[Evaluation]) -> list[
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
-    """One row an evaluation, the best value of each column marked when the rows differ in it."""
+    """One row per evaluation, the best value of each column marked when the rows differ in it."""
     texts = []
     best: list[set[int]] = [set() for _ in evaluations]
     for j, column in enumerate(columns, 1):
@@ -174,7 +174,7 @@ def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | 
 
 
 def training_table(curves: list[Curve]) -> Table | None:
-    """One row a training run: how long, and where it ended."""
+    """One row per training run: how long, and where it ended."""
     if not curves:
         return None
     columns: list[tuple[str, Callable[[Curve], float | None], Callable[[float], str]]] = [

@@ -24,7 +24,7 @@ from bitymi_ns.measure.templates import rendered
 ACCURATE = 1e-4
 """Largest error that counts as accurate."""
 STEPS = round(1 / (255 * ACCURATE))
-"""So many times ACCURATE is an 8-bit step."""
+"""An 8-bit step in units of ACCURATE."""
 ALLOWANCE = 4.0
 """A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
 EXTENDED_SIZE = 20_000

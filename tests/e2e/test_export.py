@@ -199,6 +199,6 @@ def test_a_run_is_found_beside_its_configuration(
     assert path.parent == folder / "nerfstudio_models" and step == 59
 
 
-def test_the_presets_bake_options_are_those_of_the_command() -> None:
+def test_the_options_of_the_command_are_the_declared_defaults() -> None:
     options = default_export()
     assert (options.format, options.r_max, options.cap_by_views, options.tolerance) == ("bc7", 64, True, 0.75)

@@ -25,7 +25,7 @@ from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
 from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.host.export import load_trained
 from bitymi_ns.host.metrics import image_metrics
-from bitymi_ns.host.preset import build, load_preset
+from bitymi_ns.host.preset import build
 from bitymi_ns.measure.bench.tables import difference
 from bitymi_ns.train.views import View
 
@@ -85,7 +85,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
     options = parser.parse_args()
     stated = {name: yaml.safe_load(value) for name, value in (each.split("=", 1) for each in options.bake)}
-    bake_options = build(BakeOptions, {**load_preset("bitymi").bake, **stated}, "--bake", "")
+    bake_options = build(BakeOptions, stated, "--bake", "")
     rows = []
     for run in options.runs:
         rows += measure(run, options.formats, bake_options, TuneOptions(steps=options.finetune_steps))

@@ -23,7 +23,7 @@ from gpu_common import Options, milliseconds
 from plain_capture import Capture, load_capture
 
 from bitymi_ns import bake, bundle
-from bitymi_ns.host.preset import Preset, build, load_preset
+from bitymi_ns.host.preset import Preset, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene
@@ -120,9 +120,7 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
     with torch.no_grad():
         frame = milliseconds(lambda: scene.render(camera, field_mode="frozen"), options)
     start = time.perf_counter()
-    made = bake.bake(
-        scene, [view.camera for view in capture.train], build(bake.BakeOptions, preset.bake, name, "bake.")
-    )
+    made = bake.bake(scene, [view.camera for view in capture.train])
     bake_seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         bundle.export(made, Path(folder) / "bundle")

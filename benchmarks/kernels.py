@@ -367,7 +367,7 @@ def main() -> int:
             )
         title = (
             f"### {n:,} surfels at {options.width} x {options.height}\n\n{sizes.v:,} visible, {sizes.f:,} fragments "
-            f"({sizes.f / sizes.p:.1f} a pixel), {100 * sizes.t / sizes.f:.0f} % of them textured, {sizes.b:,} pairs "
+            f"({sizes.f / sizes.p:.1f} per pixel), {100 * sizes.t / sizes.f:.0f} % of them textured, {sizes.b:,} pairs "
             f"of surfel and tile ({sizes.r:,} with a fragment)\n"
         )
         parts.append(title + "\n" + table(header, rows, (0, 1)))

@@ -12,14 +12,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
-
-PLY_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
-    "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
-    "float32": "<f4", "float64": "<f8",
-}  # fmt: skip
 
 
 @dataclass
@@ -53,7 +48,7 @@ def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture
         downscale: whole factor by which photographs are reduced.
 
     Raises:
-        ValueError: the images have lens distortion, or the point cloud is of another kind.
+        ValueError: the images have lens distortion, or the point cloud is damaged.
     """
     meta = json.loads((folder / "transforms.json").read_text("utf8"))
     frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
@@ -89,28 +84,10 @@ def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, 
 
 
 def _points(path: Path) -> tuple[Tensor, Tensor]:
-    """Positions and colours of a PLY file whose one element is `vertex`."""
-    with open(path, "rb") as file:
-        header = []
-        while not header or header[-1] != "end_header":
-            line = file.readline()
-            if not line:
-                raise ValueError(f"{path} is no PLY file")
-            header.append(line.decode("ascii", "replace").strip())
-        body = file.read()
-    words = [line.split() for line in header]
-    count = next(int(w[2]) for w in words if w[:2] == ["element", "vertex"])
-    names = [(w[2], PLY_TYPES[w[1]]) for w in words if w[0] == "property"]
-    form = next(w[1] for w in words if w[0] == "format")
-    if form == "ascii":
-        table = np.array(body.split()[: count * len(names)], dtype=np.float64).reshape(count, len(names))
-        columns = {name: table[:, i] for i, (name, _) in enumerate(names)}
-    elif form == "binary_little_endian":
-        rows = np.frombuffer(body, dtype=names, count=count)
-        columns = {name: rows[name].astype(np.float64) for name, _ in names}
-    else:
-        raise ValueError(f"{path}: PLY files of the format {form} are not read")
+    """Positions and colours of a PLY file with the colours as bytes."""
+    rows = read_rows(path, read_header(path), "vertex")
     xyz, rgb = (
-        np.stack([columns[name] for name in group], axis=1) for group in (("x", "y", "z"), ("red", "green", "blue"))
+        np.stack([rows[name] for name in group], axis=1).astype(np.float64)
+        for group in (("x", "y", "z"), ("red", "green", "blue"))
     )
     return torch.from_numpy(xyz).float(), torch.from_numpy(rgb / 255).float()

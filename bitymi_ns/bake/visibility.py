@@ -47,7 +47,7 @@ def visibility(
     """Which views see every surfel, and through what.
 
     Args:
-        surfels: the per-surfel parameters of docs/architecture.md, N rows, all of them finite and drawable.
+        surfels: the per-surfel parameters of docs/overview.md, N rows, all of them finite and drawable.
         cameras: the views.
         near: nearest drawn depth.
         through_pixel: how the scene is drawn, see `ops.project`.

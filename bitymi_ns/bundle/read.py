@@ -195,7 +195,7 @@ def _read(path: Path, entry: FileEntry, verify: bool, check: Callable[[bytes, in
 
 def _check_surfels_header(info: Manifest, head: bytes, size: int) -> None:
     elements = ply.read_header(head, size).elements
-    count, terms = elements["vertex"][0], elements[TERMS][0] if TERMS in elements else None
+    count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
     if count != info.surfels.count:
         raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {info.surfels.count}")
     if terms != info.surfels.terms:

@@ -70,7 +70,7 @@ def to_columns(
     """The columns of surfels.ply; those of the terms of lean view colours are `term_columns`.
 
     Args:
-        surfels: the per-surfel parameters of docs/architecture.md, N rows each.
+        surfels: the per-surfel parameters of docs/overview.md, N rows each.
         tiles: [N, 5] int32.
         mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers; None = 0, no column.
         extent: [N] half side of each tile in scale units; None = no column.

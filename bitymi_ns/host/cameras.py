@@ -21,11 +21,12 @@ OFF_AXIS = 80
 USUAL_VIEW = (0.5, 150.0)
 """Degrees that a picture of a perspective camera may span; outside, the focal length is doubtful."""
 POSSIBLE_VIEW = (0.01, 178.0)
-"""Outside of these it cannot be meant: nothing but the middle pixels, or a single ray, would be seen."""
+"""Degrees that a picture may span at all: outside of these nothing but the middle pixels, or a single ray, would be
+seen, which cannot be meant."""
 LITTLE_LEFT = 0.25
 """Share of a photograph's area; where undistorting leaves less, the numbers are doubtful."""
 NOTHING_LEFT = 0.05
-"""Where undistorting leaves less than this, they cannot be meant."""
+"""Share of a photograph's area; where undistorting leaves less, the numbers cannot be meant."""
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:

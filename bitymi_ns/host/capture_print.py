@@ -10,7 +10,7 @@ from bitymi_ns.host.dataset import BitymiDataset
 from bitymi_ns.host.errors import warn
 
 STEP = 1e-4
-"""Poses are compared in steps of this, in the units of the scene."""
+"""Step in which poses are compared, in the units of the scene."""
 
 
 def capture_print(dataset: BitymiDataset) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from bitymi_ns.host.viewer import LOOPBACK, adopt_viewer
 from bitymi_ns.train.config import AdamConfig
 
 SEEDS = 1 << 32
-"""numpy takes seeds below this."""
+"""End of the range of seeds that numpy takes."""
 
 
 @dataclass

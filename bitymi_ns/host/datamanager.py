@@ -31,7 +31,7 @@ from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import View, training_order
 
 FEW_VIEWS = 10
-"""With fewer training views than this the multi-view scores rest on little."""
+"""Number of training views below which the multi-view scores rest on little."""
 
 
 @dataclass

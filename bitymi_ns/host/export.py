@@ -36,7 +36,6 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
-from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
@@ -44,7 +43,7 @@ from bitymi_ns.train.losses import psnr
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
-"""With fewer steps of fine-tuning per photograph than this the number of steps is a bound, and is said to be."""
+"""Steps of fine-tuning per photograph; with fewer than this a line says that more may gain."""
 
 
 @dataclass(kw_only=True)
@@ -152,9 +151,8 @@ class ExportAtlas(BakeOptions):
 
 
 def default_export() -> ExportAtlas:
-    """The options as the preset states them; what has no default is left open."""
-    options = build(BakeOptions, load_preset("bitymi").bake, "bitymi.yaml", "bake.")
-    return ExportAtlas(load_config=tyro.MISSING, output_dir=tyro.MISSING, **asdict(options))
+    """The options with their defaults; what has none is left open."""
+    return ExportAtlas(load_config=tyro.MISSING, output_dir=tyro.MISSING)
 
 
 def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:

@@ -1,6 +1,6 @@
 """The memory that training or an export will take on the CPU, stated before it starts.
 
-What decides is the fragment list of one view (docs/architecture.md, Memory), whose length is found by counting those of
+What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
 a few views. The other numbers are measured; they belong to the default preset.
 """
 
@@ -22,15 +22,15 @@ from bitymi_ns.train.views import REDUCED_BYTES
 COUNTED_VIEWS = 3
 """Views whose fragments are counted."""
 MARGIN = 1.1
-"""Another view may have so many times the fragments of these."""
+"""Factor by which another view may have more fragments than the counted ones."""
 PROGRAM = 800e6
-"""Python, the libraries, and a capture's cameras and points."""
+"""Bytes of Python, the libraries, and a capture's cameras and points."""
 PER_FRAGMENT = 56
 """Bytes: a list and the kernel's copy of it; or the list, its colours, and their gradients in the backward pass."""
 PER_PIXEL = 400
 """Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
 PER_SURFEL = 3000
-"""Bytes: in training, parameters, gradients, Adam's averages and the two states that a run could go back to."""
+"""Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
 
 @torch.no_grad()

@@ -19,9 +19,10 @@ from bitymi_ns.train.memory import Room
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the photographs of a capture, training and held-out views together."""
 AT_ONCE = 4
-"""So many are read together at the start."""
+"""Number of photographs that are read together at the start."""
 RECENT = 2
-"""So many that do not fit are kept until the next ones are read: one step asks for a view more than once."""
+"""Number of photographs beyond the memory that are kept until the next ones are read, because one step asks for a view
+more than once."""
 
 
 class Photographs(Sequence):

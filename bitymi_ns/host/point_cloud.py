@@ -11,7 +11,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from bitymi_ns.host.errors import say
-from bitymi_ns.host.ply import bad_line, read_header, rows_there
+from bitymi_ns.host.ply import POINTS, bad_line
+from bitymi_ns.ply import PlyError, read_header, rows_there
 
 MANY_POINTS = 500_000
 """Work on clouds from this size on is announced, and timed."""
@@ -21,17 +22,18 @@ def what_is_wrong_with(path: Path) -> str | None:
     """Why the file is no whole PLY file of points, in words that follow its name; None = nothing."""
     try:
         header = read_header(path)
-        if header is None:
-            return "is not a PLY file"
-        if header.count is None:
-            return "declares no points (element vertex)"
-        missing = [name for name in "xyz" if name not in header.names]
+        points = header.elements.get(POINTS)
+        if points is None:
+            return f"declares no points (element {POINTS})"
+        missing = [name for name in "xyz" if name not in points.names]
         if missing:
             return f"gives no {' and no '.join(missing)} of its points (property float {missing[0]})"
-        there = rows_there(path, header)
-        if there is not None and there < header.count:
-            return f"is cut off: it has {there} of {header.count} points"
+        there = rows_there(path, header, POINTS)
+        if there is not None and there < points.count:
+            return f"is cut off: it has {there} of {points.count} points"
         line = _bad_line(path, path.stat().st_mtime_ns)
+    except PlyError as error:
+        return f"is {error}" if str(error).startswith("not ") else f"is damaged, no points can be read: {error}"
     except OSError as error:
         return f"cannot be read: {error}"
     return None if line is None else f"is damaged: {line}"
@@ -40,8 +42,7 @@ def what_is_wrong_with(path: Path) -> str | None:
 @lru_cache(maxsize=2)
 def _bad_line(path: Path, changed: int) -> str | None:
     """The first line that is no point. A capture is checked twice before it is read, which would take seconds."""
-    header = read_header(path)
-    return None if header is None else bad_line(path, header)
+    return bad_line(path, read_header(path))
 
 
 def point_count(path: Path) -> int:
@@ -54,9 +55,9 @@ def point_count(path: Path) -> int:
             with open(path, "rb") as file:
                 stated = re.search(rb"Number of points: (\d+)", file.read(1000))
             return int(stated[1]) if stated else 0
-        header = read_header(path)
-        return 0 if header is None else header.count or 0
-    except (OSError, struct.error):
+        points = read_header(path).elements.get(POINTS)
+        return 0 if points is None else points.count
+    except (OSError, struct.error, PlyError):
         return 0
 
 

@@ -1,4 +1,7 @@
-"""Presets: the YAML files of method_configs/ as checked dataclasses."""
+"""Presets: the YAML files of method_configs/ as checked dataclasses.
+
+A default is declared once, in the dataclass of the option; a file states what differs from it.
+"""
 
 from __future__ import annotations
 
@@ -45,14 +48,18 @@ class DataOptions:
     """How a capture is split and read."""
 
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
+    """Rule by which photographs are held out, of nerfstudio's parsers."""
     eval_interval: int = 8
+    """Of so many photographs one is held out, as is usual for 3D Gaussian splatting."""
     load_3D_points: bool = True
+    """Start from the capture's points."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """How photographs are kept in memory."""
 
 
 @dataclass
 class Preset:
-    """One method: everything its YAML file says."""
+    """One method: the defaults that the dataclasses declare, changed by what its YAML file says."""
 
     name: str
     description: str = ""
@@ -61,8 +68,6 @@ class Preset:
     optimizer: AdamConfig = field(default_factory=AdamConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
-    bake: dict[str, Any] = field(default_factory=dict)
-    """Defaults of `ns-export bitymi-atlas`, by option name."""
 
 
 def load_preset(name: str, folder: Path | None = None) -> Preset:
@@ -138,10 +143,6 @@ def _converted(value: Any, hint: Any, file: str, key: str) -> Any:
             raise PresetError(f"{file}: {key}: expected a list{count}, found {value!r}")
         items = [args[0]] * len(value) if args[-1] is Ellipsis else args
         return tuple(_converted(v, a, file, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, items, strict=True)))
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise PresetError(f"{file}: {key}: expected a group of options, found {value!r}")
-        return value
     return _converted_plain(value, hint, file, key)
 
 

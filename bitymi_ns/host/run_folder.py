@@ -9,7 +9,7 @@ from bitymi_ns import files
 from bitymi_ns.host.errors import fail, warn
 
 LOCK = ".lock"
-"""In the run folder while a process trains into it."""
+"""Name of the file that lies in a run folder while a process trains into it."""
 
 
 def take(folder: Path) -> None:

@@ -17,7 +17,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene
 
 FEW_POINTS = 50
-"""With fewer points than this, much of a scene may have none near it."""
+"""Number of points below which much of a scene may have none near it."""
 
 
 def new_scene(

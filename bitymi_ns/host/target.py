@@ -14,9 +14,9 @@ from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_t
 from bitymi_ns.host.errors import fail, warn
 
 SURFEL_BYTES = 60 * 4
-"""Of the parameters of a surfel; a checkpoint holds them three times, with Adam's two moments."""
+"""Bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments."""
 TYPICAL_SIDE = 32
-"""Of a tile, generously: within a tolerance most are far smaller."""
+"""Side of a texture tile in texels, estimated generously: within a tolerance most are far smaller."""
 
 
 def see_writable(path: Path) -> None:

@@ -25,7 +25,7 @@ HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data 
 SIZES = ("w", "h")
 INTRINSICS = (*SIZES, "fl_x", "fl_y", "cx", "cy")
 LONGEST_SIDE = 1 << 20
-"""Pixels; what is beyond is no size of a picture."""
+"""Largest width or height of a picture that is believed, in pixels."""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 

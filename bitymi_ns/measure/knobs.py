@@ -19,7 +19,6 @@ from bitymi_ns.bake.options import STEPS
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.export import load_trained, replace_file
-from bitymi_ns.host.preset import build, load_preset
 from bitymi_ns.host.target import see_writable
 from bitymi_ns.measure.bench.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
@@ -167,8 +166,7 @@ class Knobs:
         model = pipeline.model
         self.scene = model.scene
         self.background = model.background.cpu()
-        self.preset: BakeOptions = build(BakeOptions, load_preset("bitymi").bake, "bitymi.yaml", "bake.")
-        self.options = replace(self.preset, drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
+        self.options = replace(BakeOptions(), drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
         cameras = pipeline.datamanager.undistorted_train_cameras()
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
@@ -221,7 +219,7 @@ class Knobs:
         if "r_max" in wanted and textured:
             yield self._of_the_bake("r_max", TILE_SIDES, self.options.r_max)
         if "tolerance" in wanted and textured:
-            yield self._of_the_bake("tolerance", TOLERANCES, self.preset.tolerance)
+            yield self._of_the_bake("tolerance", TOLERANCES, BakeOptions().tolerance)
 
     def _of_one_bake(self, wanted: Sequence[str], textured: bool) -> Iterator[list[Setting]]:
         baked = self._bake()

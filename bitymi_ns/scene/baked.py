@@ -34,7 +34,7 @@ class BakedScene:
     bundle holds.
 
     Attributes:
-        surfels: per-surfel parameters by name (docs/architecture.md), float32.
+        surfels: per-surfel parameters by name (docs/overview.md), float32.
         view_color: a name of `ops.VIEW_COLORS`.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
         atlas: [layers, height, width, 4] uint8 or float32 on the CPU, None = no residual. On a CUDA device float texels

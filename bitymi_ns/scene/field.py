@@ -21,7 +21,7 @@ class HashField(nn.Module):
         mid: centre of the domain, world.
         half: radius of the uncontracted ball, or half edge of the box, world units.
         contract: contraction of space outside.
-        log2_table_size: entries a level, as a power of two.
+        log2_table_size: entries per level, as a power of two.
         generator: random numbers of the start.
     """
 

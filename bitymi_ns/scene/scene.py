@@ -73,7 +73,7 @@ class Scene(nn.Module):
 
     Args:
         config: the representation.
-        surfels: initial per-surfel parameters by name (docs/architecture.md), first dimension N each.
+        surfels: initial per-surfel parameters by name (docs/overview.md), first dimension N each.
         field: residual colour field, None = surfels alone.
         near: nearest drawn depth, camera z, where the configuration does not give it.
 

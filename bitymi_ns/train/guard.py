@@ -44,11 +44,11 @@ if TYPE_CHECKING:
 WORSE = 1.25
 """A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
 RISE = 0.1
-"""And by this share of the loss of blank views: losses near 0 may double."""
+"""Share of the loss of blank views by which a bad window must also exceed the best one: losses near 0 may double."""
 EARLY = 0.1
 """Share of the run in which views may still be drawn a little worse than blank ones."""
 EARLY_STEPS = 100
-"""Least length of that time: surfels have to settle, however short the run."""
+"""Fewest steps in which that is allowed: surfels have to settle, however short the run."""
 BROKEN_SHARE = 0.01
 """Surfels that are not finite are dropped up to this share of all; beyond, the run goes back."""
 COMPARED_VIEWS = 4

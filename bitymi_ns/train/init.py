@@ -83,7 +83,7 @@ def surfels_from_points(
         box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
 
     Returns:
-        The parameters by name, float32, on the CPU (table in docs/architecture.md), and what became of the points.
+        The parameters by name, float32, on the CPU (table in docs/overview.md), and what became of the points.
     """
     if not 0.0 < config.init_opacity < 1.0:
         raise ValueError(f"the training option init_opacity must lie between 0 and 1, not {config.init_opacity}")

@@ -8,9 +8,9 @@ from typing import Any
 from bitymi_ns.train.config import TrainConfig
 
 MOST = 1e9
-"""No option means anything beyond this."""
+"""Largest value of any option that has no bound of its own."""
 TINY = 1e-9
-"""Stands for "more than 0"."""
+"""Smallest value of an option that must be more than 0."""
 RANGES: dict[str, tuple[float, float]] = {
     "loss.ssim_weight": (0, 1),
     "loss.falloff_weight": (0, MOST),

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Scores:
-    """One row a surfel.
+    """One row per surfel.
 
     Attributes:
-        importance: [N] int64, mean number of bad pixels a view that the surfel is blended into, rounded down.
+        importance: [N] int64, mean number of bad pixels, per view, that the surfel is blended into, rounded down.
         prune: [N] float32 in [0, 1]; high = covers many bad pixels of bad views.
     """
 

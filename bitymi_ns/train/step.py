@@ -37,7 +37,7 @@ def view_losses(
         view: on the scene's device, its picture at the size of its camera.
         schedule, step: which parts of the scene learn.
         config: training options.
-        watch: of the run; without one a step waits until its own loss is known.
+        watch: looks at the losses of the run; without one a step waits until its own loss is known.
 
     Returns:
         The weighted terms of the loss (their sum is the objective), and the rendered view.

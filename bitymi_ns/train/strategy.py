@@ -3,7 +3,7 @@
 At each densification, in this order: surfels that can never be seen again go (a value that is not finite; an opacity
 of 1/255 or less), surfels with many bad pixels and a large gradient are cloned or split, half of the candidates for
 pruning are drawn by lot, opacities are clamped. Between 60 and 90 % of the run, four final prunes remove what is
-transparent or in the way. See the published rules in docs/architecture.md.
+transparent or in the way. See the published rules in docs/training.md.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DrawViews = Callable[[int, torch.Generator], list[View]]
 """(k, CPU generator) -> k different training views, or all when there are fewer."""
 
 SPLIT_SHRINK = 1.6
-"""The two halves of a split surfel are smaller by this factor."""
+"""Factor by which the two halves of a split surfel are smaller."""
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 

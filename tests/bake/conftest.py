@@ -54,7 +54,7 @@ def make_camera(distance: float = 6.0, width: int = 64, height: int = 48) -> Cam
 
 @pytest.fixture(scope="session")
 def surfels():
-    """make(count, kind="sv", seed=0) -> the parameters of docs/architecture.md."""
+    """make(count, kind="sv", seed=0) -> the parameters of docs/overview.md."""
     return make_surfels
 
 

@@ -1,44 +1,20 @@
+"""What is written is read, and a write that fails leaves what was there."""
+
 import errno
 import hashlib
-import json
 import os
 import stat
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import Range, encode
 from bitymi_ns.bundle import BundleError, World, check_target, ktx2, ply, read_bundle, verify_bundle
 from bitymi_ns.bundle import write as bundle_module
-from bitymi_ns.bundle.manifest import parse
 from bitymi_ns.ops.reference import view_color as reference
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
-from tests.bundle.damage import amend, signed
-from tests.ops.test_view_color import lean_parameters
-
-
-def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
-    """A bundle of a few surfels and random texels; returns what went in."""
-    params = surfels(count, kind)
-    packing = pack([[8, 4]] * count)
-    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
-    atlas = None if format is None else encode(texels, packing, format, Range(-0.5, 2.0, "test"))
-    tiles = packing.tiles if atlas else np.zeros_like(packing.tiles)
-    write(folder, params, tiles, atlas, **kwargs)
-    return params, tiles, texels, atlas
-
-
-def make_lean(surfels, folder, kind="sv", count=6):
-    """A bundle with lean view colours and without texture; returns its surfels."""
-    params = {k: v for k, v in surfels(count, kind).items() if k not in VIEW_COLORS[kind].names}
-    params |= lean_parameters(kind, count, torch.float32)
-    write(folder, params, np.zeros((count, 5), dtype=np.int32), None, kind=kind)
-    return params
+from tests.bundle.damage import amend
+from tests.bundle.made import make, make_lean
 
 
 def names_beside(folder):
@@ -232,178 +208,3 @@ def test_a_folder_without_permission_is_a_clear_error(surfels, tmp_path):
             make(surfels, tmp_path / "b")
     finally:
         tmp_path.chmod(stat.S_IRWXU)
-
-
-def test_parameters_that_are_not_finite_are_not_written(surfels, tmp_path):
-    params = surfels(3)
-    params["log_scales"][1, 0] = float("nan")
-    with pytest.raises(BundleError, match="log_scales is not finite in row 1"):
-        write(tmp_path / "b", params, np.zeros((3, 5), dtype=np.int32), None)
-    with pytest.raises(BundleError, match="rows"):
-        write(tmp_path / "b", surfels(3), np.zeros((2, 5), dtype=np.int32), None)
-    with pytest.raises(BundleError, match="cannot be the name"):
-        make(surfels, tmp_path / "b", extra_files={"../escape": b""})
-    with pytest.raises(BundleError, match="may not replace"):
-        make(surfels, tmp_path / "b", extra_files={"surfels.ply": b""})
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_damage_is_named(surfels, tmp_path):
-    target = tmp_path / "b"
-    make(surfels, target, extra_files={"preview.png": b"picture"})
-    originals = {path.name: path.read_bytes() for path in target.iterdir()}
-    for name in ("surfels.ply", "atlas.ktx2", "preview.png"):
-        path = target / name
-        path.write_bytes(originals[name][:-1])
-        with pytest.raises(BundleError, match=f"{name} is truncated"):
-            read_bundle(target)
-        path.write_bytes(originals[name][:-1] + bytes([originals[name][-1] ^ 1]))
-        with pytest.raises(BundleError, match=f"{name} is altered"):
-            read_bundle(target)
-        path.unlink()
-        with pytest.raises(BundleError, match=f"{name} is missing"):
-            read_bundle(target)
-        path.write_bytes(originals[name])
-    read_bundle(target)
-    (target / "bundle.json").unlink()
-    with pytest.raises(BundleError, match="not a bundle"):
-        read_bundle(target)
-    with pytest.raises(BundleError, match="not a bundle"):
-        read_bundle(tmp_path / "nothing")
-
-
-def test_versions(surfels, tmp_path):
-    target = tmp_path / "b"
-    make(surfels, target)
-    amend(target, lambda info: info.update(version="1.7", holograms={"yes": True}))
-    assert read_bundle(target).info.holograms == {"yes": True}
-    amend(target, lambda info: info.update(version="3.0"))
-    with pytest.raises(BundleError, match="update bitymi-ns"):
-        read_bundle(target)
-    amend(target, lambda info: info.update(version="one"))
-    with pytest.raises(BundleError, match="must look like"):
-        read_bundle(target)
-
-
-@pytest.mark.parametrize(
-    "change, reason",
-    [
-        (lambda i: i.update(format="zip"), "not a bundle"),
-        (lambda i: i.pop("surfels"), "surfels is missing"),
-        (lambda i: i["surfels"].update(count=7), "it has 6 surfels, surfels.count of bundle.json says 7"),
-        (lambda i: i["surfels"].update(count=-1), "surfels.count must be greater than or equal to 0, not -1"),
-        (lambda i: i["surfels"].update(count=True), "surfels.count must be a valid integer, not True"),
-        (lambda i: i["surfels"].update(count=6.0), "surfels.count must be a valid integer, not 6.0"),
-        (lambda i: i["surfels"].pop("count"), "surfels.count is missing"),
-        (lambda i: i["surfels"].update(view_color="sh"), "surfels.ply"),
-        (lambda i: i["atlas"].update(width=20), "not those of"),
-        (lambda i: i["atlas"].update(offset=10**400), "atlas.offset must be a finite number"),
-        (lambda i: i["atlas"].update(scale=0), "atlas.scale must be greater than 0, not 0"),
-        (lambda i: i["atlas"].update(scale=1e30), r"atlas.scale must be less than or equal to 512, not 1e\+30"),
-        (lambda i: i["atlas"].update(file="../surfels.ply"), "atlas.file must be 'atlas.ktx2', not '../surfels.ply'"),
-        (lambda i: i["surfels"].update(file="atlas.ktx2"), "surfels.file must be 'surfels.ply'"),
-        (lambda i: i.update(atlas=None), "disagree"),
-        (lambda i: i["files"].pop("atlas.ktx2"), "disagree"),
-        (lambda i: i["files"].update({"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}), "cannot be the name"),
-        (lambda i: i["files"].update({"extra": []}), "files.extra must be an object"),
-        (lambda i: i["files"]["surfels.ply"].update(sha256="no"), "files.surfels.ply.sha256 must match"),
-        (lambda i: i["files"]["surfels.ply"].update(bytes=-1), "files.surfels.ply.bytes must be"),
-        (lambda i: i["render"].update(near="close"), "render.near must be a valid number, not 'close'"),
-        (lambda i: i["render"].update(near=0), "render.near must be greater than or equal to .*, not 0"),
-        (lambda i: i["render"].update(background=[0, 9e29, 0]), "render.background.1 must be less than or equal to 1"),
-        (lambda i: i["render"].update(weight_bound=False), "render.weight_bound must be a valid number, not False"),
-        (
-            lambda i: i["render"].update(t_min=1e-3),
-            "render.t_min must be 0.0001, which is what is drawn",
-        ),
-        (lambda i: i["surfels"].update(support=4), "surfels.support must be 3.0"),
-        (lambda i: i.update(color_bias=0), "color_bias must be 0.5"),
-        (
-            lambda i: i["world"].update(transform=[[1]]),
-            r"transform.0.1 is .*0.3 is missing \(and 2 more\)",
-        ),
-        (lambda i: i["world"].update(scale=-1), "world.scale must be greater than 0"),
-        (lambda i: i["bounds"].update(min=[0, 0, 1e300]), "bounds.min.2 must be"),
-        (lambda i: i.update(statistics=[1, 2]), r"statistics must be an object, not \[1, 2\]"),
-        (
-            lambda i: i["statistics"].update(options={"r_max": "wide"}),
-            "statistics.options.r_max must be a valid",
-        ),
-        (lambda i: i["statistics"].update(error=3), "statistics.error must be an object, not 3"),
-        (lambda i: i.update(generator="\ud800"), "hex escape"),
-    ],
-)
-def test_a_manifest_that_contradicts_the_files_is_refused(surfels, tmp_path, change, reason):
-    make(surfels, tmp_path / "b")
-    amend(tmp_path / "b", change)
-    with pytest.raises(BundleError, match=reason):
-        read_bundle(tmp_path / "b")
-
-
-def test_tiles_outside_the_atlas_are_refused(surfels, tmp_path):
-    params = surfels(1)
-    packing = pack([[8, 8]])
-    atlas = encode(np.zeros((1, 8, 8, 3), dtype=np.float32), packing, "uint8")
-    bad_tiles = [[4, 0, 0, 8, 8], [0, 4, 0, 8, 8], [0, 0, 1, 8, 8], [-4, 0, 0, 8, 8], [0, 0, 0, 8, 0]]
-    for i, tile in enumerate(bad_tiles):
-        write(tmp_path / str(i), params, np.array([tile], dtype=np.int32), atlas)
-        with pytest.raises(BundleError, match="outside the atlas"):
-            read_bundle(tmp_path / str(i))
-
-
-@pytest.fixture(scope="module")
-def good_bundle(tmp_path_factory):
-    return tmp_path_factory.mktemp("damage") / "b"
-
-
-@settings(deadline=None, max_examples=250)
-@given(st.data())
-def test_damaged_files_raise_only_bundle_errors(surfels, good_bundle, data):
-    if not good_bundle.exists():
-        make(surfels, good_bundle, "sb", "bc7", count=2)
-    name = data.draw(st.sampled_from(["surfels.ply", "atlas.ktx2", "bundle.json"]))
-    path = good_bundle / name
-    good = path.read_bytes()
-    bad = bytearray(good[: data.draw(st.one_of(st.just(len(good)), st.integers(0, len(good))))])
-    for _ in range(data.draw(st.integers(0, 3))):
-        if bad:
-            bad[data.draw(st.integers(0, len(bad) - 1))] = data.draw(st.integers(0, 255))
-    path.write_bytes(bad)
-    try:
-        for verify in (True, False):
-            try:
-                read_bundle(good_bundle, verify)
-                same = parse if name == "bundle.json" else bytes  # of JSON, white space may differ
-                assert same(bytes(bad)) == same(good) or (name != "bundle.json" and not verify)
-            except BundleError as error:
-                assert str(error)
-    finally:
-        path.write_bytes(good)
-
-
-@settings(deadline=None, max_examples=100)
-@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-                    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)), st.data())  # fmt: skip
-def test_any_json_in_any_place_raises_only_bundle_errors(surfels, good_bundle, value, data):
-    if not good_bundle.exists():
-        make(surfels, good_bundle, "sb", "bc7", count=2)
-    path = good_bundle / "bundle.json"
-    good = path.read_bytes()
-    info = json.loads(good)
-    at = info
-    while True:
-        key = data.draw(st.sampled_from(sorted(at)))
-        if not isinstance(at[key], dict) or not at[key] or data.draw(st.booleans()):
-            break
-        at = at[key]
-    at[key] = value
-    try:
-        path.write_bytes(signed(info))
-    except ValueError:  # a number that is not finite
-        path.write_bytes(json.dumps(info).encode("utf-8", "surrogatepass"))
-    try:
-        read_bundle(good_bundle)
-    except BundleError as error:
-        assert str(error)
-    finally:
-        path.write_bytes(good)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.host.config import BitymiTrainerConfig, method_config
 from bitymi_ns.sample import generate
+from tests.e2e.exports import TOLERANCE, run_export
 
 STEPS = 60
 
@@ -58,3 +60,20 @@ def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrain
     config.save_only_latest_checkpoint = False
     ns_train.main(config)
     return config
+
+
+@pytest.fixture(scope="session")
+def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The trained room as a bundle, its texels as they were learned. Not to be changed.
+
+    After so few steps little of the residual is worth a tile.
+    """
+    folder = tmp_path_factory.mktemp("bundles") / "room-bc7"
+    run_export(trained, folder, tolerance=TOLERANCE, finetune_steps=0)
+    return folder
+
+
+@pytest.fixture
+def copied(bundle: Path, tmp_path: Path) -> Path:
+    """The bundle in another place."""
+    return Path(shutil.copytree(bundle, tmp_path / "elsewhere"))

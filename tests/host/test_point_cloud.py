@@ -84,6 +84,7 @@ def test_other_files(tmp_path: Path) -> None:
         path.write_bytes(data)
         assert what_is_wrong_with(path) == "is not a PLY file"
     assert "no points" in str(what_is_wrong_with(write(path, b"", count="many")))
+    assert "the count 'many' of the element vertex is not a number" in str(what_is_wrong_with(path))
     assert "cannot be read" in str(what_is_wrong_with(tmp_path))
 
 

@@ -1,52 +1,65 @@
-"""Presets state every option once, and errors name the file and the key."""
+"""Presets state what differs from the declared defaults, and errors name the file and the key."""
 
-import dataclasses
+import ast
+import inspect
 from pathlib import Path
 
 import pytest
 import yaml
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.host.preset import DataOptions, PresetError, TrainerOptions, load_preset
+from bitymi_ns.host.preset import DataOptions, Preset, PresetError, TrainerOptions, load_preset
 from bitymi_ns.presets import preset_names, preset_path
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import AdamConfig, TrainConfig
+from bitymi_ns.train.config import AdamConfig
 
 METHODS = ["bitymi", "bitymi-quality", "bitymi-fast", "bitymi-sb", "bitymi-sg", "bitymi-sh", "bitymi-notexture"]
-
-
-def missing_keys(cls: type, values: dict, prefix: str = "") -> list[str]:
-    missing = []
-    for field in dataclasses.fields(cls):
-        if field.name not in values:
-            missing.append(prefix + field.name)
-        elif isinstance(values[field.name], dict):
-            missing += missing_keys(type(field.default_factory()), values[field.name], f"{prefix}{field.name}.")
-    return missing
 
 
 def test_the_presets_are_those_that_are_registered() -> None:
     assert sorted(METHODS) == preset_names()
 
 
-def test_the_default_preset_states_every_option() -> None:
-    values = yaml.safe_load(preset_path("bitymi").read_text("utf8"))
-    assert missing_keys(SceneConfig, values["scene"]) == []
-    assert missing_keys(TrainConfig, values["train"]) == []
-    assert missing_keys(BakeOptions, values["bake"]) == []
-    assert missing_keys(TrainerOptions, values["trainer"]) == []
-    assert missing_keys(AdamConfig, values["optimizer"]) == []
-    assert missing_keys(DataOptions, values["data"]) == []
-
-
-def test_the_default_preset_agrees_with_the_declared_defaults() -> None:
+def test_the_default_preset_is_the_declared_defaults() -> None:
     preset = load_preset("bitymi")
-    assert preset.scene == SceneConfig()
-    assert preset.train == TrainConfig()
-    assert BakeOptions(**preset.bake) == BakeOptions()
-    assert preset.trainer == TrainerOptions()
-    assert preset.optimizer == AdamConfig()
-    assert preset.data == DataOptions()
+    assert preset == Preset("bitymi", preset.description)
+
+
+def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
+    """Keys to which a preset gives the default again."""
+    found = []
+    for key, value in values.items():
+        default = getattr(defaults, key)
+        if isinstance(value, dict):
+            found += repeated(value, default, f"{prefix}{key}.")
+        elif value == default:
+            found.append(prefix + key)
+    return found
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_preset_states_no_default_again(name: str) -> None:
+    values = yaml.safe_load(preset_path(name).read_text("utf8"))
+    base = values.pop("base", None)
+    assert repeated(values, Preset(name) if base is None else load_preset(base)) == []
+
+
+def documented(cls: type) -> list[str]:
+    """Options without a line that says what they are, which the command line's help would lack."""
+    (tree,) = ast.parse(inspect.cleandoc("\n" + inspect.getsource(cls))).body
+    assert isinstance(tree, ast.ClassDef)
+    pairs = zip(tree.body, [*tree.body[1:], None], strict=True)
+    return [
+        ast.unparse(node.target)
+        for node, after in pairs
+        if isinstance(node, ast.AnnAssign)
+        and not (isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant))
+    ]
+
+
+@pytest.mark.parametrize("cls", [TrainerOptions, DataOptions, SceneConfig, AdamConfig, BakeOptions])
+def test_every_option_is_documented_where_it_is_declared(cls: type) -> None:
+    assert documented(cls) == []
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -80,6 +93,7 @@ def write(folder: Path, text: str, name: str = "mine") -> Path:
         ("scene:\n  levels: four", r"mine\.yaml: scene\.levels: expected int, found 'four'"),
         ("scene:\n  levels: true", r"scene\.levels: expected int"),
         ("scene:\n  view_color: xy", r"scene\.view_color: expected one of sv, sh, sb, sg"),
+        ("bake:\n  tolerance: 1.0", r"mine\.yaml: bake: unknown key; known here: .*scene, train"),
         ("scene: 3", r"mine\.yaml: scene: expected a group of options"),
         ("train:\n  lr:\n    means: [1.0]", r"train\.lr\.means: expected a list of 2 values"),
         ("train:\n  densify:\n    final_prune_steps: [1, x]", r"final_prune_steps\[1\]: expected int"),

@@ -90,7 +90,7 @@ def spread(
         cluster: slurm; local = processes of this machine.
         watcher: told about each cell that turns up.
         jobs: how many at a time (Slurm has its own queue: there it bounds what is in that queue).
-        gpus: local: GPUs by number, one a job, and as many jobs at a time as there are GPUs.
+        gpus: local: GPUs by number, one per job, and as many jobs at a time as there are GPUs.
         options: of a job (timeout_min, slurm_partition, ...).
 
     Returns:

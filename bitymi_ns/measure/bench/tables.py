@@ -103,7 +103,7 @@ def results_table(matrix: Matrix, cells: Cells) -> tuple[str, list[str]]:
 
 
 BUNDLE_HEADER = (
-    "scene", "row", "bundle", "surfels", "sites a surfel", "one colour", "texels a surfel", "atlas bytes",
+    "scene", "row", "bundle", "surfels", "sites per surfel", "one colour", "texels per surfel", "atlas bytes",
     "of the first", "dPSNR", "PSNR to neural", "dFLIP", "render ms", "tile error p99", "colour error p99",
 )  # fmt: skip
 BUNDLE_NOTES = (

@@ -16,7 +16,7 @@ MAX_WORST = 16
 """Worst views that a page shows."""
 MAX_IMAGES = 48
 MAX_WIDTH = 1200
-"""Wider images are scaled down."""
+"""Width in pixels to which wider images are scaled down."""
 MAX_PNG_BYTES = 400_000
 """Images that are larger as PNG are embedded as JPEG of quality 92."""
 
@@ -41,6 +41,11 @@ class Group:
     title: str
     pictures: tuple[Picture, ...]
     left_out: int
+
+    @property
+    def broad(self) -> bool:
+        """Whether a picture needs half of the page's width."""
+        return any(picture.width > 2.2 * picture.height for picture in self.pictures)
 
 
 def open_image(path: Path) -> Image.Image:

@@ -11,7 +11,7 @@ from bitymi_ns.measure.report.records import KnobPoint
 from bitymi_ns.measure.report.tables import MISSING, Row, Table, significant
 
 KNOBS = "Quality knobs: what they cost and save"
-"""Section of the page."""
+"""Heading of the page's section on quality knobs."""
 TITLES = {
     "weight_bound": "Weight bound",
     "transmittance": "Termination threshold",

@@ -50,9 +50,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 TWO, THREE = "{:.2f}".format, "{:.3f}".format
 QUALITY = (TWO, THREE, THREE, count, significant)
-"""PSNR, SSIM, LPIPS, N, FPS of ours."""
+"""Formats of our PSNR, SSIM, LPIPS, N and FPS."""
 PRINTED = (TWO, THREE, THREE, count, "{:,.1f}".format)
-"""The same with the digits that the paper prints; Tables 2 and 3 print whole frames."""
+"""Formats of `QUALITY` with the digits that the paper prints; Tables 2 and 3 print whole frames."""
 PRINTED_WHOLE = (*PRINTED[:4], count)
 
 

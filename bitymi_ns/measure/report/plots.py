@@ -16,7 +16,7 @@ from bitymi_ns.measure.report.records import Curve, Evaluation, Records, neural_
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Marks of baked evaluations, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
-"""Sections of the page."""
+"""Headings of the page's sections of plots."""
 CURVES = ("psnr_seconds", "psnr_cpu_seconds", "surfels_steps")
 """Names of the plots of training curves, which have no Pareto front."""
 MIN_POINTS = 3

@@ -1,10 +1,9 @@
-"""The tables of a report, as data, and as Markdown and HTML."""
+"""The tables of a report, as data and as Markdown; their HTML is in templates/report.html.j2."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 from bitymi_ns.measure import markdown
@@ -120,7 +119,7 @@ def _numbers(evaluations: list[Evaluation], everyone: list[Evaluation]) -> list[
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
-    """One row an evaluation, the best value of each column marked when the rows differ in it."""
+    """One row per evaluation, the best value of each column marked when the rows differ in it."""
     texts = []
     best: list[set[int]] = [set() for _ in evaluations]
     for j, column in enumerate(columns, 1):
@@ -175,7 +174,7 @@ def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | 
 
 
 def training_table(curves: list[Curve]) -> Table | None:
-    """One row a training run: how long, and where it ended."""
+    """One row per training run: how long, and where it ended."""
     if not curves:
         return None
     columns: list[tuple[str, Callable[[Curve], float | None], Callable[[float], str]]] = [
@@ -263,18 +262,3 @@ def to_markdown(table: Table) -> str:
             cells[0] = f"*{cells[0]}*"
         rows.append([f"**{c}**" if i in row.best else c for i, c in enumerate(cells)])
     return markdown.table([escaped(text) for text in table.header], rows)
-
-
-def to_html(table: Table) -> str:
-    """A table as HTML, in a box that scrolls sideways when it is too wide."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in table.header)
-    body = []
-    for row in table.rows:
-        if row.section:
-            body.append(f'<tr class="section"><th colspan="{len(table.header)}">{escape(row.cells[0])}</th></tr>')
-            continue
-        cells = [f"<b>{escape(t)}</b>" if i in row.best else escape(t) for i, t in enumerate(row.cells)]
-        body.append(f"<tr><th>{cells[0]}</th>" + "".join(f"<td>{c}</td>" for c in cells[1:]) + "</tr>")
-    rows = "\n".join(body)
-    dense = ' class="dense"' if len(table.header) > 10 else ""
-    return f'<div class="wide"><table{dense}>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'

@@ -38,6 +38,13 @@ class ComparedView:
     title: str
     columns: tuple[tuple[Picture, ...], ...]
 
+    @property
+    def stacks(self) -> tuple[tuple[Picture, ...], ...]:
+        """Pictures that stand below each other: the columns; with one folder every picture, its error beside it."""
+        if len(self.columns) > 2:
+            return self.columns
+        return tuple((picture,) for column in self.columns for picture in column)
+
 
 @dataclass(frozen=True)
 class ComparedSet:

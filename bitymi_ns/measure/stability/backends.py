@@ -31,7 +31,7 @@ BACKENDS: dict[str, Backend] = {
     "cuda": Backend("cuda", "cuda"),
     "emulated": Backend("emulated", "cpu", emulated_cuda),
 }
-"""By name; tests/stress runs every case on each that there is. `emulated`: the CUDA kernels, run on the host."""
+"""Backends by name; tests/stress runs every case on those that are there. `emulated`: CUDA kernels, run on the host."""
 
 
 def missing(backend: Backend) -> str:

@@ -25,7 +25,7 @@ CHANNELS = {
     "depth": slice(5, 6),
     "normal": slice(6, 9),
 }
-"""Where `ops.composite_image` puts them."""
+"""Places of the channels in the image of `ops.composite_image`."""
 RIM = 1e-3
 """Bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}

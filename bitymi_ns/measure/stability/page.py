@@ -19,41 +19,16 @@ from bitymi_ns.measure.stability.cases import cases
 from bitymi_ns.measure.stability.errors import PROBES, RIM, ROUNDING, Errors, Trust, against_extended, measure
 from bitymi_ns.measure.stability.scenes import SceneCase
 from bitymi_ns.measure.stability.sweeps import SWEEPS, Sweep
+from bitymi_ns.measure.templates import rendered
 
 ACCURATE = 1e-4
 """Largest error that counts as accurate."""
 STEPS = round(1 / (255 * ACCURATE))
-"""So many times ACCURATE is an 8-bit step."""
+"""An 8-bit step in units of ACCURATE."""
 ALLOWANCE = 4.0
 """A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
 EXTENDED_SIZE = 20_000
 """Largest number of pixels times surfels for which extended precision is evaluated."""
-
-INTRODUCTION = """\
-# Numerical stability
-
-Written by `bitymi stability`; measured on backend `{backend}`. What the formulas do about each of these cases, and why,
-is in [numerics.md](numerics.md); `tests/stress` holds every backend to the figures that
-`bitymi_ns/measure/stability/cases.py` states.
-
-**Error**: largest error over all pixels of rgb, alpha, depth, normal and Beta map (forward), and over all gradients of
-a random linear loss of these images (gradient), each relative to the largest value of its kind. The reference is
-float64 (brute force, `ops/reference`) and gets the same inputs, rounded to float32. Pixels in which a threshold (1/255,
-the end of the transmittance, the branch of the kernel) falls to the other side are not compared; **flipped** is their
-share. Gradients use the same bound at the rim of the kernel on both sides (`scene.rim`, {rim:g}).
-
-**Inputs**: how much the float64 reference itself moves when every input number is moved by half a unit in its last
-float32 place (the worst of {probes} random draws). No formula in float32 can be asked to do better than that on inputs
-that were rounded once. Divided by 2^-24 it is the condition number of the case.
-
-**float64**: the same kernels in double against the reference. **Reference**: the float64 reference against a separate
-evaluation in extended precision (64 bits of mantissa; gradients by complex steps); a dash where it is too large for
-that.
-
-**Verdict**: *accurate*: the errors of float32 and of float64 are at most {accurate:g}, 1/{steps} of an 8-bit step; *as
-the inputs allow*: at most {allowance:g} times what rounding the inputs to the same type does; *nothing drawn*; else
-*loses figures*.
-"""
 
 
 @dataclass(frozen=True)
@@ -124,18 +99,18 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
 
 
 def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:
-    parts = [
-        INTRODUCTION.format(
-            backend=backend.name, rim=RIM, probes=PROBES, accurate=ACCURATE, steps=STEPS, allowance=ALLOWANCE
-        ),
-        "## Error against stiffness\n",
-        f"![Error against stiffness, eight kinds]({picture})\n",
-        "Solid: float32. Dashed: what rounding the inputs does. Dotted: float64. Errors below 1e-17 are drawn there.\n",
-    ]
-    for sweep in SWEEPS:
-        parts += [f"### {sweep.name}: {sweep.axis}\n", _table(sweep.name, swept[sweep.name])]
-    parts += ["## Cases\n", _table("case", named)]
-    return "\n".join(parts)
+    return rendered(
+        "stability.md.j2",
+        backend=backend.name,
+        rim=f"{RIM:g}",
+        probes=PROBES,
+        accurate=f"{ACCURATE:g}",
+        steps=STEPS,
+        allowance=f"{ALLOWANCE:g}",
+        picture=picture,
+        sweeps=[(sweep, _table(sweep.name, swept[sweep.name])) for sweep in SWEEPS],
+        cases=_table("case", named),
+    )
 
 
 HEADER = (
@@ -175,7 +150,7 @@ def _table(first: str, rows: Sequence[Row]) -> str:
             row.verdict,
         ]
         lines.append([row.label, *cells])
-    return markdown.table([first, *HEADER], lines, (0, len(HEADER))) + "\n"
+    return markdown.table([first, *HEADER], lines, (0, len(HEADER)))
 
 
 def _short(value: float) -> str:

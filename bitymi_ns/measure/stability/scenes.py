@@ -20,7 +20,7 @@ class SceneCase:
     """A scene and a camera, all float64."""
 
     name: str
-    params: dict[str, Tensor]  # SURFEL_KEYS and SV_KEYS, as in docs/architecture.md
+    params: dict[str, Tensor]  # SURFEL_KEYS and SV_KEYS, as in docs/overview.md
     viewmat: Tensor  # [4, 4]
     K: Tensor  # [3, 3]
     width: int

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.measure.report.records import Records, evaluation_from
-from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, summary, to_html, to_markdown
+from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, summary, to_markdown
+from tests.measure.report.pages import page_of
 
 
 def make(scene="fox", method="bitymi", source="a/eval.json", **results):
@@ -67,5 +68,8 @@ def test_significant(value: float, text: str):
 
 def test_names_cannot_break_the_table():
     table = Table("t", ("Method", "A"), (Row(("<script>a|b</script>", "1"), frozenset({1})),))
-    assert "<script>" not in to_html(table) and "&lt;script&gt;" in to_html(table)
+    title = table.rows[0].cells[0]
+    page = page_of(title=title, summary=[title], quality=[table], training=table, everything=table, paper=[table])
+    assert "<script>" not in page and page.count("<th>&lt;script&gt;a|b&lt;/script&gt;</th>") == 4
+    assert page.count("<td><b>1</b></td>") == 4 and "<title>&lt;script&gt;a|b&lt;/script&gt;</title>" in page
     assert to_markdown(table).splitlines()[2] == "| <script>a\\|b</script> | **1** |"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.measure.report.page import _views
 from bitymi_ns.measure.report.views import ERROR_SCALE, compare_views, heat
+from tests.measure.report.pages import page_of
 
 
 def write(folder: Path, name: str, errors: list[float], tint: float = 0.0) -> list[Path]:
@@ -38,20 +39,20 @@ def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path
     # of 8-bit pictures: errors of 12 and 2 steps
     best = [column[0].caption for column in compared.views[2].columns]
     assert best == ["photograph", "neural: 26.55 dB", "baked: 42.11 dB"]
-    html = "".join(_views(compared, named=False))
+    html = page_of(views=[compared])
     assert html.count("<figure>") == 15 and html.count('<div class="views">') == 3
 
 
 def test_one_folder_has_its_error_beside_the_render(tmp_path: Path) -> None:
     (compared,), _, _ = compare_views(write(tmp_path, "renders", [0.1, 0.2]))
-    html = "".join(_views(compared, named=False))
-    assert html.count("<div><figure>") == 2 * 3  # two views are worst and best
+    html = page_of(views=[compared])
+    assert len(re.findall(r"<div>\s*<figure>", html)) == 2 * 3  # two views are worst and best
 
 
 def test_renders_of_other_photographs_are_apart(tmp_path: Path) -> None:
     sets, _, _ = compare_views([*write(tmp_path, "a", [0.1, 0.2]), *write(tmp_path, "b", [0.1, 0.2], tint=0.1)])
     assert [compared.title for compared in sets] == ["a", "b"]
-    assert "a: Worst view" in "".join(_views(sets[0], named=True))
+    assert "<h3>a: Worst view" in page_of(views=sets) and "<h3>a: " not in page_of(views=sets[:1])
 
 
 @pytest.mark.parametrize("spoil", ["cut", "odd"])

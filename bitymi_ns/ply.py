@@ -1,0 +1,187 @@
+"""PLY files: what their header says, and the rows of an element, binary or text.
+
+`bundle.ply` reads and writes the PLY file of a bundle with it, `host.ply` judges the point clouds of captures.
+
+plyfile, the library for such files, is not used: it is under the GPL and this package under Apache-2.0, and it takes
+memory for as many rows of text as a header claims. Here nothing is taken that the file does not have.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+HEADER_LIMIT = 1 << 16
+"""No header is longer, in bytes."""
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+_MAGIC = re.compile(rb"ply[ \t]*\r?\n")
+_END = re.compile(rb"\nend_header[ \t]*\r?\n")
+
+
+class PlyError(ValueError):
+    """The bytes are not a PLY file, or not one of the kind that is wanted; the message says what is wrong."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """What a PLY file declares of one element.
+
+    Attributes:
+        count: of its rows.
+        names: of its properties.
+        row: type of a row, a field per property; None where a property is a list.
+    """
+
+    count: int
+    names: tuple[str, ...]
+    row: np.dtype | None
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a PLY file declares.
+
+    Attributes:
+        order: of the bytes, < or >; "" in a text file.
+        elements: by name, in the file's order.
+        start: where the rows begin, bytes.
+        lines: of the header.
+    """
+
+    order: str
+    elements: dict[str, Element]
+    start: int
+    lines: int
+
+    def ahead(self, name: str) -> int | None:
+        """What lies between the header and an element's rows: lines of a text file, else bytes; None where lists do
+        not tell."""
+        total = 0
+        for other, element in self.elements.items():
+            if other == name:
+                break
+            if self.order and element.row is None:
+                return None
+            total += element.count * (element.row.itemsize if self.order and element.row is not None else 1)
+        return total
+
+
+def read_header(path: Path) -> Header:
+    """The header of a file; PlyError where it is none."""
+    with open(path, "rb") as file:
+        return parse_header(file.read(HEADER_LIMIT))
+
+
+def parse_header(data: bytes | bytearray) -> Header:
+    """The header of a file that begins with `data`, which is all of it or its first `HEADER_LIMIT` bytes.
+
+    Raises:
+        PlyError: there is no header, or it has a line that is not understood.
+    """
+    end = _END.search(data, 0, HEADER_LIMIT)
+    if not _MAGIC.match(data) or end is None:
+        raise PlyError("not a PLY file")
+    lines = data[: end.start()].decode("latin-1").split("\n")[1:]
+    lines = [line for line in lines if line.split()[:1] not in ([], ["comment"], ["obj_info"])]
+    if not all(line.isascii() for line in lines):
+        raise PlyError("the PLY header is not ASCII text")
+    form = lines[0].split() if lines else []
+    if len(form) != 3 or form[0] != "format" or form[1] not in _ORDERS or form[2] != "1.0":
+        raise PlyError(f"the PLY header names no known format: {' '.join(form)!r}")
+    order = _ORDERS[form[1]]
+    elements = _elements(lines[1:], order)
+    return Header(order, elements, end.end(), data.count(b"\n", 0, end.end()))
+
+
+def _elements(lines: Sequence[str], order: str) -> dict[str, Element]:
+    found: dict[str, tuple[int, dict[str, str | None]]] = {}
+    properties: dict[str, str | None] = {}
+    for line in lines:
+        match line.split():
+            case ["element", name, count] if name not in found:
+                if not re.fullmatch(r"[0-9]{1,10}", count):
+                    raise PlyError(f"the count {count!r} of the element {name} is not a number")
+                properties = {}
+                found[name] = int(count), properties
+            case ["property", *kind, name] if found and _known(kind):
+                if name in properties:
+                    raise PlyError(f"the PLY header declares the property {name} twice")
+                properties[name] = _TYPES[kind[0]] if len(kind) == 1 else None
+            case _:
+                raise PlyError(f"the PLY header has a line that is not understood: {line.strip()!r}")
+    return {name: Element(count, tuple(own), _row(own, order)) for name, (count, own) in found.items()}
+
+
+def _known(kind: Sequence[str]) -> bool:
+    if len(kind) == 3 and kind[0] == "list":
+        kind = kind[1:]
+    else:
+        kind = kind if len(kind) == 1 else [""]
+    return all(name in _TYPES for name in kind)
+
+
+def _row(properties: dict[str, str | None], order: str) -> np.dtype | None:
+    types = [(name, f"{order}{kind}") for name, kind in properties.items() if kind is not None]
+    return np.dtype(types) if len(types) == len(properties) else None
+
+
+def rows_there(path: Path, header: Header, name: str) -> int | None:
+    """How many rows of an element the file has room for; None where that cannot be told from the header."""
+    element, ahead = header.elements[name], header.ahead(name)
+    if ahead is None:
+        return None
+    if not header.order:
+        return sum(1 for _ in text_lines(path, header, name))
+    if element.row is None:
+        return None
+    return max(0, path.stat().st_size - header.start - ahead) // max(1, element.row.itemsize)
+
+
+def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
+    """The rows of an element, [count], a field per property.
+
+    Raises:
+        PlyError: the rows have lists or follow some, there are fewer than stated, or a line of text is no row.
+    """
+    element, ahead = header.elements[name], header.ahead(name)
+    if element.row is None or ahead is None:
+        raise PlyError(f"the rows of the element {name} have lists, or stand behind some")
+    if not header.order:
+        text = (line for _, line in islice(text_lines(path, header, name), element.count))
+        with warnings.catch_warnings(), np.errstate(over="ignore"):
+            warnings.simplefilter("error", DeprecationWarning)  # a fraction for a whole number
+            warnings.filterwarnings("ignore", "loadtxt", UserWarning)  # no line at all
+            try:
+                rows = np.loadtxt(text, element.row, comments=None, ndmin=1)
+            except (ValueError, DeprecationWarning) as error:
+                raise PlyError(f"a line is no row of the element {name}: {error}") from error
+    else:
+        there = rows_there(path, header, name) or 0  # fromfile takes the memory first
+        rows = np.fromfile(path, element.row, min(there, element.count), offset=header.start + ahead)
+    if len(rows) < element.count:
+        raise PlyError(f"it is cut off: it has {len(rows)} of {element.count} rows of the element {name}")
+    return rows
+
+
+def text_lines(path: Path, header: Header, name: str) -> Iterator[tuple[int, str]]:
+    """Number, from 1 in the file, and text of each line from an element's first row on; empty ones do not count."""
+    with open(path, encoding="latin-1", newline="\n") as file:
+        filled = ((number, line) for number, line in enumerate(file, 1) if number > header.lines and line.strip())
+        yield from islice(filled, header.ahead(name), None)

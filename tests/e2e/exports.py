@@ -1,0 +1,25 @@
+"""Exports of runs, and what nerfstudio's evaluation says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.scripts.eval import ComputePSNR
+
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.export import ExportAtlas
+
+TOLERANCE = 0.02
+
+
+def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> None:
+    ExportAtlas(load_config=config.get_base_dir() / "config.yml", output_dir=folder, **options).main()
+
+
+def evaluate(config: Path, output: Path) -> dict[str, float]:
+    ComputePSNR(load_config=config, output_path=output).main()
+    text = output.read_text()
+    assert "NaN" not in text
+    return json.loads(text)["results"]

@@ -1,0 +1,56 @@
+"""Which checkpoint of a run is evaluated, and which are refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from tests.e2e.runs import a_run_of, rewrite
+
+
+def test_evaluation_refuses_a_checkpoint_that_is_damaged_or_missing(
+    trained: BitymiTrainerConfig, tmp_path: Path
+) -> None:
+    folder = a_run_of(trained, tmp_path)
+    newest = folder / "nerfstudio_models" / "step-000000059.ckpt"
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.raises(InputError, match=f"{newest} is damaged(.|\n)*go back to step-000000040.ckpt"):
+        eval_setup(folder / "config.yml")
+    newest.unlink()
+    assert eval_setup(folder / "config.yml")[3] == 40
+    shutil.rmtree(newest.parent)
+    newest.parent.mkdir()
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        eval_setup(folder / "config.yml")
+
+
+def test_evaluation_refuses_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    folder = a_run_of(trained, tmp_path)
+    rewrite(folder, lambda config: setattr(config.pipeline.model.scene, "view_color", "sg"))
+    with pytest.raises(InputError, match="another preset:\n.*view-color: sv there, sg here"):
+        eval_setup(folder / "config.yml")
+
+
+def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    folder = a_run_of(trained, tmp_path)
+    rewrite(folder, lambda config: setattr(config, "load_step", 7))  # of the run that it went on from
+    assert eval_setup(folder / "config.yml")[3] == 59
+
+
+def test_the_near_plane_is_the_one_of_the_training(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    scene = eval_setup(trained.get_base_dir() / "config.yml")[1].model.scene
+    assert 0.02 < scene.near < 0.04  # nerfstudio scales the cameras to 1
+    folder = a_run_of(trained, tmp_path)
+    path = max((folder / "nerfstudio_models").iterdir())
+    state = torch.load(path, weights_only=True)
+    state["pipeline"]["_model._extra_state"]["near"] = 0.5
+    torch.save(state, path)
+    assert eval_setup(folder / "config.yml")[1].model.scene.near == 0.5
+    rewrite(folder, lambda config: setattr(config.pipeline.model.scene, "near", 0.1))
+    assert eval_setup(folder / "config.yml")[1].model.scene.near == 0.1

@@ -1,0 +1,159 @@
+"""Exports that are refused before the work, and bundles that are not opened."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from nerfstudio.utils.eval_utils import eval_setup
+
+from bitymi_ns.host import export as host_export
+from bitymi_ns.host import target
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.export import ExportAtlas
+from tests.e2e.exports import run_export
+
+
+def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerConfig, copied: Path) -> None:
+    before = (copied / "bundle.json").read_bytes()
+    with pytest.raises(InputError, match="is a bundle already.*--overwrite True"):
+        run_export(trained, copied)
+    assert (copied / "bundle.json").read_bytes() == before
+    run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)
+    info = json.loads((copied / "bundle.json").read_text())
+    assert info["statistics"]["options"]["r_max"] == 8 and "held_out" not in info["statistics"]
+
+
+def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("x")
+    with pytest.raises(InputError, match="is not a bundle"):
+        run_export(trained, tmp_path, overwrite=True)
+    with pytest.raises(InputError, match="is not a bundle") as stop:
+        run_export(trained, tmp_path)
+    assert "--overwrite" not in str(stop.value)  # which would not help
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="link is a link to nothing"):
+        run_export(trained, tmp_path / "link")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "precious.txt"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"finetune_steps": -1}, "--finetune-steps must not be negative"),
+        ({"finetune_memory": math.inf}, "--finetune-memory must be from 0 to"),
+        ({"finetune_memory": math.nan}, "--finetune-memory must be from 0 to"),
+        ({"page_width": 100}, "page width must be a power of two"),
+        ({"r_max": 48}, "r_max must be a power of two"),
+        ({"r_max": 8192}, "do not fit pages"),
+        ({"seed": -1}, "seed must not be negative"),
+    ],
+)
+def test_options_out_of_range_are_found_before_the_work(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: Any, message: str
+) -> None:
+    monkeypatch.setattr(host_export, "load_trained", None)  # is not called
+    with pytest.raises(InputError, match=message):
+        run_export(trained, tmp_path / "b", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_that_make_no_sense(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be baked: .*power of two"):
+        run_export(trained, tmp_path / "b", r_min=5)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_config_of_another_kind(tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_text("just text")
+    with pytest.raises(InputError, match="is not the configuration of a trained scene"):
+        host_export.load_trained(tmp_path / "config.yml")
+
+
+def test_a_place_that_will_not_do_is_found_before_the_work(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host_export, "load_trained", None)  # is not called
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="b cannot be written: .*file is not a folder.*--output-dir"):
+        run_export(trained, tmp_path / "file" / "b")
+    with pytest.raises(InputError, match="cannot be written: the name is too long"):
+        run_export(trained, tmp_path / ("b" * 300))
+    monkeypatch.setattr(target, "free_bytes", lambda path: 34_500)
+    with pytest.raises(
+        InputError, match=r"too little room .*: 34.5 kB are free, .* up to \d.* MB \(a generous estimate"
+    ):
+        run_export(trained, tmp_path / "b")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_missing_encoder_is_named(
+    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
+    with pytest.raises(InputError, match="pip install ispc_texcomp"):
+        run_export(trained, tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_that_is_not_there_or_not_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no .*config.yml"):
+        ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
+    (tmp_path / "config.yml").write_text("a: [")
+    with pytest.raises(InputError, match="is not the configuration"):
+        ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
+
+
+def test_a_damaged_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "outputs/room/bitymi/run"))
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir = tmp_path / "outputs"
+    (folder / "config.yml").write_text(yaml.dump(config))
+    path = folder / "nerfstudio_models" / "step-000000059.ckpt"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="damaged"):
+        ExportAtlas(load_config=folder / "config.yml", output_dir=tmp_path / "b").main()
+
+
+def test_a_bundle_cannot_be_baked_again(bundle: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="which is baked already"):
+        ExportAtlas(load_config=bundle / "config.yml", output_dir=tmp_path / "b").main()
+
+
+@pytest.mark.parametrize("name", ["surfels.ply", "atlas.ktx2"])
+def test_damaged_bundles_are_refused(copied: Path, name: str) -> None:
+    path = copied / name
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=f"{name} is truncated.*or export the scene again"):
+        eval_setup(copied / "config.yml")
+    path.write_bytes(whole[:-9] + bytes(9))
+    with pytest.raises(InputError, match=f"{name} is altered"):
+        eval_setup(copied / "config.yml")
+    path.unlink()
+    with pytest.raises(InputError, match=f"{name} is missing"):
+        eval_setup(copied / "config.yml")
+
+
+def test_a_bundle_of_a_newer_version_is_refused(copied: Path) -> None:
+    info = json.loads((copied / "bundle.json").read_text())
+    (copied / "bundle.json").write_text(json.dumps({**info, "version": "3.0"}))
+    with pytest.raises(InputError, match="version 3.0.*update bitymi-ns"):
+        eval_setup(copied / "config.yml")
+
+
+def test_a_configuration_without_its_bundle(copied: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.model.bundle = tmp_path / "gone"
+    (alone / "config.yml").write_text(yaml.dump(config))
+    with pytest.raises(InputError, match="no bundle found"):
+        eval_setup(alone / "config.yml")

@@ -1,0 +1,184 @@
+"""Runs that are interrupted and go on, and checkpoints from which none can."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.scripts import train as ns_train
+
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.curve import FILE
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.trainer import BitymiTrainer
+from tests.e2e.runs import Start, a_run_of, checkpoint
+
+
+def different(a: Any, b: Any, path: str = "") -> list[str]:
+    """Where two checkpoints differ, clocks left out."""
+    if path.endswith("seconds"):
+        return []
+    if isinstance(a, torch.Tensor):
+        return [] if torch.equal(a, b) else [path]
+    if isinstance(a, dict):
+        if a.keys() != b.keys():
+            return [path]
+        return [d for key in a for d in different(a[key], b[key], f"{path}/{key}")]
+    if isinstance(a, (list, tuple)):
+        return [d for i, pair in enumerate(zip(a, b, strict=True)) for d in different(*pair, f"{path}/{i}")]
+    return [] if a == b else [path]
+
+
+@pytest.mark.parametrize("by", ["load_checkpoint", "load_dir"])
+def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
+    trained: BitymiTrainerConfig, start: Start, by: str
+) -> None:
+    config = start(name="resumed")
+    config.max_num_iterations = None  # as long as the interrupted run was to be
+    if by == "load_checkpoint":
+        config.load_checkpoint = trained.get_checkpoint_dir() / "step-000000020.ckpt"
+    else:
+        config.load_dir, config.load_step = trained.get_checkpoint_dir(), 20
+    ns_train.main(config)
+    assert different(checkpoint(trained, 59), checkpoint(config, 59)) == []
+    steps = [json.loads(line)["step"] for line in (config.get_base_dir() / FILE).read_text().splitlines()]
+    assert steps == [20, 40, 60]  # the first point is that of the interrupted run
+
+
+def test_a_finished_run_is_not_touched_when_it_is_resumed(trained: BitymiTrainerConfig, start: Start) -> None:
+    config = start(name="again")
+    config.load_dir = trained.get_checkpoint_dir()
+    ns_train.main(config)
+    assert not config.get_checkpoint_dir().exists()
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int, how: signal.Signals = signal.SIGINT) -> None:
+    iterate = BitymiTrainer.train_iteration
+
+    def train_iteration(self: BitymiTrainer, current: int) -> Any:
+        if current == step:
+            os.kill(os.getpid(), how)
+        return iterate(self, current)
+
+    monkeypatch.setattr(BitymiTrainer, "train_iteration", train_iteration)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_saves_what_was_learned_and_says_how_to_go_on(
+    trained: BitymiTrainerConfig,
+    start: Start,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    how: signal.Signals,
+) -> None:
+    config = start(name="interrupted")
+    handler = signal.getsignal(how)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 27, how)
+        with pytest.raises(SystemExit) as stop:
+            ns_train.main(config)
+    assert stop.value.code == 130
+    assert signal.getsignal(how) is handler
+    assert "--load-dir" in capsys.readouterr().out
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000027.ckpt"]
+    resumed = start(name="resumed")
+    resumed.load_dir = config.get_checkpoint_dir()
+    ns_train.main(resumed)
+    assert different(checkpoint(trained, 59), checkpoint(resumed, 59)) == []
+
+
+def test_ctrl_c_while_the_capture_is_read(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    config = start(name="early")
+    monkeypatch.setattr(type(config.pipeline), "setup", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        ns_train.main(config)
+    assert stop.value.code == 130
+
+
+def test_a_run_that_branches_off_earlier_keeps_the_later_checkpoints(
+    trained: BitymiTrainerConfig, start: Start, tmp_path: Path
+) -> None:
+    config = start(name="branch")
+    shutil.copytree(trained.get_checkpoint_dir(), config.get_checkpoint_dir())
+    config.load_dir, config.load_step, config.max_num_iterations = config.get_checkpoint_dir(), 20, 41
+    config.steps_per_save = 100
+    ns_train.main(config)
+    assert [p.name for p in sorted(config.get_checkpoint_dir().iterdir())] == [
+        "step-000000040.ckpt", "step-000000059.ckpt"
+    ]  # fmt: skip
+
+
+def test_going_on_with_another_capture_is_said(
+    trained: BitymiTrainerConfig, room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def resumed(change: Callable[[dict[str, Any]], None], name: str) -> str:
+        data = tmp_path / name
+        shutil.copytree(room, data)
+        meta = json.loads((data / "transforms.json").read_text())
+        change(meta)
+        (data / "transforms.json").write_text(json.dumps(meta))
+        config = start(name=name, data=data)
+        config.load_dir, config.load_step, config.max_num_iterations = trained.get_checkpoint_dir(), 59, 61
+        capsys.readouterr()
+        ns_train.main(config)
+        return " ".join(capsys.readouterr().out.split())
+
+    def moved(meta: dict[str, Any]) -> None:
+        meta["frames"][3]["transform_matrix"][0][3] += 0.5
+
+    assert "another capture" not in resumed(lambda meta: None, "same")
+    assert "it had 10 training photographs, this one has 9" in resumed(lambda meta: meta["frames"].pop(), "fewer")
+    assert "its cameras stand elsewhere" in resumed(moved, "moved")
+
+
+def test_resuming_in_another_folder_cleans_up_the_one_of_the_killed_run(
+    trained: BitymiTrainerConfig, start: Start, tmp_path: Path
+) -> None:
+    killed = a_run_of(trained, tmp_path)
+    (killed / ".step-000000060.ckpt.unfinished").write_text("half")
+    config = start(name="resumed")
+    config.load_dir = killed / "nerfstudio_models"
+    ns_train.main(config)
+    assert not [p.name for p in killed.iterdir() if p.name.startswith(".")]
+
+
+def test_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, start: Start) -> None:
+    config = start(method="bitymi-sh")
+    config.load_dir = trained.get_checkpoint_dir()
+    with pytest.raises(InputError, match="another preset:\n.*view-color: sv there, sh here"):
+        ns_train.main(config)
+
+
+def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
+    config = start()
+    config.load_dir = tmp_path / "nowhere"
+    with pytest.raises(InputError, match="there is no checkpoint folder"):
+        ns_train.main(copy.deepcopy(config))
+    config.load_dir.mkdir()
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        ns_train.main(copy.deepcopy(config))
+    whole = (trained.get_checkpoint_dir() / "step-000000059.ckpt").read_bytes()
+    (config.load_dir / "step-000000059.ckpt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="damaged"):
+        ns_train.main(copy.deepcopy(config))
+
+
+def test_optimisers_of_another_scene(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
+    state = checkpoint(trained, 59)
+    del state["optimizers"]["means"]["param_groups"]
+    torch.save(state, tmp_path / "step-000000059.ckpt")
+    config = start()
+    config.load_dir = tmp_path
+    with pytest.raises(InputError, match="step-000000059.ckpt cannot be resumed"):
+        ns_train.main(config)

@@ -1,0 +1,98 @@
+"""The folder of a run: one run at a time, and a disk that is full or cannot be written."""
+
+from __future__ import annotations
+
+import copy
+import errno
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.scripts import train as ns_train
+
+from bitymi_ns.host import run_folder
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from tests.e2e.runs import Start, checkpoint
+
+
+def test_a_full_disk_keeps_the_earlier_checkpoint(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = start(name="full")
+    save = torch.save
+
+    def full_after_the_first(state: Any, file: Any) -> None:
+        if isinstance(state, dict) and state.get("step", 0) > 20:
+            file.write(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(state, file)
+
+    monkeypatch.setattr(torch, "save", full_after_the_first)
+    with pytest.raises(InputError, match="could not be written: the disk is full(.|\n)*Resume with --load-dir"):
+        ns_train.main(config)
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]
+    assert not [p for p in config.get_base_dir().iterdir() if "unfinished" in p.name]
+    assert checkpoint(config, 20)["step"] == 20
+
+
+HOLDS = """
+import sys
+from pathlib import Path
+from bitymi_ns.host import run_folder
+
+run_folder.take(Path(sys.argv[1]))
+print("has it", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_folder_takes_one_run_at_a_time(start: Start) -> None:
+    config = start(name="run")
+    config.max_num_iterations = 2
+    folder = config.get_base_dir()
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert other.stdout is not None and other.stdout.readline() == "has it\n"
+        with pytest.raises(InputError, match=f"is in use: process {other.pid} is at work(.|\n)*--timestamp") as stop:
+            ns_train.main(copy.deepcopy(config))
+        assert stop.value.code != 0 and [p.name for p in folder.iterdir()] == [".lock"]  # nothing of it is touched
+    finally:
+        other.kill()
+        other.communicate()
+    (folder / ".step-000000001.ckpt.unfinished").write_text("of the run that was killed")
+    ns_train.main(config)
+    assert not [p.name for p in folder.iterdir() if p.name.startswith(".")]
+    again = start(name="run")  # into the same folder, once the first has ended
+    again.max_num_iterations, again.load_dir = 3, config.get_checkpoint_dir()
+    ns_train.main(again)
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000002.ckpt"]
+
+
+def test_too_little_room_for_a_checkpoint_is_found_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_folder.files, "free_bytes", lambda path: 12_000)
+    config = start(name="full")
+    with pytest.raises(InputError, match=r"has 12.0 kB free, and a checkpoint takes [\d.]+ [kM]B already at the start"):
+        ns_train.main(config)
+    assert not (config.get_base_dir() / "nerfstudio_models").exists()
+
+
+def test_a_folder_that_cannot_be_written(start: Start) -> None:
+    config = start(name="readonly")
+    config.output_dir = config.output_dir / "file"
+    config.output_dir.parent.mkdir()
+    config.output_dir.write_text("in the way")
+    with pytest.raises(InputError, match="cannot be written: .*is not a folder.*--output-dir"):
+        ns_train.main(config)
+
+
+def test_a_new_run_keeps_out_of_the_folder_of_an_earlier_one(trained: BitymiTrainerConfig, start: Start) -> None:
+    config = start(name="run")
+    config.output_dir = trained.output_dir
+    with pytest.raises(
+        InputError, match="holds a run already, its newest checkpoint is step-000000059.ckpt.*--load-dir"
+    ):
+        ns_train.main(config)
+    assert len(list(trained.get_checkpoint_dir().glob("*.ckpt"))) == 3

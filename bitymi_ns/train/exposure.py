@@ -29,7 +29,7 @@ OTHER_LIMIT = 0.5
 EXPLAINED = 0.05
 """`auto` corrects photographs where gains explain more than this share of how far they disagree at the points."""
 EXIF_SPREAD = 0.03
-"""Where the points do not tell, `auto` corrects photographs whose EXIF gains have this standard deviation (0.1 stop)."""
+"""Where the points do not tell, `auto` corrects photographs whose EXIF gains have this deviation (0.1 stop)."""
 PRIOR_POINTS = 20
 """What EXIF says of a photograph, or else that it is like the others, counts as much as so many points."""
 BETAS = (0.9, 0.99)

@@ -103,7 +103,7 @@ class Training:
             image_pixels: of all training views together.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
-            exif: log2 of the exposure of each training photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
+            exif: log2 of the exposure of each training photograph (`exposure.exif_stops`); NaN, None = unknown.
 
         Raises:
             ValueError: a training option is out of its range.

@@ -20,6 +20,7 @@ from torch.optim import SparseAdam
 
 from bitymi_ns.train.agreement import measure_agreement
 from bitymi_ns.train.config import ExposureKind
+from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.views import View
 
 LIMIT = 2.0
@@ -95,6 +96,15 @@ class Exposure:
         self._optimizer = SparseAdam([self.table], betas=BETAS)
 
     @property
+    def sentence(self) -> str:
+        """What was decided, and why."""
+        gains = self.log_gains
+        if gains is None:
+            return f"Photographs are taken as they are exposed: {self.finding or 'as asked for'}."
+        spread = f"{math.expm1(float(gains.std(correction=0))):.0%}"
+        return f"The exposure of each photograph is learned, they differ by {spread}: {self.finding}."
+
+    @property
     def log_gains(self) -> Tensor | None:
         """[V, 3] logarithms of the gains; None = no photograph is corrected."""
         return None if self.table is None else self.table.detach()[:, _diagonal(self.table)]
@@ -158,6 +168,30 @@ class Exposure:
         assert self.table is not None and self._optimizer is not None
         self.table.data.copy_(table)
         self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+
+
+def corrected(views: Sequence[View], state: Mapping[str, Any] | None) -> Sequence[View]:
+    """The training photographs with the corrections that a run ended with.
+
+    Args:
+        views: of the run, at full size.
+        state: of its `Exposure`; None = it had none.
+
+    Raises:
+        ValueError: there are more or fewer photographs than the run had.
+    """
+    if state is None or state["table"] is None:
+        return views
+    if len(state["table"]) != len(views):
+        raise ValueError(
+            f"training learned the exposure of {len(state['table'])} photographs, and now there are {len(views)}: "
+            "restore the capture, or leave the texels as they are baked (--finetune-steps 0)"
+        )
+    exposure = Exposure(state["kind"])
+    exposure.load_state_dict(state, len(views))
+    with torch.no_grad():
+        found = [exposure.of(i) for i in range(len(views))]
+    return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
 
 
 def settled(table: Tensor) -> Tensor:

@@ -44,28 +44,29 @@ class View(NamedTuple):
         return View(self.camera.to(device), self.image.to(device), mask, correction)
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
-        """[H, W, 3] a rendered image as this photograph shows it. What is seen of the background stays as it is.
+        """`shown` by this photograph's correction."""
+        return shown(rgb, self.correction, alpha, background)
 
-        Args:
-            rgb: [H, W, 3] over the background.
-            alpha: [H, W, 1] coverage.
-            background: [3]; None = black.
-        """
-        correction = self.correction
-        if correction is None:
-            return rgb
-        behind = None if background is None else (1.0 - alpha) * background
-        seen = rgb if behind is None else rgb - behind
-        if correction.ndim == 1:
-            seen = seen * correction
-        else:  # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
-            mixed = (seen[..., i : i + 1] * correction[:, i] for i in range(3))
-            seen = sum(mixed, alpha * correction[:, 3])
-        return seen if behind is None else seen + behind
 
-    def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
-        """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
-        return over_background(as_float(self.image.to(device)), background)
+def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
+    """[H, W, 3] a rendered image as a photograph shows it. What is seen of the background stays as it is.
+
+    Args:
+        rgb: [H, W, 3] over the background.
+        correction: of the photograph, see `View`; None = the image as it is.
+        alpha: [H, W, 1] coverage.
+        background: [3]; None = black.
+    """
+    if correction is None:
+        return rgb
+    behind = None if background is None else (1.0 - alpha) * background
+    seen = rgb if behind is None else rgb - behind
+    if correction.ndim == 1:
+        seen = seen * correction
+    else:  # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+        mixed = (seen[..., i : i + 1] * correction[:, i] for i in range(3))
+        seen = sum(mixed, alpha * correction[:, 3])
+    return seen if behind is None else seen + behind
 
 
 def as_float(image: Tensor) -> Tensor:

@@ -22,8 +22,8 @@ Settings = tuple[float, float, float]
 def stops_of(paths: Sequence[Path]) -> list[float]:
     """log2 of the exposure of photographs, by shutter time, aperture and ISO; NaN where it is not known.
 
-    A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has is the same for all of
-    them. Photographs that lack what most have cannot be compared with these.
+    A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has is the same for all.
+    Photographs that lack what most have cannot be compared with these.
     """
     with ThreadPoolExecutor(THREADS) as pool:
         settings = list(pool.map(_settings, paths))

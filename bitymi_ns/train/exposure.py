@@ -89,7 +89,7 @@ class Exposure:
         self._begin(gains.to(points.device), affine=self.kind == "affine")
 
     def _begin(self, log_gains: Tensor, affine: bool) -> None:
-        first = log_gains.new_zeros(len(log_gains), 12) if affine else log_gains
+        first = log_gains.new_zeros(len(log_gains), 12 if affine else 3)
         first[:, _diagonal(first)] = log_gains
         self.table = Parameter(settled(first))
         # sparse: a photograph that is not shown keeps its moments

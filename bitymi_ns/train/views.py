@@ -47,6 +47,10 @@ class View(NamedTuple):
         """`shown` by this photograph's correction."""
         return shown(rgb, self.correction, alpha, background)
 
+    def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
+        """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
+        return over_background(as_float(self.image.to(device)), background)
+
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
     """[H, W, 3] a rendered image as a photograph shows it. What is seen of the background stays as it is.

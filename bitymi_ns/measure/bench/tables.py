@@ -15,8 +15,8 @@ from bitymi_ns.measure.bench.matrix import Matrix, Run, Stage
 from bitymi_ns.measure.markdown import table
 
 HEADER = (
-    "scene", "row", "form", "PSNR", "ccPSNR", "SSIM", "FLIP", "LPIPS", "surfels", "fragments/px", "render ms", "training s",
-    "training CPU s", "process CPU s", "peak RSS MB", "bundle bytes", "atlas bytes", "dPSNR",
+    "scene", "row", "form", "PSNR", "ccPSNR", "SSIM", "FLIP", "LPIPS", "surfels", "fragments/px", "render ms",
+    "training s", "training CPU s", "process CPU s", "peak RSS MB", "bundle bytes", "atlas bytes", "dPSNR",
 )  # fmt: skip
 TEXT_COLUMNS = 3
 NOTES = (

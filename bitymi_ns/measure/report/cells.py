@@ -82,7 +82,7 @@ def read_pictures(path: Path, run: str = "") -> list[WorstView]:
 
 _SHOWN = (
     ("psnr", 2, "dB"),
-    ("cc_psnr", 2, "dB after a fit of the colours"),
+    ("cc_psnr", 2, "dB ccPSNR"),
     ("ssim", 3, "SSIM"),
     ("flip", 3, "FLIP"),
     ("lpips", 3, "LPIPS"),

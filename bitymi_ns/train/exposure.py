@@ -27,7 +27,7 @@ LIMIT = 2.0
 """Largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops."""
 OTHER_LIMIT = 0.5
 """Largest other entry of an affine correction."""
-EXPLAINED = 0.05
+EXPLAINED = 0.1
 """`auto` corrects photographs where gains explain more than this share of how far they disagree at the points."""
 EXIF_SPREAD = 0.03
 """Where the points do not tell, `auto` corrects photographs whose EXIF gains have this deviation (0.1 stop)."""
@@ -113,7 +113,7 @@ class Exposure:
         """The correction of a training photograph: [3] gains, or [3, 4] matrix and offset; None = as it is."""
         if self.table is None:
             return None
-        row = embedding(torch.tensor(number, device=self.table.device), self.table, sparse=True)
+        row = embedding(torch.full((), number, device=self.table.device), self.table, sparse=True)
         if row.numel() == 3:
             return row.exp()
         gains = torch.zeros(12, dtype=torch.bool, device=row.device)
@@ -203,9 +203,9 @@ def settled(table: Tensor) -> Tensor:
     return table / (table.abs().amax(0) / limit).clamp(min=1.0)
 
 
-def _diagonal(table: Tensor) -> list[int]:
-    """The columns of the gains' logarithms."""
-    return [0, 1, 2] if table.shape[-1] == 3 else [0, 5, 10]
+def _diagonal(table: Tensor) -> slice:
+    """The columns of the gains' logarithms. A slice: a list would be copied to the card at every step."""
+    return slice(None) if table.shape[-1] == 3 else slice(0, None, 5)
 
 
 def exif_stops(seconds: float, f_number: float, iso: float) -> float:

@@ -22,6 +22,8 @@ from bitymi_ns.train.views import View, as_float
 
 POINTS = 6000
 """Points that are looked at, at most."""
+HIDING = 100_000
+"""Points that may hide them, at most."""
 OBSERVATIONS = 1_200_000
 """Points times photographs, at most."""
 SWEEPS = 10
@@ -70,12 +72,12 @@ def measure_agreement(points: Tensor, views: Sequence[View], near: float) -> Agr
             transparent do not count.
         near: nearest drawn depth, camera z.
     """
-    points = points.detach()
-    most = min(POINTS, max(1, OBSERVATIONS // max(1, len(views))))
-    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most].to(points.device)
-    logs = torch.full((len(views), len(chosen), 3), math.nan)
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:HIDING]
+    points = points.detach()[order.to(points.device)]
+    count = min(len(points), POINTS, max(1, OBSERVATIONS // max(1, len(views))))
+    logs = torch.full((len(views), count, 3), math.nan)
     for row, view in enumerate(views):
-        logs[row] = _log_colors(view, points, chosen, near).cpu()
+        logs[row] = _log_colors(view, points, count, near).cpu()
     logs = logs[:, logs.isfinite().all(-1).sum(0) >= FEWEST_PHOTOGRAPHS]
     count = logs.isfinite().all(-1).sum(1)
     half, other = logs[:, ::2], logs[:, 1::2]
@@ -85,8 +87,9 @@ def measure_agreement(points: Tensor, views: Sequence[View], near: float) -> Agr
     return Agreement(_log_gains(logs), count, before, after)
 
 
-def _log_colors(view: View, points: Tensor, chosen: Tensor, near: float) -> Tensor:
-    """[C, 3] logarithm of the colour at the pixel of each chosen point; NaN where it is hidden or does not count."""
+def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
+    """[C, 3] logarithm of the colour at the pixel of each of the first points; NaN where it is hidden or does not
+    count. All points may hide them."""
     camera = view.camera.to(points.device)
     # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
     x, y, z = ((points[:, None] * camera.viewmat[:3, :3]).sum(-1) + camera.viewmat[:3, 3]).unbind(-1)
@@ -101,12 +104,12 @@ def _log_colors(view: View, points: Tensor, chosen: Tensor, near: float) -> Tens
     around = -max_pool2d(-nearest, 3, stride=1, padding=1).flatten()
     shown = inside & (z <= HIDDEN * around[cell])
 
-    color = as_float(_pixels(view.image, camera, x[chosen], y[chosen]))
-    shown = shown[chosen].to(color.device)
+    color = as_float(_pixels(view.image, camera, x[:count], y[:count]))
+    shown = shown[:count].to(color.device)
     if color.shape[-1] == 4:
         shown = shown & (color[:, 3] > 0.99)
     if view.mask is not None:
-        shown = shown & _pixels(view.mask, camera, x[chosen], y[chosen]).flatten().bool()
+        shown = shown & _pixels(view.mask, camera, x[:count], y[:count]).flatten().bool()
     color = color[:, :3]
     counts = shown[:, None] & (color > DARKEST) & (color < BRIGHTEST)
     return torch.where(counts, color.log(), math.nan)

@@ -161,7 +161,7 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     scene, _ = build_scene(capture.points, capture.colours, centers, SceneConfig(), config, False, pixels)
     aside = calibration.every(10)
     _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, settings.steps, callback=aside))
-    neural, fragments = evaluate(scene, capture.views, config)
+    neural, fragments, _ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
         baked = bake(scene, cameras, BakeOptions(), calibration.every(10))

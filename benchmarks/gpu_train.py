@@ -112,7 +112,7 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
         seconds += time.perf_counter() - start
         if trainer.step in due:
             trainer.training.watch.finish(scene)
-            psnr, _ = evaluate(scene, capture.held_out, preset.train)
+            psnr, *_ = evaluate(scene, capture.held_out, preset.train)
             curve.append(Point(trainer.step, seconds, len(scene), psnr))
             say(f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {psnr:.2f} dB, {len(scene):,} surfels")
     peak = torch.cuda.max_memory_allocated(device) if cuda else 0

@@ -84,7 +84,7 @@ def run(seed: int, options: argparse.Namespace) -> Result:
             trainer.advance()
     except TrainingDiverged as error:
         note = str(error)
-    psnr, _ = evaluate(scene, held_out, config)
+    psnr, *_ = evaluate(scene, held_out, config)
     rollbacks = trainer.training.guard.rollbacks
     finite = not describe_broken(scene) and math.isfinite(psnr)
     return Result(seed, psnr, len(scene), finite, rollbacks, time.process_time() - start, note)

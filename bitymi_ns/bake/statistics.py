@@ -176,6 +176,9 @@ class HeldOut(Part):
     psnr_baked_against_neural: Decibels = None
     psnr_neural_against_photos: Decibels = None
     psnr_baked_against_photos: Decibels = None
+    cc_psnr_neural_against_photos: Decibels = None
+    """After the affine fit of each view's colours to its photograph."""
+    cc_psnr_baked_against_photos: Decibels = None
     psnr_baked_against_neural_worst: Decibels = None
 
 

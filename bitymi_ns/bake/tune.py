@@ -30,7 +30,7 @@ from bitymi_ns.ops.backend import require
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room
-from bitymi_ns.train.views import View, training_order
+from bitymi_ns.train.views import View, shown, training_order
 
 FEWEST_VIEWS = 4
 """With fewer views none can be set aside: an atlas is then not tuned."""
@@ -80,6 +80,8 @@ class TexelView:
         rest: [H, W, 3] the picture without these fragments: the faint ones, and the background.
         target: [H, W, 3] the photograph over the background.
         mask: [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        correction: of the photograph's exposure, as in `View`; None = there is none.
+        alpha: [H, W, 1] coverage; None without a correction.
     """
 
     fragments: TexelFragments
@@ -87,12 +89,14 @@ class TexelView:
     rest: Tensor
     target: Tensor
     mask: Tensor | None
+    correction: Tensor | None = None
+    alpha: Tensor | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory that it takes."""
-        arrays = (self.base, self.rest, self.target, *(() if self.mask is None else (self.mask,)))
-        return self.fragments.nbytes + sum(array.nbytes for array in arrays)
+        arrays = (self.base, self.rest, self.target, self.mask, self.alpha)
+        return self.fragments.nbytes + sum(array.nbytes for array in arrays if array is not None)
 
 
 class TexelScene:
@@ -169,12 +173,19 @@ class TexelScene:
         size = (camera.height, camera.width)
         target = view.target(self._background, "cpu")
         mask = None if view.mask is None else view.mask.cpu().reshape(*size, 1)
-        return TexelView(chosen, base, rest.view(*size, 3), target.contiguous(), mask)
+        correction = alpha = None
+        if view.correction is not None:
+            correction, alpha = view.correction.detach().cpu(), plain[:, 3:4].reshape(*size, 1)
+        return TexelView(chosen, base, rest.view(*size, 3), target.contiguous(), mask, correction, alpha)
 
     @torch.no_grad()
     def render(self, view: TexelView, texels: Tensor) -> Tensor:
         """[H, W, 3] the picture with these texels, as the baked renderer shows it before any quantisation."""
         return texel_image(view.fragments, view.base, texels, self.tiles).view_as(view.rest) + view.rest
+
+    def shown(self, view: TexelView, rgb: Tensor) -> Tensor:
+        """[H, W, 3] a picture as the view's photograph shows it, by its correction."""
+        return rgb if view.alpha is None else shown(rgb, view.correction, view.alpha, self._background)
 
     def add_gradient(self, view: TexelView, texels: Tensor, dimage: Tensor, out: Tensor) -> None:
         """Adds the gradient [T, 3] of a picture's gradient [H, W, 3]."""
@@ -203,7 +214,8 @@ class TexelViews(Sequence[TexelView]):
         """Mean dB over the views of which any pixel counts."""
         values = []
         for view in self:
-            values.append(psnr(self._scene.render(view, texels).clamp(0.0, 1.0), view.target, view.mask))
+            rgb = self._scene.shown(view, self._scene.render(view, texels))
+            values.append(psnr(rgb.clamp(0.0, 1.0), view.target, view.mask))
             progress("looking at the set-aside views", len(values), len(self))
         return mean_psnr(values)
 
@@ -229,7 +241,7 @@ def tune_atlas(
 
     Args:
         baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
-        views: training views; every `held_in_every`-th is set aside.
+        views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
         background: [3] colour behind the scene.
         options: see `TuneOptions`.
         progress: called after every step.
@@ -286,7 +298,7 @@ def _descend(
     for step in range(options.steps):
         view = views[training_order(len(views), options.seed, step)]
         rgb = scene.render(view, texels).requires_grad_()
-        photometric(rgb, view.target, options.ssim_weight, view.mask).backward()
+        photometric(scene.shown(view, rgb), view.target, options.ssim_weight, view.mask).backward()
         pixels = rgb.numel() if view.mask is None else 3 * int(view.mask.sum())
         gradient.zero_()
         scene.add_gradient(view, texels, rgb.grad * pixels, gradient)  # the loss is a mean, the step wants a sum

@@ -17,12 +17,13 @@ from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.capture_print import capture_print, warn_of_another
 from bitymi_ns.host.curve import FILE, TrainingCurve, points
 from bitymi_ns.host.errors import fail, listed, say, warn
+from bitymi_ns.host.exif import stops_of
 from bitymi_ns.host.memory import state_training
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import bounds
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.coverage import views_without_surfels
-from bitymi_ns.train.evaluate import evenly_spaced, held_out_quality
+from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.step import Training
@@ -77,6 +78,7 @@ class TrainingRun:
                 metadata["train_pixels"],
                 self._on_resize,
                 warn,
+                stops_of(self.datamanager.train_dataset.image_filenames),
             )
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
@@ -147,7 +149,10 @@ class TrainingRun:
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
+        undecided = not self.training.exposure.decided
         self.training.begin(step)
+        if undecided:
+            say(self.training.exposure.sentence)
 
     def losses(self, view: View) -> dict[str, Tensor]:
         """Render the step's view and compare it with its photograph."""
@@ -195,17 +200,17 @@ class TrainingRun:
         }
         shown = ""
         if quality is not None:
-            point["psnr"], point["fragments"] = (round(value, 4) for value in quality)
-            shown = f"{quality[0]:6.2f} dB held out, "
-            writer.put_scalar("Held-out PSNR", torch.tensor(quality[0]), step)
+            point |= {name: round(value, 4) for name, value in quality._asdict().items()}
+            shown = f"{quality.psnr:6.2f} dB held out, "
+            writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
         self.curve.add({**point, **self.names})
         CONSOLE.print(
             f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
             f"{self.training.clock.seconds:.0f} s of training"
         )
 
-    def _held_out(self, all_views: bool) -> tuple[float, float] | None:
-        """Mean PSNR and mean number of fragments over held-out views at full size; None where no pixel counts."""
+    def _held_out(self, all_views: bool) -> Quality | None:
+        """Means over held-out views at full size; None where no pixel counts."""
         views = self.datamanager.eval_views
         rows = evenly_spaced(len(views), 0 if all_views else self._curve_views)
         quality = held_out_quality(

@@ -39,7 +39,8 @@ from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.exposure import corrected
+from bitymi_ns.train.losses import cc_psnr, psnr
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
@@ -127,7 +128,8 @@ class ExportAtlas(BakeOptions):
                 if finetunes and baked.atlas is not None:
                     held_out = datamanager.eval_views if self.compare else ()
                     background = model.background.cpu()
-                    baked = tune_atlas(baked, datamanager.train_views, background, tune, progress, held_out)
+                    photographs = corrected(datamanager.train_views, model.resume_state.get("exposure"))
+                    baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
@@ -201,10 +203,12 @@ def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera]) -> 
 
 @torch.no_grad()
 def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
-    """PSNR in dB over the held-out views, of bundle, trained scene and photographs against each other: means, and the
-    view in which the bundle is farthest from the trained scene."""
+    """PSNR in dB over the held-out views, of bundle, trained scene and photographs against each other, and after the
+    affine fit of each view's colours to its photograph: means, and the view in which the bundle is farthest from the
+    trained scene."""
     rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
+    names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")
     means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
     worst = round(min(row[0] for row in rows), 4)
     return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
@@ -214,8 +218,8 @@ def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera
 def held_out_psnr(
     model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
 ) -> list[list[float]]:
-    """Of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph, and
-    bundle against photograph."""
+    """Of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
+    bundle against photograph, and the last two after the affine fit of the colours."""
     rows = []
     background = model.background
     for index in range(min(views, len(datamanager.eval_views))):
@@ -224,7 +228,8 @@ def held_out_psnr(
         baked = render_baked(view.camera.to("cpu")).clamp(0.0, 1.0)
         photo = view.target(background.cpu(), "cpu")
         mask = None if view.mask is None else view.mask.cpu()
-        rows.append([psnr(baked, neural, mask), psnr(neural, photo, mask), psnr(baked, photo, mask)])
+        of_photo = [measure(rgb, photo, mask) for measure in (psnr, cc_psnr) for rgb in (neural, baked)]
+        rows.append([psnr(baked, neural, mask), *of_photo])
     return rows
 
 
@@ -247,6 +252,11 @@ def replace_file(path: Path, data: bytes) -> None:
         write_file(path, data)
     except OSError as error:
         fail(f"{path} could not be written: {reason(error, path)}.", error)
+
+
+def decibels(value: float | None) -> str:
+    """For the table; pictures that are equal have no finite PSNR, nor have those of which no pixel counts."""
+    return "no number" if value is None else f"{value:.2f} dB"
 
 
 def print_summary(folder: Path, info: Manifest) -> None:
@@ -282,9 +292,12 @@ def print_summary(folder: Path, info: Manifest) -> None:
     held_out = statistics.held_out
     if held_out is not None:
         table.add_row("Held-out views", f"{held_out.views}")
-        table.add_row("Bundle against trained scene", f"{held_out.psnr_baked_against_neural:.2f} dB")
-        table.add_row("Trained scene against photographs", f"{held_out.psnr_neural_against_photos:.2f} dB")
-        table.add_row("Bundle against photographs", f"{held_out.psnr_baked_against_photos:.2f} dB")
+        table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))
+        for name, form in (("Trained scene", "neural"), ("Bundle", "baked")):
+            plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "cc_psnr"))
+            table.add_row(
+                f"{name} against photographs", f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
+            )
     CONSOLE.print(table)
     say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
 

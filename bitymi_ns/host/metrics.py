@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.host.errors import warn
-from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.losses import cc_psnr, psnr
 
 LPIPS_TIMEOUT = 30.0
 """Seconds to wait for the server that has the weights of LPIPS."""
@@ -25,17 +25,20 @@ _flip_missing: list[bool] = []
 
 
 def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-    """psnr, ssim, flip (where its package is installed) and lpips (where its weights can be had).
+    """psnr, cc_psnr (after an affine fit of the colours), ssim, flip (where its package is installed) and lpips (where
+    its weights can be had).
 
     Args:
         image, reference: [H, W, 3] in [0, 1].
-        mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of psnr.
+        mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of psnr
+            and cc_psnr.
     """
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
         image, reference = image * mask, reference * mask
-    result = {"psnr": psnr(image, reference, mask), "ssim": ssim(image, reference)}
+    result = {"psnr": psnr(image, reference, mask), "cc_psnr": cc_psnr(image, reference, mask)}
+    result["ssim"] = ssim(image, reference)
     for name, value in (("flip", flip(image, reference)), ("lpips", lpips(image, reference))):
         if value is not None:
             result[name] = value

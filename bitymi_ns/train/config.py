@@ -7,6 +7,8 @@ from typing import Literal
 
 REFERENCE_STEPS = 30_000
 """The run length for which every step count below is given."""
+ExposureKind = Literal["auto", "off", "gain", "affine"]
+"""Colour corrections of the photographs."""
 
 
 @dataclass
@@ -113,6 +115,8 @@ class LearningRates:
     """Hash table of the texture field."""
     field_mlp: tuple[float, float] = (1e-2, 1e-3)
     """MLP of the texture field."""
+    exposure: tuple[float, float] = (5e-3, 5e-4)
+    """Colour corrections of the photographs: logarithms of gains, and what else they have."""
 
     def times(self, factor: float) -> LearningRates:
         """The rates times a factor; the rules for short runs stay as they are."""
@@ -171,6 +175,9 @@ class TrainConfig:
     """Opacity of the first surfels."""
     random_points: int = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
+    exposure: ExposureKind = "auto"
+    """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
+    matrix, off = all photographs are taken as they are, auto = gain where the photographs disagree by gains."""
     background: Literal["black", "white", "random"] = "black"
     """Colour behind the scene while training; images with alpha are composed over it."""
     seed: int = 0

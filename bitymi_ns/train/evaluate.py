@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.losses import mean_psnr, psnr
+from bitymi_ns.train.losses import cc_psnr, mean_psnr, psnr
 from bitymi_ns.train.views import View, judging_background
 
 if TYPE_CHECKING:
@@ -24,10 +24,12 @@ class Quality(NamedTuple):
     Attributes:
         psnr: dB, over the views of which any pixel counts.
         fragments: blended fragments per view.
+        cc_psnr: dB after the affine fit of each view's colours (`losses.color_corrected`), over the same views.
     """
 
     psnr: float
     fragments: float
+    cc_psnr: float
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
@@ -48,13 +50,16 @@ def held_out_quality(
         background: [3] colour behind the scene; None = black.
         device: of the renders.
     """
-    values, fragments = [], []
+    values, corrected, fragments = [], [], []
     for view in (view.to(device) for view in views):
         output = render(view.camera)
-        values.append(psnr(output.rgb.clamp(0.0, 1.0), view.target(background, device), view.mask))
+        rgb, target = output.rgb.clamp(0.0, 1.0), view.target(background, device)
+        values.append(psnr(rgb, target, view.mask))
+        corrected.append(cc_psnr(rgb, target, view.mask))
         fragments.append(len(output.fragments))
         del output  # with its fragments, before the next view makes its own
-    return Quality(mean_psnr(values), sum(fragments) / len(fragments) if fragments else math.nan)
+    mean_fragments = sum(fragments) / len(fragments) if fragments else math.nan
+    return Quality(mean_psnr(values), mean_fragments, mean_psnr(corrected))
 
 
 def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Quality:

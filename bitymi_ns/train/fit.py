@@ -38,6 +38,8 @@ class LogEntry:
     """Of the last training step."""
     psnr: float
     """dB, mean over the evaluation views at full size; NaN without such views."""
+    cc_psnr: float
+    """The same after the affine fit of each view's colours (`losses.color_corrected`)."""
 
 
 @dataclass
@@ -157,9 +159,11 @@ def fit(
             log.events.append({"step": trainer.step - 1, **report})
         if trainer.step in due:
             trainer.training.watch.finish(scene)
-            quality, fragments = evaluate(scene, eval_views, config)
-            times = (clock.seconds, clock.cpu_seconds)
-            log.entries.append(LogEntry(trainer.step, *times, len(scene), fragments, trainer.loss, quality))
+            quality = evaluate(scene, eval_views, config)
+            times, loss = (clock.seconds, clock.cpu_seconds), trainer.loss
+            log.entries.append(
+                LogEntry(trainer.step, *times, len(scene), quality.fragments, loss, quality.psnr, quality.cc_psnr)
+            )
         if callback is not None:
             callback(trainer, terms, output, report)
     return log

@@ -38,6 +38,7 @@ from bitymi_ns.train.views import ReducedViews, judging_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
+    from bitymi_ns.train.exposure import Exposure
     from bitymi_ns.train.schedules import Schedule
     from bitymi_ns.train.strategy import Strategy
 
@@ -73,6 +74,7 @@ class Guard:
         schedule: Schedule,
         config: TrainConfig,
         announce: Callable[[str], None] = warnings.warn,
+        exposure: Exposure | None = None,
     ) -> None:
         """
         Args:
@@ -80,7 +82,9 @@ class Guard:
             schedule: of the run.
             config: training options.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
+            exposure: restored, too; None = there are no corrections.
         """
+        self.exposure = exposure
         self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
         self.schedule, self.config, self.announce = schedule, config, announce
         self.window = max(config.guard.min_window, schedule.scaled(config.guard.window))
@@ -145,7 +149,8 @@ class Guard:
             if blank:
                 drawn = target.mean((0, 1)).expand_as(target).contiguous()
             else:
-                drawn = self.scene.render(view.camera.to(device), background=background, field_mode="frozen").rgb
+                output = self.scene.render(view.camera.to(device), background=background, field_mode="frozen")
+                drawn = view.shown(output.rgb, output.alpha, background)
             losses.append(photometric(drawn, target, self.config.loss.ssim_weight, view.mask))
         return float(torch.stack(losses).mean())
 
@@ -263,6 +268,7 @@ class Guard:
             "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
             "optimizers": {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),
+            "exposure": None if self.exposure is None else self.exposure.state_dict(),
         }
 
     def _restore(self, state: Mapping[str, Any]) -> None:
@@ -276,3 +282,5 @@ class Guard:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.strategy.load_state_dict(state["strategy"])
+        if self.exposure is not None and self._views is not None:
+            self.exposure.load_state_dict(state["exposure"], len(self._views))

@@ -133,6 +133,36 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return min(100.0, -10.0 * math.log10(max(float(error.sum()) / error.numel(), 1e-10)))
 
 
+def color_corrected(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """[H, W, 3] the image after the affine map of its colours that brings it nearest to the target, clamped to [0, 1].
+
+    The customary comparison where photographs differ in exposure and white balance: matrix [3, 3] and offset [3] are
+    those of least squares over the pixels that count, fitted for each view alone. An image that is not finite there is
+    returned as it is.
+
+    Args:
+        image, target: [H, W, 3] in [0, 1].
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+    """
+    colors = torch.cat([image.reshape(-1, 3), torch.ones_like(image[..., :1]).reshape(-1, 1)], -1).double().cpu()
+    wanted = target.reshape(-1, 3).double().cpu()
+    if mask is not None:
+        counts = mask.reshape(-1).bool().cpu()
+        fitted, wanted = colors[counts], wanted[counts]
+    else:
+        fitted = colors
+    if not bool(fitted.isfinite().all() & wanted.isfinite().all()):
+        return image
+    # the pseudoinverse: a picture of one colour leaves the matrix open
+    affine = torch.linalg.pinv(fitted.T @ fitted, hermitian=True) @ (fitted.T @ wanted)  # [4, 3]
+    return (colors @ affine).clamp(0.0, 1.0).to(image).view_as(image)
+
+
+def cc_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """`psnr` of the `color_corrected` image; what is left when exposure and white balance do not count."""
+    return psnr(color_corrected(image, target, mask), target, mask)
+
+
 def mean_psnr(values: Sequence[float]) -> float:
     """Mean dB of the views of which any pixel counts; NaN when there is none."""
     counted = [value for value in values if not math.isnan(value)]

@@ -142,7 +142,8 @@ class Schedule:
         """Learning rate of a parameter in this step.
 
         Args:
-            name: a surfel parameter, or field_table, field_w1 to field_w3 (or field_mlp for the three together).
+            name: a surfel parameter, field_table, field_w1 to field_w3 (or field_mlp for the three together), or
+                exposure.
         """
         rates, gain = self.config.lr, self.short_run_gain
         if name == "means":
@@ -156,6 +157,8 @@ class Schedule:
             return self.field_warmup(step) * self._decay(rates.field_table, step)
         if name in FIELD_MLP:
             return self.field_warmup(step) * self._decay(rates.field_mlp, step)
+        if name == "exposure":
+            return gain * self._decay(rates.exposure, step)
         raise KeyError(f"no learning rate is known for a parameter named {name!r}")
 
     def _decay(self, ends: tuple[float, float], step: int) -> float:

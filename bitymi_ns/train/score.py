@@ -77,9 +77,10 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
     for view in (view.to(device) for view in views):
         target = view.target(background, device)
         output = scene.render(view.camera, background=background, field_mode="frozen")
-        bad = bad_pixels(output.rgb, target, config.densify.error_threshold, view.mask)
+        rgb = view.shown(output.rgb, output.alpha, background)
+        bad = bad_pixels(rgb, target, config.densify.error_threshold, view.mask)
         counts = output.fragments.masked_counts(bad.flatten(), n)  # [N]
-        loss = photometric(output.rgb, target, config.loss.ssim_weight, view.mask)
+        loss = photometric(rgb, target, config.loss.ssim_weight, view.mask)
         total += counts
         weighted += loss.double() * counts
         del output  # with its fragments, before the next view makes its own

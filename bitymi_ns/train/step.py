@@ -6,6 +6,7 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,6 +16,7 @@ from torch.optim import Optimizer
 from bitymi_ns.train.clock import Stopwatch
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.losses import objective
 from bitymi_ns.train.resize import ResizeHook
@@ -54,7 +56,10 @@ def view_losses(
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
         beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )
-    terms = objective(output, view.target(background, device), config.loss, view.mask)
+    shown = output
+    if view.correction is not None:
+        shown = replace(output, rgb=view.shown(output.rgb, output.alpha, background))
+    terms = objective(shown, view.target(background, device), config.loss, view.mask)
     own = watch or LossWatch()
     own.note(scene, step, terms)
     if watch is None:
@@ -70,6 +75,7 @@ class Training:
     Attributes:
         step: index of the step that was begun last.
         schedule, strategy, guard, watch: of the run.
+        exposure: how the training photographs differ in their colours; decided when the first step begins.
         clock: time between `begin` and `finish`.
     """
 
@@ -84,6 +90,7 @@ class Training:
         image_pixels: int,
         on_resize: ResizeHook | None = None,
         announce: Callable[[str], None] = warnings.warn,
+        exif: Sequence[float] | None = None,
     ) -> None:
         """
         Args:
@@ -96,6 +103,7 @@ class Training:
             image_pixels: of all training views together.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
+            exif: log2 of the exposure of each training photograph (`exposure.exif_stops`); NaN, None = unknown.
 
         Raises:
             ValueError: a training option is out of its range.
@@ -106,7 +114,9 @@ class Training:
         for name in optimizers:
             self.schedule.lr(name, 0)
         self.strategy = Strategy(config, self.schedule, extent, on_resize, image_pixels)
-        self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce)
+        self.exposure = Exposure(config.exposure, exif)
+        self.schedule.lr("exposure", 0)
+        self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure)
         self.watch = LossWatch()
         self.clock = Stopwatch()
         self.step = 0
@@ -117,7 +127,7 @@ class Training:
     @functools.cached_property
     def views(self) -> ReducedViews:
         """The training views. Made at first use: on a card it takes a share of the memory that is free then."""
-        return ReducedViews(self._full_size, self.scene.surfels["means"].device)
+        return ReducedViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of)
 
     def view(self, index: int) -> View:
         """Training view number `index`, as the step that was begun last wants it: on the device, reduced."""
@@ -127,6 +137,8 @@ class Training:
         """Start the clock and set the learning rates of a step."""
         self.clock.start()
         self.step = step
+        if not self.exposure.decided:
+            self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
         self.guard.before(step, self.views)
         self._set_rates()
 
@@ -165,6 +177,7 @@ class Training:
         step, output = self.step, self._output
         assert output is not None, "a step is finished after its losses"
         self._output = None
+        self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step))
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(output)
         broken = output.projection.broken
@@ -184,6 +197,7 @@ class Training:
         return {
             "strategy": self.strategy.state_dict(),
             "guard": self.guard.state_dict(),
+            "exposure": self.exposure.state_dict(),
             "seconds": self.clock.seconds,
             "cpu_seconds": self.clock.cpu_seconds,
         }
@@ -193,4 +207,5 @@ class Training:
         self.strategy.load_state_dict(state["strategy"])
         if "guard" in state:  # checkpoints of earlier versions have none
             self.guard.load_state_dict(state["guard"])
+        self.exposure.load_state_dict(state.get("exposure"), len(self._full_size))
         self.clock = Stopwatch(state["seconds"], state["cpu_seconds"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -24,11 +24,14 @@ class View(NamedTuple):
         camera: the camera of the full-size image.
         image: [H, W, 3] or, with straight (not premultiplied) alpha, [H, W, 4]; float in [0, 1] or uint8.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        correction: how the photograph shows the scene's colours c: gains [3], gain c, or [3, 4], matrix c + offset;
+            None = as they are.
     """
 
     camera: Camera
     image: Tensor
     mask: Tensor | None = None
+    correction: Tensor | None = None
 
     @property
     def nbytes(self) -> int:
@@ -37,12 +40,37 @@ class View(NamedTuple):
 
     def to(self, device: torch.device | str) -> View:
         """Camera, picture and mask on a device."""
-        mask = None if self.mask is None else self.mask.to(device)
-        return View(self.camera.to(device), self.image.to(device), mask)
+        mask, correction = (None if value is None else value.to(device) for value in (self.mask, self.correction))
+        return View(self.camera.to(device), self.image.to(device), mask, correction)
+
+    def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
+        """`shown` by this photograph's correction."""
+        return shown(rgb, self.correction, alpha, background)
 
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
         """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
         return over_background(as_float(self.image.to(device)), background)
+
+
+def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
+    """[H, W, 3] a rendered image as a photograph shows it. What is seen of the background stays as it is.
+
+    Args:
+        rgb: [H, W, 3] over the background.
+        correction: of the photograph, see `View`; None = the image as it is.
+        alpha: [H, W, 1] coverage.
+        background: [3]; None = black.
+    """
+    if correction is None:
+        return rgb
+    behind = None if background is None else (1.0 - alpha) * background
+    seen = rgb if behind is None else rgb - behind
+    if correction.ndim == 1:
+        seen = seen * correction
+    else:  # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+        mixed = (seen[..., i : i + 1] * correction[:, i] for i in range(3))
+        seen = sum(mixed, alpha * correction[:, 3])
+    return seen if behind is None else seen + behind
 
 
 def as_float(image: Tensor) -> Tensor:
@@ -121,7 +149,7 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
                 f"the {what} is {w} x {h} pixels, but its camera {view.camera.width} x {view.camera.height}"
             )
     mask = None if view.mask is None else reduce_mask(view.mask.to(device), camera.width, camera.height)
-    return View(camera, reduce_image(image, camera.width, camera.height), mask)
+    return View(camera, reduce_image(image, camera.width, camera.height), mask, view.correction)
 
 
 class ReducedViews:
@@ -133,10 +161,17 @@ class ReducedViews:
     Args:
         views: at full size.
         device: where the pictures are wanted.
+        correction: gives the correction of a view by its number, as it is at the moment; None = there is none.
     """
 
-    def __init__(self, views: Sequence[View], device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        device: torch.device | str = "cpu",
+        correction: Callable[[int], Tensor | None] | None = None,
+    ) -> None:
         self._views = views
+        self._correction = correction
         self._device = torch.device(device)
         self._factor = 1.0
         self._kept: dict[int, View] = {}
@@ -154,7 +189,11 @@ class ReducedViews:
         return self._full_size(index).camera
 
     def at(self, index: int, factor: float) -> View:
-        """View number `index`, its image resized by `factor`."""
+        """View number `index`, its image resized by `factor`, with its correction."""
+        view = self._at(index, factor)
+        return view if self._correction is None else view._replace(correction=self._correction(index))
+
+    def _at(self, index: int, factor: float) -> View:
         if factor != self._factor:
             self._factor, self._kept, self._reduced_room = factor, {}, Room(self._reduced_bytes)
         if index in self._kept:

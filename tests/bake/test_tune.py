@@ -218,6 +218,26 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
     assert torch.equal(*same)
 
 
+def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, views: list[View]) -> None:
+    logs = torch.linspace(-0.4, 0.4, len(views))
+    exposed = []
+    for view, log in zip(views, logs, strict=True):
+        alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
+        bare = view._replace(correction=log.exp().expand(3))
+        exposed.append(bare._replace(image=bare.shown(view.image, alpha, BACKGROUND)))
+    scene = TexelScene(truth, BACKGROUND)
+    alike = TexelViews(scene, exposed, Room(1 << 30))
+    assert alike.psnr(scene.texels) > 55  # background and all
+    blind = [view._replace(correction=None) for view in exposed]
+    after = {}
+    for name, each in (("known", exposed), ("unknown", blind)):
+        tuned = tune_atlas(wrong, each, BACKGROUND, OPTIONS)
+        after[name] = TexelViews(TexelScene(tuned, BACKGROUND), views, Room(1 << 30)).psnr(
+            TexelScene(tuned, BACKGROUND).texels
+        )
+    assert after["known"] > after["unknown"] + 1.0
+
+
 def test_too_few_views_leave_the_atlas_alone(wrong: Baked, views: list[View]) -> None:
     same = tune_atlas(wrong, views[:3], BACKGROUND)
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}

@@ -41,7 +41,7 @@ def train(device: torch.device) -> tuple[list[float], float, dict[str, torch.Ten
         trainer.advance()
         losses.append(trainer.loss)
     trainer.training.watch.finish(scene)
-    psnr, _ = evaluate(scene, views, config)
+    psnr, *_ = evaluate(scene, views, config)
     return losses, psnr, {name: p.detach().cpu() for name, p in scene.named_parameters()}
 
 

@@ -43,6 +43,19 @@ def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> N
     assert 0 < result["ssim"] < 1 and all(isinstance(v, float) and math.isfinite(v) for v in result.values())
 
 
+def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_lpips", [None])
+    _, reference = pair()
+    darker = 0.7 * reference + 0.02
+    result = metrics.image_metrics(darker, reference)
+    assert result["psnr"] < 20 and result["cc_psnr"] > 80
+    mask = torch.zeros(40, 50, 1, dtype=torch.bool)
+    mask[:, :25] = True
+    spoilt = torch.where(mask, darker, 1.0)
+    assert metrics.image_metrics(spoilt, reference, mask)["cc_psnr"] > 80
+    assert metrics.image_metrics(spoilt, reference)["cc_psnr"] < 30
+
+
 def test_lpips_that_cannot_be_had_is_left_out_with_one_warning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,7 +24,7 @@ def test_a_short_run_is_a_proper_run(make_scene, views):
         make_scene(),
         TrainConfig(densify=DensifyConfig(max_surfels=400, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)),
     )
-    before, _ = evaluate(scene, views[:1], config)
+    before, *_ = evaluate(scene, views[:1], config)
     seen = []
     log = fit(
         scene, views[1:], views[:1], config, 200, callback=lambda t, *_: seen.append(len(t.scene)), eval_steps=[100]
@@ -89,7 +89,7 @@ def test_the_falloff_loss_moves_what_the_option_says(make_scene, views):
 def test_low_resolution_steps_take_either_picture(make_scene, views):
     scene, config = make_scene(texture=False), TrainConfig()
     schedule = Schedule(config, 3000)
-    camera, image, _ = views[0]
+    camera, image, *_ = views[0]
     reduced = camera.scaled(schedule.resolution_factor(0))
     terms, output = view_losses(scene, at_size(views[0], reduced, "cpu"), schedule, 0, config)
     assert output.rgb.shape == (12, 12, 3)
@@ -101,7 +101,7 @@ def test_low_resolution_steps_take_either_picture(make_scene, views):
 def test_images_with_alpha_and_bytes_and_masks(make_scene, views):
     scene, config = make_scene(texture=False), TrainConfig(background="white", resolution_schedule=0)
     schedule = Schedule(config, 100)
-    camera, image, _ = views[0]
+    camera, image, *_ = views[0]
     rgba = torch.cat([image, torch.ones(48, 48, 1)], -1)
     rgba[:, :10] = torch.tensor([0.3, 0.9, 0.1, 0.0])  # nothing there: the background shows
     white = image.clone()

@@ -41,7 +41,7 @@ def test_a_healthy_run_is_left_alone(make_scene, views):
 @pytest.mark.parametrize("factor", [10.0, 100.0, 10_000.0])
 def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scene, views, factor):
     scene, config = make_scene(), config_of(factor)
-    start, _ = evaluate(scene, views, config)
+    start, *_ = evaluate(scene, views, config)
     trainer = Trainer(scene, views, config, 120)
     try:
         reports = run(trainer, 120)
@@ -49,7 +49,7 @@ def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scen
         assert "Lower the learning rates" in str(error) and "training diverged at step" in str(error)
         reports = []
     assert not describe_broken(scene)
-    psnr, _ = evaluate(scene, views, config)
+    psnr, *_ = evaluate(scene, views, config)
     assert math.isfinite(psnr) and psnr > start - 3.0
     assert sum("rolled_back" in report for report in reports) == trainer.training.guard.rollbacks or not reports
 
@@ -79,11 +79,11 @@ def test_views_drawn_worse_than_before_take_the_run_back(make_scene, views):
     scene = make_scene()
     trainer = Trainer(scene, views, config_of(), 120)
     run(trainer, 96)
-    good, _ = evaluate(scene, views, trainer.config)
+    good, *_ = evaluate(scene, views, trainer.config)
     assert trainer.training.guard.window == 24  # four epochs; the windows end with the run
     with torch.no_grad():
         scene.surfels["sv_rgb"] += 0.3
-    damaged, _ = evaluate(scene, views, trainer.config)
+    damaged, *_ = evaluate(scene, views, trainer.config)
     with pytest.warns(UserWarning, match="step 119: training diverged .the views are drawn worse than before"):
         for _ in range(24):
             trainer.advance()

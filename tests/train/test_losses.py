@@ -4,11 +4,22 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bitymi_ns import ops
 from bitymi_ns.train.config import LossConfig, TrainConfig
 from bitymi_ns.train.fit import fit
-from bitymi_ns.train.losses import error_weight, mean_psnr, mean_where_right, objective, photometric, psnr
+from bitymi_ns.train.losses import (
+    cc_psnr,
+    color_corrected,
+    error_weight,
+    mean_psnr,
+    mean_where_right,
+    objective,
+    photometric,
+    psnr,
+)
 
 
 @pytest.fixture
@@ -138,3 +149,36 @@ def test_the_overdraw_loss_leaves_fewer_fragments(make_scene, views):
         log = fit(scene, views, views, config, 40)
         counts.append(log.entries[-1].fragments)
     assert counts[1] < 0.9 * counts[0]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.booleans(), st.sampled_from([0.0, 1e-4, 1.0]))
+def test_fitted_colours_are_never_farther_away(seed: int, masked: bool, contrast: float) -> None:
+    g = torch.Generator().manual_seed(seed)
+    image, target = (torch.rand(6, 7, 3, generator=g) for _ in range(2))
+    image = 0.4 + contrast * (image - 0.4)  # of one colour, of nearly one colour
+    mask = torch.rand(6, 7, generator=g) < 0.5 if masked else None
+    if masked:
+        mask[0, 0] = True
+        target = torch.where(mask[..., None], target, math.nan)
+    assert cc_psnr(image, target, mask) >= psnr(image, target, mask) - 1e-4
+    assert cc_psnr(target.nan_to_num(0.5), target, mask) > 80
+
+
+def test_an_affine_change_of_colours_is_undone() -> None:
+    g = torch.Generator().manual_seed(0)
+    image = 0.2 + 0.5 * torch.rand(8, 9, 3, generator=g)
+    matrix, offset = torch.eye(3) + 0.1 * torch.randn(3, 3, generator=g), torch.tensor([0.05, -0.02, 0.1])
+    target = (image @ matrix.T + offset).clamp(0.0, 1.0)
+    assert psnr(image, target) < 25
+    torch.testing.assert_close(color_corrected(image, target), target, atol=1e-5, rtol=0)
+    mask = torch.rand(8, 9, generator=g) < 0.5
+    spoilt = torch.where(mask[..., None], target, 0.3)
+    torch.testing.assert_close(color_corrected(image, spoilt, mask), target, atol=1e-5, rtol=0)
+
+
+def test_fits_of_nothing_and_of_what_is_not_finite() -> None:
+    a = torch.rand(4, 5, 3)
+    assert math.isnan(cc_psnr(a, a, torch.zeros(4, 5, dtype=torch.bool)))
+    broken = torch.where(torch.arange(5)[None, :, None] == 2, math.nan, a)
+    assert torch.equal(color_corrected(broken, a).isnan(), broken.isnan())

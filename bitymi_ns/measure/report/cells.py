@@ -80,7 +80,13 @@ def read_pictures(path: Path, run: str = "") -> list[WorstView]:
     return views
 
 
-_SHOWN = (("psnr", 2, "dB"), ("ssim", 3, "SSIM"), ("flip", 3, "FLIP"), ("lpips", 3, "LPIPS"))
+_SHOWN = (
+    ("psnr", 2, "dB"),
+    ("cc_psnr", 2, "dB ccPSNR"),
+    ("ssim", 3, "SSIM"),
+    ("flip", 3, "FLIP"),
+    ("lpips", 3, "LPIPS"),
+)
 
 
 def _identity(key: dict[str, Any], *without: str) -> str:

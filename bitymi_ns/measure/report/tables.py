@@ -91,6 +91,7 @@ def _atlas_mb(row: Evaluation) -> float | None:
 COLUMNS = (
     Column("PSNR", _key("psnr"), "{:.2f}".format, "up"),
     Column("± seeds", _key("psnr_seeds"), "{:.2f}".format),
+    Column("ccPSNR", _key("cc_psnr"), "{:.2f}".format, "up"),
     Column("SSIM", _key("ssim"), "{:.3f}".format, "up"),
     Column("LPIPS", _key("lpips"), "{:.3f}".format, "down"),
     Column("FLIP", _key("flip"), "{:.3f}".format, "down"),
@@ -108,7 +109,8 @@ STAGES = {False: "Pre-baking (neural renderer)", True: "Post-baking (atlas)"}
 NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
     "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus neural, in dB. ± seeds: standard "
-    "deviation of the PSNR over seeds. Bold: best of its scene."
+    "deviation of the PSNR over seeds. ccPSNR: after an affine fit of each view's colours to its photograph, so that "
+    "exposure and white balance do not count. Bold: best of its scene."
 )
 
 
@@ -183,6 +185,7 @@ def training_table(curves: list[Curve]) -> Table | None:
         ("CPU seconds", lambda c: c.last("cpu_seconds"), significant),
         ("Last PSNR", lambda c: c.last("psnr"), "{:.2f}".format),
         ("Best PSNR", lambda c: c.best("psnr"), "{:.2f}".format),
+        ("Last ccPSNR", lambda c: c.last("cc_psnr"), "{:.2f}".format),
         ("Points", lambda c: c.last("surfels"), count),
         ("Fragments", lambda c: c.last("fragments"), count),
     ]

@@ -1,0 +1,227 @@
+"""Exposure and white balance of the training photographs: a colour correction per photograph, learned beside the scene.
+
+A photograph shows the scene's colour c as gain c, with a gain per channel, or as matrix c + offset. The corrections are
+relative to the mean photograph: the logarithms of the gains, and what else there is, sum to zero over the photographs
+after every step, so that they tint nothing. They are no part of the scene: held-out views have none, bundles neither.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.nn.functional import embedding
+from torch.optim import SparseAdam
+
+from bitymi_ns.train.agreement import measure_agreement
+from bitymi_ns.train.config import ExposureKind
+from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.views import View
+
+LIMIT = 2.0
+"""Largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops."""
+OTHER_LIMIT = 0.5
+"""Largest other entry of an affine correction."""
+EXPLAINED = 0.1
+"""`auto` corrects photographs where gains explain more than this share of how far they disagree at the points."""
+EXIF_SPREAD = 0.03
+"""Where the points do not tell, `auto` corrects photographs whose EXIF gains have this deviation (0.1 stop)."""
+PRIOR_POINTS = 20
+"""What EXIF says of a photograph, or else that it is like the others, counts as much as so many points."""
+BETAS = (0.9, 0.99)
+"""Of Adam: a photograph is shown once an epoch, so its averages have to be short."""
+ENCODING = 2.2
+"""Encoded colours grow as this root of the light."""
+
+
+class Exposure:
+    """The corrections of a run.
+
+    Attributes:
+        table: [V, 3] logarithms of gains; of affine corrections [V, 12], the rows of [matrix | offset] one after the
+            other, with the logarithms of the gains on the diagonal. None = no photograph is corrected.
+        decided: whether `start` has been called, or a state loaded.
+        finding: why photographs are corrected or not, in a sentence; empty until decided.
+    """
+
+    def __init__(self, kind: ExposureKind, exif: Sequence[float] | None = None) -> None:
+        """
+        Args:
+            kind: the option.
+            exif: log2 of the exposure of each training photograph (`exif_stops`), NaN = unknown; None = of all.
+        """
+        self.kind: ExposureKind = kind
+        self.table: Parameter | None = None
+        self.decided = kind == "off"
+        self.finding = ""
+        self._exif = exif
+        self._optimizer: SparseAdam | None = None
+
+    def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
+        """Decides whether photographs are corrected, and where the corrections start from.
+
+        Args:
+            points: [M, 3] of the scene, at best those of the capture.
+            views: training photographs at full size.
+            near: nearest drawn depth, camera z.
+        """
+        self.decided = True
+        agreement = measure_agreement(points, views, near)
+        prior = seeds(self._exif, len(views))
+        if self.kind == "auto":
+            if math.isnan(agreement.explained):
+                worth = float(prior.std(0, correction=0).max()) > EXIF_SPREAD
+                self.finding = "their EXIF exposures " + ("differ" if worth else "do not differ, or are unknown")
+            else:
+                worth = agreement.explained > EXPLAINED
+                self.finding = f"gains explain {max(0.0, agreement.explained):.0%} of how far they differ at the points"
+            if not worth:
+                return
+        else:
+            self.finding = "as asked for"
+        seen = agreement.points[:, None].float()
+        gains = (seen * agreement.log_gains + PRIOR_POINTS * prior) / (seen + PRIOR_POINTS)
+        self._begin(gains.to(points.device), affine=self.kind == "affine")
+
+    def _begin(self, log_gains: Tensor, affine: bool) -> None:
+        first = log_gains.new_zeros(len(log_gains), 12 if affine else 3)
+        first[:, _diagonal(first)] = log_gains
+        self.table = Parameter(settled(first))
+        # sparse: a photograph that is not shown keeps its moments
+        self._optimizer = SparseAdam([self.table], betas=BETAS)
+
+    @property
+    def sentence(self) -> str:
+        """What was decided, and why."""
+        gains = self.log_gains
+        if gains is None:
+            return f"Photographs are taken as they are exposed: {self.finding or 'as asked for'}."
+        spread = f"{math.expm1(float(gains.std(correction=0))):.0%}"
+        return f"The exposure of each photograph is learned, they differ by {spread}: {self.finding}."
+
+    @property
+    def log_gains(self) -> Tensor | None:
+        """[V, 3] logarithms of the gains; None = no photograph is corrected."""
+        return None if self.table is None else self.table.detach()[:, _diagonal(self.table)]
+
+    def of(self, number: int) -> Tensor | None:
+        """The correction of a training photograph: [3] gains, or [3, 4] matrix and offset; None = as it is."""
+        if self.table is None:
+            return None
+        row = embedding(torch.full((), number, device=self.table.device), self.table, sparse=True)
+        if row.numel() == 3:
+            return row.exp()
+        gains = torch.zeros(12, dtype=torch.bool, device=row.device)
+        gains[_diagonal(row)] = True
+        return torch.where(gains, torch.where(gains, row, 0.0).exp(), row).view(3, 4)
+
+    def step(self, rate: float) -> None:
+        """Learns from the gradients of a step's loss, which it clears.
+
+        Args:
+            rate: learning rate, of logarithms and other entries alike.
+        """
+        if self.table is None or self._optimizer is None or self.table.grad is None:
+            return
+        self.table.grad = self.table.grad.coalesce()
+        self.table.grad.values().nan_to_num_(0.0, 0.0, 0.0)
+        self._optimizer.param_groups[0]["lr"] = rate
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            self.table.copy_(settled(self.table))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors, numbers and text only."""
+        return {
+            "kind": self.kind,
+            "decided": self.decided,
+            "finding": self.finding,
+            "table": None if self.table is None else self.table.detach().clone(),
+            "optimizer": None if self._optimizer is None else copy.deepcopy(self._optimizer.state_dict()),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any] | None, count: int) -> None:
+        """Goes on where `state_dict` was taken; what belongs to another option or other photographs is left.
+
+        Args:
+            state: None = of a run from before there were corrections: `auto` then leaves all as it is.
+            count: number of training photographs.
+        """
+        if state is None:
+            self.decided = self.kind in ("off", "auto")
+            return
+        table = state["table"]
+        if state["kind"] != self.kind or (table is not None and len(table) != count):
+            return
+        self.decided, self.finding = bool(state["decided"]), str(state["finding"])
+        if table is None:
+            self.table = self._optimizer = None
+            return
+        device = table.device if self.table is None else self.table.device
+        self._begin(table[:, _diagonal(table)].to(device), table.shape[1] > 3)
+        assert self.table is not None and self._optimizer is not None
+        self.table.data.copy_(table)
+        self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+
+
+def corrected(views: Sequence[View], state: Mapping[str, Any] | None) -> Sequence[View]:
+    """The training photographs with the corrections that a run ended with.
+
+    Args:
+        views: of the run, at full size.
+        state: of its `Exposure`; None = it had none.
+
+    Raises:
+        ValueError: there are more or fewer photographs than the run had.
+    """
+    if state is None or state["table"] is None:
+        return views
+    if len(state["table"]) != len(views):
+        raise ValueError(
+            f"training learned the exposure of {len(state['table'])} photographs, and now there are {len(views)}: "
+            "restore the capture, or leave the texels as they are baked (--finetune-steps 0)"
+        )
+    exposure = Exposure(state["kind"])
+    exposure.load_state_dict(state, len(views))
+    with torch.no_grad():
+        found = [exposure.of(i) for i in range(len(views))]
+    return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
+
+
+def settled(table: Tensor) -> Tensor:
+    """The nearest admissible table [V, 3] or [V, 12]: finite, each column with mean 0 and within its limit."""
+    limit = table.new_full(table.shape[1:], OTHER_LIMIT)
+    limit[_diagonal(table)] = LIMIT
+    table = torch.maximum(torch.minimum(table.detach().nan_to_num(0.0), limit), -limit)
+    table = table - table.mean(0)
+    return table / (table.abs().amax(0) / limit).clamp(min=1.0)
+
+
+def _diagonal(table: Tensor) -> slice:
+    """The columns of the gains' logarithms. A slice: a list would be copied to the card at every step."""
+    return slice(None) if table.shape[-1] == 3 else slice(0, None, 5)
+
+
+def exif_stops(seconds: float, f_number: float, iso: float) -> float:
+    """log2 of the light that a photograph's settings let count: shutter time times ISO over the f-number's square."""
+    return math.log2(seconds * iso / (f_number * f_number))
+
+
+def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
+    """[V, 3] logarithms of gains by EXIF: encoded colours grow as a root of the light. 0 where nothing is known.
+
+    Args:
+        stops: by `exif_stops` for each photograph, NaN = unknown.
+        count: V.
+    """
+    if stops is None:
+        return torch.zeros(count, 3)
+    light = torch.tensor(stops, dtype=torch.float64) * math.log(2.0)
+    light = torch.where(light.isfinite(), light, math.nan) / ENCODING
+    return settled((light - light.nanmean()).nan_to_num(0.0).float()[:, None].expand(-1, 3))

@@ -1,0 +1,85 @@
+"""Colour corrections through nerfstudio's entry points: in checkpoints, in the export, in what is said."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.scripts import train as ns_train
+from PIL import Image
+
+from bitymi_ns.host import export as module
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.curve import FILE
+from bitymi_ns.host.export import ExportAtlas
+from bitymi_ns.sample import generate
+from tests.e2e.test_training import checkpoint, different
+
+Start = Callable[..., BitymiTrainerConfig]
+
+
+@pytest.fixture
+def uneven(tmp_path: Path) -> Path:
+    """The room, with every other photograph at 0.7 of its light."""
+    folder = generate(tmp_path / "uneven", views=12, width=48, height=36, seed=0, points=200)
+    for path in sorted((folder / "images").iterdir())[::2]:
+        Image.open(path).point(lambda value: round(0.7 * value)).save(path)
+    return folder
+
+
+def test_a_resumed_run_goes_on_with_its_corrections(
+    uneven: Path, start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = start(data=uneven, name="whole")
+    whole.save_only_latest_checkpoint = False
+    whole.pipeline.model.train.exposure = "gain"
+    ns_train.main(whole)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The exposure of each photograph is learned" in said and "as asked for" in said
+    state = checkpoint(whole, 59)["pipeline"]["_model._extra_state"]["run"]["exposure"]
+    table = state["table"]
+    assert table.shape == (10, 3) and table.abs().max() > 0.05
+    torch.testing.assert_close(table.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
+    last = json.loads((whole.get_base_dir() / FILE).read_text().splitlines()[-1])
+    assert last["cc_psnr"] > last["psnr"]
+
+    resumed = start(data=uneven, name="resumed")
+    resumed.pipeline.model.train.exposure = "gain"
+    resumed.load_dir, resumed.load_step = whole.get_checkpoint_dir(), 20
+    ns_train.main(resumed)
+    assert different(checkpoint(whole, 59), checkpoint(resumed, 59)) == []
+
+    given = []
+
+    def tune(baked: Any, views: Any, *rest: Any) -> Any:
+        given.extend(view.correction for view in views)
+        return baked
+
+    monkeypatch.setattr(module, "tune_atlas", tune)
+    ExportAtlas(load_config=whole.get_base_dir() / "config.yml", output_dir=tmp_path / "bundle").main()
+    torch.testing.assert_close(torch.stack(given), table.exp())
+    bundle = json.loads((tmp_path / "bundle" / "bundle.json").read_text())
+    held_out = bundle["statistics"]["held_out"]
+    assert held_out["cc_psnr_neural_against_photos"] > held_out["psnr_neural_against_photos"]
+    assert held_out["cc_psnr_baked_against_photos"] > held_out["psnr_baked_against_photos"]
+    assert "after a fit of the colours" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_checkpoint_of_before_goes_on_without(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
+    old = checkpoint(trained, 20)
+    del old["pipeline"]["_model._extra_state"]["run"]["exposure"]
+    path = tmp_path / "step-000000020.ckpt"
+    torch.save(old, path)
+    config = start(name="resumed")
+    config.load_checkpoint = path
+    ns_train.main(config)
+    run = checkpoint(config, 59)["pipeline"]["_model._extra_state"]["run"]
+    assert run["exposure"]["table"] is None
+    assert torch.equal(
+        checkpoint(config, 59)["pipeline"]["_model.scene.surfels.means"],
+        checkpoint(trained, 59)["pipeline"]["_model.scene.surfels.means"],
+    )

@@ -1,0 +1,270 @@
+"""Colour corrections of the photographs: the formula, what is kept of them, when there are any, and resuming."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from bitymi_ns.train import exposure as module
+from bitymi_ns.train.agreement import Agreement
+from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, corrected, exif_stops, seeds, settled
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.score import multi_view_scores
+from bitymi_ns.train.views import View, shown
+
+DENSIFY = DensifyConfig(max_surfels=250, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)
+
+
+def config(kind: str, **more) -> TrainConfig:
+    return TrainConfig(exposure=kind, densify=DENSIFY, **more)
+
+
+@pytest.fixture
+def uneven(views) -> list[View]:
+    """The views, exposed differently."""
+    logs = torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15])
+    return [v._replace(image=(v.image * g.exp()).clamp(0, 1)) for v, g in zip(views, logs, strict=True)]
+
+
+def started(kind: str, log_gains: Tensor, stops: Sequence[float] | None = None, points: int = 10**6) -> Exposure:
+    """An exposure whose photographs were found to have these gains."""
+    exposure = Exposure(kind, stops)
+    found = Agreement(log_gains, torch.full((len(log_gains),), points), 0.1, 0.05)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "measure_agreement", lambda *_: found)
+        exposure.start(torch.zeros(1, 3), [None] * len(log_gains), 0.02)
+    return exposure
+
+
+# the formula
+
+
+@pytest.mark.parametrize("background", [None, torch.tensor([0.2, 0.9, 1.0], dtype=torch.float64)])
+@pytest.mark.parametrize("columns", [3, 12])
+def test_gradients_of_the_corrected_image(columns: int, background: Tensor | None) -> None:
+    g = torch.Generator().manual_seed(0)
+    table = (0.3 * torch.randn(4, columns, generator=g, dtype=torch.float64)).requires_grad_()
+    rgb, alpha = (torch.rand(3, 4, n, generator=g, dtype=torch.float64).requires_grad_() for n in (3, 1))
+    exposure = Exposure("affine")
+
+    def image(table: Tensor, rgb: Tensor, alpha: Tensor) -> Tensor:
+        exposure.table = table  # type: ignore[assignment]
+        return shown(rgb, exposure.of(2), alpha, background)
+
+    def dense(table: Tensor, rgb: Tensor, alpha: Tensor) -> Tensor:
+        with pytest.MonkeyPatch.context() as patch:  # gradcheck knows no sparse gradients
+            patch.setattr(module, "embedding", lambda number, weight, sparse: weight[number])
+            return image(table, rgb, alpha)
+
+    assert torch.autograd.gradcheck(dense, (table, rgb, alpha))
+    image(table, rgb, alpha).sum().backward()
+    (gradient,) = torch.autograd.grad(dense(table, rgb, alpha).sum(), table)
+    torch.testing.assert_close(table.grad.to_dense(), gradient)
+
+
+def test_an_affine_correction_is_its_formula() -> None:
+    g = torch.Generator().manual_seed(1)
+    rgb, alpha, background = torch.rand(5, 6, 3, generator=g), torch.rand(5, 6, 1, generator=g), torch.rand(3)
+    correction = torch.rand(3, 4, generator=g)
+    behind = (1 - alpha) * background
+    want = (rgb - behind) @ correction[:, :3].T + alpha * correction[:, 3] + behind
+    torch.testing.assert_close(shown(rgb, correction, alpha, background), want)
+    gains = torch.diag(torch.tensor([1.2, 0.9, 1.1]))
+    as_matrix = torch.cat([gains, torch.zeros(3, 1)], 1)
+    torch.testing.assert_close(shown(rgb, gains.diag(), alpha, background), shown(rgb, as_matrix, alpha, background))
+    assert shown(rgb, None, alpha, background) is rgb
+
+
+# what is kept
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.integers(1, 9),
+    st.sampled_from([3, 12]),
+    st.floats(0, 100),
+    st.sampled_from([0.0, math.nan, math.inf, -math.inf, 1e30]),
+    st.integers(0, 99),
+)
+def test_tables_are_settled(count: int, columns: int, spread: float, odd: float, seed: int) -> None:
+    table = spread * torch.randn(count, columns, generator=torch.Generator().manual_seed(seed))
+    table[0, 0] = odd
+    done = settled(table)
+    limit = torch.full((columns,), OTHER_LIMIT)
+    limit[[0, 1, 2] if columns == 3 else [0, 5, 10]] = LIMIT
+    assert done.isfinite().all() and bool((done.abs() <= limit * (1 + 1e-6)).all())
+    torch.testing.assert_close(done.mean(0), torch.zeros(columns), rtol=0, atol=1e-6)
+    torch.testing.assert_close(settled(done), done, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_steps_keep_the_mean_and_the_limits(kind: str) -> None:
+    exposure = started(kind, torch.zeros(5, 3))
+    for step, bad in enumerate([0.0, 0.0, math.nan, math.inf, 0.0] * 20):
+        exposure.of(step % 5).sum().backward()
+        exposure.table.grad = exposure.table.grad + bad * exposure.table.grad
+        exposure.step(1.0)
+        assert exposure.table.grad is None and exposure.table.isfinite().all()
+        assert exposure.log_gains.abs().max() <= LIMIT + 1e-6
+        torch.testing.assert_close(
+            exposure.table.detach().mean(0), torch.zeros_like(exposure.table[0]), atol=1e-6, rtol=0
+        )
+    assert exposure.table.abs().max() > 0.1
+
+
+def test_a_photograph_that_is_not_shown_keeps_its_moments() -> None:
+    exposure = started("gain", torch.zeros(3, 3))
+    for _ in range(3):
+        exposure.of(1).sum().backward()
+        exposure.step(0.01)
+    before = exposure.table.detach().clone()
+    torch.testing.assert_close(before[0], before[2])  # both were only moved by the mean
+    assert bool((before[1] < before[0]).all())
+
+
+# when there are any
+
+
+def test_exif_is_where_the_corrections_start_from() -> None:
+    stops = [exif_stops(1 / 60, 2.8, 100), exif_stops(1 / 30, 2.8, 100), exif_stops(1 / 60, 2.8, 400), math.nan]
+    assert stops[1] - stops[0] == pytest.approx(1.0) and stops[2] - stops[0] == pytest.approx(2.0)
+    gains = seeds(stops, 4)
+    torch.testing.assert_close(gains[1:3] - gains[0], math.log(2) / 2.2 * torch.tensor([[1.0], [2.0]]).expand(-1, 3))
+    torch.testing.assert_close(gains.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
+    assert not gains[3].any() and not seeds(None, 3).any() and not seeds([math.nan, math.inf], 2).any()
+    assert seeds([0.0, 1e6], 2).abs().max() <= LIMIT
+    unseen = started("gain", torch.zeros(4, 3), stops, points=0)
+    torch.testing.assert_close(unseen.log_gains, gains)
+    well_seen = started("gain", torch.tensor([[0.1], [-0.1], [0.2], [-0.2]]).expand(-1, 3).clone(), stops)
+    torch.testing.assert_close(well_seen.log_gains[:, 0], torch.tensor([0.1, -0.1, 0.2, -0.2]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("stops", "before", "after", "on"),
+    [
+        (None, 0.1, 0.05, True),
+        (None, 0.1, 0.093, False),
+        (None, 0.1, 0.12, False),
+        (None, 0.0, 0.0, False),
+        (None, math.nan, math.nan, False),
+        ([0.0, 1.0, 2.0], math.nan, math.nan, True),
+        ([0.0, 0.01, 0.0], math.nan, math.nan, False),
+        ([0.0, 1.0, 2.0], 0.1, 0.1, False),  # the photographs say that the camera evened it out
+    ],
+)
+def test_auto_asks_the_photographs_and_then_exif(monkeypatch, stops, before, after, on) -> None:
+    found = Agreement(torch.zeros(3, 3), torch.zeros(3, dtype=torch.int64), before, after)
+    monkeypatch.setattr(module, "measure_agreement", lambda *_: found)
+    exposure = Exposure("auto", stops)
+    exposure.start(torch.zeros(1, 3), [None] * 3, 0.02)
+    assert exposure.decided and (exposure.table is not None) == on and exposure.finding in exposure.sentence
+    assert on == (exposure.of(1) is not None)
+
+
+def test_off_and_auto_on_even_photographs_are_the_same_run(make_scene, views) -> None:
+    runs = []
+    for kind in ("off", "auto"):
+        trainer = Trainer(make_scene(), views, config(kind), 30)
+        for _ in range(30):
+            trainer.advance()
+        assert trainer.training.exposure.table is None
+        runs.append([p.detach().clone() for p in trainer.scene.parameters()])
+    for a, b in zip(*runs, strict=True):
+        assert torch.equal(a, b)
+
+
+# in training
+
+
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_training_learns_the_exposures(make_scene, views, uneven, kind: str) -> None:
+    results = {}
+    for option in ("off", kind):
+        lr = LearningRates(exposure=(0.02, 0.005))
+        trainer = Trainer(make_scene(every=2), uneven, config(option, lr=lr, resolution_schedule=0), 150)
+        while trainer.step < 150:
+            trainer.advance()
+        results[option] = evaluate(trainer.scene, views, trainer.config)
+    grey = torch.full((1, 1, 3), 0.5)
+    shades = [shown(grey, trainer.training.exposure.of(i), torch.ones(1, 1, 1), None).mean() / 0.5 for i in range(6)]
+    want = torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15])
+    torch.testing.assert_close(torch.stack(shades).log(), want, atol=0.1, rtol=0)
+    assert results[kind].cc_psnr > results["off"].cc_psnr + 0.5
+    assert results[kind].psnr > results["off"].psnr - 0.1
+
+
+def test_scores_are_of_the_corrected_image(make_scene, views) -> None:
+    scene = make_scene(texture=False)
+    with torch.no_grad():
+        view = views[0]._replace(image=0.6 * scene.render(views[0].camera).rgb, correction=torch.full((3,), 0.6))
+    assert multi_view_scores(scene, [view], TrainConfig()).importance.sum() == 0
+    assert multi_view_scores(scene, [view._replace(correction=None)], TrainConfig()).importance.sum() > 0
+
+
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_a_resumed_run_is_the_same_run(make_scene, uneven, kind: str) -> None:
+    straight = Trainer(make_scene(), uneven, config(kind), 60)
+    for _ in range(14):
+        straight.advance()
+    state = straight.state_dict()
+    resumed = Trainer(make_scene(every=5), uneven, config(kind), 60)
+    resumed.load_state_dict(state)
+    for _ in range(14, 24):
+        straight.advance()
+        resumed.advance()
+    assert torch.equal(straight.training.exposure.table, resumed.training.exposure.table)
+    moments = [t.training.exposure.state_dict()["optimizer"]["state"][0] for t in (straight, resumed)]
+    assert torch.equal(moments[0]["exp_avg"].to_dense(), moments[1]["exp_avg"].to_dense())
+
+
+def test_states_of_earlier_versions_other_options_and_other_photographs(make_scene, uneven) -> None:
+    trainer = Trainer(make_scene(), uneven, config("gain"), 20)
+    trainer.advance()
+    state = trainer.training.exposure.state_dict()
+    older = Exposure("auto")
+    older.load_state_dict(None, 6)
+    assert older.decided and older.table is None
+    for kind, count in (("affine", 6), ("gain", 5)):
+        other = Exposure(kind)
+        other.load_state_dict(state, count)
+        assert not other.decided  # it starts anew
+    off = Exposure("off")
+    off.load_state_dict(state, 6)
+    assert off.decided and off.table is None
+    asked = Exposure("gain")
+    asked.load_state_dict(None, 6)
+    assert not asked.decided
+
+
+def test_going_back_restores_the_corrections(make_scene, uneven) -> None:
+    trainer = Trainer(make_scene(), uneven, config("gain"), 300)
+    trainer.advance()
+    before = trainer.training.exposure.state_dict()["table"]
+    trainer.training.guard._states = [(1, trainer.training.guard._capture())]
+    for _ in range(8):
+        trainer.advance()
+    assert not torch.equal(trainer.training.exposure.table, before)
+    with pytest.warns(UserWarning, match="diverged"):
+        trainer.training.guard._go_back(9, "a test")
+    assert torch.equal(trainer.training.exposure.table, before)
+    trainer.advance()
+
+
+def test_the_photographs_of_a_run_with_its_corrections(make_scene, uneven) -> None:
+    trainer = Trainer(make_scene(), uneven, config("gain"), 20)
+    trainer.advance()
+    state = trainer.training.exposure.state_dict()
+    views = corrected(uneven, state)
+    torch.testing.assert_close(views[3].correction, trainer.training.exposure.log_gains[3].exp())
+    assert views[3].image is uneven[3].image and not views[3].correction.requires_grad
+    assert corrected(uneven, None) is uneven and corrected(uneven, {**state, "table": None}) is uneven
+    with pytest.raises(ValueError, match="6 photographs, and now there are 5"):
+        corrected(uneven[:5], state)

@@ -23,13 +23,13 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.host import transforms
-from bitymi_ns.host.colmap import check_model, models_in, options_for
+from bitymi_ns.host.colmap import check_model, options_for
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
+from bitymi_ns.host.poses import check_spread
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
-
-PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic"}
+from bitymi_ns.recognise import PHOTOGRAPHS, models_in
 
 
 class Cloud(NamedTuple):
@@ -92,8 +92,8 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images
     if images and dataparser.downscale_factor is None:  # else copies of another size are read
         check_images([folder / frame["file_path"] for frame in frames])
     places = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
-    if dataparser.auto_scale_poses and not np.ptp(places, axis=0).any():
-        fail(f"{path}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+    if dataparser.auto_scale_poses:
+        check_spread(places, str(path))
     if not dataparser.load_3D_points:
         return Cloud()
     points = meta.get("ply_file_path")

@@ -33,8 +33,8 @@ class Found:
 
     Attributes:
         format: how.
-        path: nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap: the
-            folder of the model; photographs: the folder; video: the file.
+        path: nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap:
+            the folder of the model; photographs: the folder; video: the file.
         folder: of the capture, to which the names in its files are relative.
         others: what is there besides and is not read, with its format.
     """
@@ -233,8 +233,8 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     if archive is not None:
         hint = f" Unpack {archive.name} first."
     return (
-        f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), no "
-        f"photographs and no video.{hint}"
+        f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
+        f"no photographs and no video.{hint}"
     )
 
 

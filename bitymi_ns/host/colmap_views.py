@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pycolmap
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -21,7 +22,7 @@ from PIL import Image
 from bitymi_ns.host.colmap_model import Model, ModelCamera, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS
-from bitymi_ns.host.lens import Lens, lens
+from bitymi_ns.host.lens import Lens, Pinhole, lens
 from bitymi_ns.host.poses import check_spread
 from bitymi_ns.recognise import PHOTOGRAPHS
 
@@ -143,7 +144,7 @@ def _photographs(names: Sequence[str], folder: Path, capture: Path, given: Path 
     if present(best) == 0:
         fail(
             f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}. Copy the "
-            "photographs to its folder `images`, or give their folder, seen from there, with `bitymi-data --images-path`."
+            "photographs to its folder `images`, or give their folder, seen from there: `bitymi-data --images-path`."
         )
     return best
 
@@ -220,21 +221,7 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
         scale /= float(poses[:, :3, 3].abs().max())
     poses[:, :3, 3] *= scale
     transform = transform @ torch.from_numpy(TO_NERFSTUDIO.astype(np.float32))
-    pinholes = [each.pinhole for each in lenses]
-
-    def column(name: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-        return torch.tensor([getattr(pinhole, name) for pinhole in pinholes], dtype=dtype)
-
-    cameras = Cameras(
-        fx=column("fx"),
-        fy=column("fy"),
-        cx=column("cx"),
-        cy=column("cy"),
-        width=column("width", torch.int32),
-        height=column("height", torch.int32),
-        camera_to_worlds=poses[:, :3, :4],
-        camera_type=CameraType.PERSPECTIVE,
-    )
+    cameras = pinhole_cameras([each.pinhole for each in lenses], poses)
     metadata: dict[str, Any] = {"lenses": lenses}
     if points and len(model.xyz):
         xyz = torch.from_numpy(model.xyz.astype(np.float32))
@@ -251,6 +238,20 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
         dataparser_scale=scale,
         dataparser_transform=transform,
         metadata=metadata,
+    )
+
+
+def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras:
+    """nerfstudio's cameras of these, with poses [N, 3 or 4, 4] camera to world."""
+
+    def column(name: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.tensor([getattr(pinhole, name) for pinhole in pinholes], dtype=dtype)
+
+    return Cameras(
+        **{name: column(name) for name in ("fx", "fy", "cx", "cy")},
+        **{name: column(name, torch.int32) for name in ("width", "height")},
+        camera_to_worlds=poses[:, :3, :4],
+        camera_type=CameraType.PERSPECTIVE,
     )
 
 
@@ -306,11 +307,7 @@ def _scaled(camera: ModelCamera, size: tuple[int, int]) -> tuple[float, ...]:
     """The parameters of a camera for pictures of another size."""
     if size == (camera.width, camera.height):
         return camera.params
-    import pycolmap
-
-    rescaled = pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-    )
+    rescaled = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
     rescaled.rescale(*size)
     return tuple(rescaled.params)
 
@@ -329,7 +326,9 @@ def _point_out_smaller(source: Source, lenses: Sequence[Lens]) -> None:
     if source.reduction > 1 or longest <= LARGE:
         return
     there = [n for n in (2, 4, 8) if source.photographs.with_name(f"{source.photographs.name}_{n}").is_dir()]
-    ways = f": `bitymi-data --downscale-factor {there[-1]}` reads {source.photographs.name}_{there[-1]}" if there else (
-        ", as they are with `bitymi-data --downscale-factor 4`"
+    ways = (
+        f": `bitymi-data --downscale-factor {there[-1]}` reads {source.photographs.name}_{there[-1]}"
+        if there
+        else (", as they are with `bitymi-data --downscale-factor 4`")
     )
     say(f"The photographs have up to {longest:,} pixels along a side. Smaller ones train faster{ways}.")

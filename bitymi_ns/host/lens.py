@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pycolmap
 from PIL import Image
 
-from bitymi_ns.host.cameras import LITTLE_LEFT, NOTHING_LEFT
+from bitymi_ns.host.cameras import LITTLE_LEFT, NOTHING_LEFT, PANORAMAS
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import wrong_size
 
@@ -115,10 +115,7 @@ def lens(
     """
     camera = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     if camera.is_spherical():
-        fail(
-            f"{whose} is {model}: 360-degree pictures cannot be trained on as they are. Cut them into perspective views "
-            "with `ns-process-data images --camera-type equirectangular`, which finds their poses anew."
-        )
+        fail(f"{whose} is {model}. {PANORAMAS}")
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
@@ -135,7 +132,7 @@ def lens(
     if share < NOTHING_LEFT or min(w, h) < 1:
         fail(
             f"the lens distortion of {whose} is absurd: with {model} {camera.params_to_string()} undistorting would "
-            f"leave {100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler camera "
+            f"leave {100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler model "
             "(SIMPLE_RADIAL)."
         )
     if share < LITTLE_LEFT:

@@ -89,7 +89,6 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
             )
             > math.tan(math.radians(OFF_AXIS)),
         ),
-        ("its pictures are equirectangular", kind == CameraType.EQUIRECTANGULAR.value),
         (
             "it is neither a perspective nor a fisheye camera, which are the kinds that can be trained on, but "
             f"{_kind_names(kind[~torch.isin(kind, kinds)])}",
@@ -105,7 +104,7 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
         ),
     ):
         if bool(wrong.any()):
-            remedy = PANORAMAS if "equirectangular" in what else "Correct the capture."
+            remedy = PANORAMAS if CameraType.EQUIRECTANGULAR.name in what else "Correct the capture."
             fail(f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. {remedy}")
     if distortion is not None:
         _check_distortion(cameras, names)

@@ -20,7 +20,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from bitymi_ns.host import holdout
+from bitymi_ns.host import finding, holdout
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import Place, Source, find_source, pinhole_cameras, tell_left_out, views
 from bitymi_ns.host.dataset import views_of
@@ -136,7 +136,7 @@ class BitymiDataParserConfig(DataParserConfig):
         reduction = self.downscale_factor or 1
         if found.format == "colmap":
             return find_source(found.path, found.folder, self.images_path, self.masks_path, reduction)
-        return _find_poses(found, self.masks_path, reduction)
+        return finding.source_of(found, self.masks_path, reduction)
 
 
 class BitymiDataParser(DataParser):
@@ -270,16 +270,3 @@ def _without_fisheyes(outputs: DataparserOutputs, where: str) -> DataparserOutpu
         cameras=pinhole_cameras([each.pinhole for each in lenses], cameras.camera_to_worlds),
         metadata={**outputs.metadata, "lenses": lenses},
     )
-
-
-def _find_poses(found: Found, masks_path: Path | None, reduction: int) -> Source:
-    """The model of photographs or of a video whose poses nobody knows yet."""
-    from bitymi_ns.capture import CaptureError, SfmOptions, find_poses
-
-    masks = None if masks_path is None else found.folder / masks_path
-    try:
-        poses = find_poses(found.path, SfmOptions(masks=masks))
-    except CaptureError as error:
-        fail(str(error), error)
-    masks = masks_path if masks_path is None else masks
-    return find_source(poses.model, poses.images.parent, poses.images, masks, reduction, poses.left_out)

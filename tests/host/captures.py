@@ -12,6 +12,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.host.datamanager import BitymiDataManager, BitymiDataManagerConfig
+from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.errors import InputError
 
 
@@ -24,6 +25,11 @@ def load(data: Path, **dataparser: Any) -> BitymiDataManager:
 def load_with(data: Path, dataparser: Any) -> BitymiDataManager:
     """The data manager of a capture in another format."""
     return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device="cpu", test_mode="val")
+
+
+def load_any(data: Path, **options: Any) -> BitymiDataManager:
+    """The data manager of whatever the path holds, as the presets read it."""
+    return load_with(data, BitymiDataParserConfig(**options))
 
 
 def images_of(capture: Path) -> list[Path]:

@@ -29,20 +29,22 @@ from bitymi_ns.host.lens import lens
 from bitymi_ns.host.transforms import Lists, complete_instant_ngp, corrected_files, take_lists, without_endings
 from bitymi_ns.recognise import Found, NotRecognised, recognise
 
+WITH_MODEL = ("colmap", "photographs", "video")
+"""Formats that are read as a COLMAP model, which is found for those that come without."""
 USED_BY: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
     "masks_path": ("colmap", "photographs"),
-    "downscale_factor": ("nerfstudio", "colmap", "photographs", "video"),
+    "downscale_factor": ("nerfstudio", *WITH_MODEL),
     "ply_path": ("blender",),
     "alpha_color": ("blender",),
-    "scene_scale": ("nerfstudio", "colmap", "photographs", "video"),
-    "orientation_method": ("nerfstudio", "colmap", "photographs", "video"),
-    "center_method": ("nerfstudio", "colmap", "photographs", "video"),
-    "auto_scale_poses": ("nerfstudio", "colmap", "photographs", "video"),
-    "scale_factor": ("nerfstudio", "colmap", "photographs", "video", "blender"),
-    "load_3D_points": ("nerfstudio", "colmap", "photographs", "video"),
-    "eval_names": ("nerfstudio", "instant-ngp", "colmap", "photographs", "video"),
+    "scene_scale": ("nerfstudio", *WITH_MODEL),
+    "orientation_method": ("nerfstudio", *WITH_MODEL),
+    "center_method": ("nerfstudio", *WITH_MODEL),
+    "auto_scale_poses": ("nerfstudio", *WITH_MODEL),
+    "scale_factor": ("nerfstudio", *WITH_MODEL, "blender"),
+    "load_3D_points": ("nerfstudio", *WITH_MODEL),
+    "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL),
 }
 """Formats that an option is for, where that is not all of them."""
 
@@ -158,7 +160,7 @@ class BitymiDataParser(DataParser):
         found = self.config.find()
         if found.format == "blender":
             return self._blender(found)
-        outputs, lists = self._colmap(found) if found.format in USED_BY["masks_path"] else self._transforms(found)
+        outputs, lists = self._colmap(found) if found.format in WITH_MODEL else self._transforms(found)
         split = self._holdout(outputs.image_filenames, lists, found)
         say(split.told(outputs.image_filenames))
         held_out = views_of(outputs, split.held_out)

@@ -20,7 +20,7 @@ from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.train.views import View
-from tests.host.captures import colmap_model, expect, images_of, load_any, load_with, said
+from tests.host.captures import colmap_model, expect, images_of, load_any, load_with, mixed_project, said
 from tests.host.test_colmap import as_binary
 from tests.host.test_lens import MODELS, camera_of
 
@@ -93,42 +93,15 @@ def test_the_transform_leads_back_to_the_models_frame(project: Path) -> None:
         assert np.allclose(-rotation.T @ place, image.tvec, atol=1e-4)
 
 
-def write_model(folder: Path, cameras: dict[int, str], camera_of_image: list[int], images: list[str]) -> None:
-    """A text model of these photographs on a circle; cameras as lines of cameras.txt after the number."""
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text("".join(f"{number} {line}\n" for number, line in cameras.items()))
-    lines = []
-    for i, (name, number) in enumerate(zip(images, camera_of_image, strict=True)):
-        half = np.pi * i / len(images)
-        lines.append(f"{i + 1} {np.cos(half)} 0 {np.sin(half)} 0 0 0 3 {number} {name}\n\n")
-    (folder / "images.txt").write_text("".join(lines), "utf8")
-    (folder / "points3D.txt").write_text("".join(f"{i} 0.{i} 0 0.5 200 10 10 0.5\n" for i in range(1, 9)))
-
-
 @pytest.fixture
 def mixed(tmp_path: Path) -> Path:
-    """Nine photographs by three cameras: landscape through a lens, portrait, and a fisheye."""
-    sizes = {1: (48, 36), 2: (30, 40), 3: (40, 40)}
-    chosen = [1, 2, 3] * 3
-    photographs = [f"cam{number}/IMG {i} \u00fc.jpg" for i, number in enumerate(chosen)]
-    cameras = {
-        1: "SIMPLE_RADIAL 48 36 40 24 18 0.08",
-        2: "PINHOLE 30 40 40 41 15 20",
-        3: "OPENCV_FISHEYE 40 40 16 16 20 20 0.01 0 0 0",
-    }
-    write_model(tmp_path / "sparse/0", cameras, chosen, photographs)
-    for i, (name, number) in enumerate(zip(photographs, chosen, strict=True)):
-        path = tmp_path / "images" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.random.default_rng(i).integers(0, 255, (*sizes[number][::-1], 3), np.uint8)
-        Image.fromarray(pixels).save(path)
-    return tmp_path
+    return mixed_project(tmp_path)
 
 
 def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     manager = load_any(mixed)
     text = said(capsys)
-    assert "(9 photographs, 1 OPENCV_FISHEYE and 1 PINHOLE and 1 SIMPLE_RADIAL cameras, 8 points)" in text
+    assert "(9 photographs, 1 OPENCV_FISHEYE and 1 PINHOLE and 1 SIMPLE_RADIAL cameras, 99 points)" in text
     assert "Camera 3 of " in text and "is OPENCV_FISHEYE: its photographs are used as pinhole pictures of 10" in text
     sizes = set()
     for views in (manager.train_views, manager.eval_views):

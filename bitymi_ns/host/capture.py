@@ -91,7 +91,7 @@ def _check_options(dataparser: DataParserConfig) -> None:
 def _check_model(dataparser: BitymiDataParserConfig, found: Found, images: bool) -> Cloud:
     if found.format != "colmap":
         return Cloud()  # there are no poses yet
-    source = dataparser.source(found)
+    source = dataparser.source(found, images)
     model = read_model(source.folder)
     if images:
         check_images(source.files(model))

@@ -94,6 +94,7 @@ def find_source(
     masks_path: Path | None = None,
     reduction: int = 1,
     left_out: Mapping[str, str] | None = None,
+    look: bool = True,
 ) -> Source:
     """Find a model's photographs and masks.
 
@@ -104,24 +105,25 @@ def find_source(
         images_path, masks_path: where they are, if that is known.
         reduction: use photographs that are so many times smaller.
         left_out: what is known of photographs that the model lacks.
+        look: the photographs are needed; else they may be missing.
 
     Raises:
         InputError: no folder has the model's photographs, or the masks are not whole.
     """
     names = [image.name for image in read_model(folder).images]
-    photographs = _photographs(names, folder, capture, images_path, reduction)
+    photographs = _photographs(names, folder, capture, images_path, reduction, look)
     smaller = photographs.with_name(f"{photographs.name}_{reduction}")
     reduced = smaller if reduction > 1 and smaller.is_dir() else None
-    if reduction > 1 and not photographs.is_dir() and reduced is None:
-        fail(f"neither {smaller} nor {photographs} exists. Leave --downscale-factor out, or give --images-path.")
     masks = _masks(photographs, capture, masks_path, reduction if reduced is not None else 1)
     return Source(folder, photographs, masks, reduction, reduced, dict(left_out or {}))
 
 
-def _photographs(names: Sequence[str], folder: Path, capture: Path, given: Path | None, reduction: int) -> Path:
+def _photographs(
+    names: Sequence[str], folder: Path, capture: Path, given: Path | None, reduction: int, look: bool
+) -> Path:
     """The folder that has the most of these photographs."""
     if given is not None:
-        if (capture / given).is_dir() or (capture / f"{given}_{reduction}").is_dir():
+        if not look or (capture / given).is_dir() or (capture / f"{given}_{reduction}").is_dir():
             return capture / given
         fail(
             f"the folder of photographs {capture / given} does not exist. Give it, seen from {capture}, with "
@@ -141,7 +143,7 @@ def _photographs(names: Sequence[str], folder: Path, capture: Path, given: Path 
         return max(sum((each / name).is_file() for name in names) if each.is_dir() else 0 for each in both)
 
     best = max(places, key=present)  # the first of equals
-    if present(best) == 0:
+    if look and present(best) == 0:
         fail(
             f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}. Copy the "
             "photographs to its folder `images`, or give their folder, seen from there: `bitymi-data --images-path`."
@@ -150,8 +152,9 @@ def _photographs(names: Sequence[str], folder: Path, capture: Path, given: Path 
 
 
 def _masks(photographs: Path, capture: Path, given: Path | None, reduction: int) -> Path | None:
-    """The folder of masks: the given one, or `masks` beside the photographs."""
-    folder = photographs.with_name("masks") if given is None else capture / given
+    """The folder of masks: the given one, or `masks` beside the photographs, or in the capture where it is they."""
+    beside = capture if photographs == capture else photographs.parent
+    folder = beside / "masks" if given is None else capture / given
     if reduction > 1:
         folder = folder.with_name(f"{folder.name}_{reduction}")
     if folder.is_dir():
@@ -224,9 +227,7 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
     cameras = pinhole_cameras([each.pinhole for each in lenses], poses)
     metadata: dict[str, Any] = {"lenses": lenses}
     if points and len(model.xyz):
-        xyz = torch.from_numpy(model.xyz.astype(np.float32))
-        metadata["points3D_xyz"] = (xyz @ transform[:, :3].T + transform[:, 3]) * scale
-        metadata["points3D_rgb"] = torch.from_numpy(model.rgb)
+        metadata.update(points_of(model, transform, scale))
     elif points and announce:
         warn(f"The COLMAP model {source.folder} has no points. Training starts from random points.")
     side = place.scene_scale
@@ -253,6 +254,12 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
         camera_to_worlds=poses[:, :3, :4],
         camera_type=CameraType.PERSPECTIVE,
     )
+
+
+def points_of(model: Model, transform: torch.Tensor, scale: float) -> dict[str, torch.Tensor]:
+    """nerfstudio's entries for a model's points, moved by [3, 4] and scaled."""
+    xyz = torch.from_numpy(model.xyz.astype(np.float32)) @ transform[:3, :3].T + transform[:3, 3]
+    return {"points3D_xyz": xyz * scale, "points3D_rgb": torch.from_numpy(model.rgb)}
 
 
 TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

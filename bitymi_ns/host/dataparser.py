@@ -22,11 +22,26 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from bitymi_ns.host import finding, holdout
 from bitymi_ns.host.colmap_model import read_model
-from bitymi_ns.host.colmap_views import Place, Source, find_source, pinhole_cameras, tell_left_out, views
+from bitymi_ns.host.colmap_views import (
+    Place,
+    Source,
+    find_source,
+    pinhole_cameras,
+    points_of,
+    tell_left_out,
+    views,
+)
 from bitymi_ns.host.dataset import views_of
 from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.lens import lens
-from bitymi_ns.host.transforms import Lists, complete_instant_ngp, corrected_files, take_lists, without_endings
+from bitymi_ns.host.transforms import (
+    Lists,
+    colmap_points,
+    complete_instant_ngp,
+    corrected_files,
+    take_lists,
+    without_endings,
+)
 from bitymi_ns.recognise import Found, NotRecognised, recognise
 
 WITH_MODEL = ("colmap", "photographs", "video")
@@ -120,10 +135,14 @@ class BitymiDataParserConfig(DataParserConfig):
         """The configuration of nerfstudio's parser that reads this, all views as one split; None = it has none."""
         if found.format == "nerfstudio":
             names = ("downscale_factor", "scale_factor", "scene_scale", "orientation_method", "center_method")
-            kept = {name: getattr(self, name) for name in (*names, "auto_scale_poses", "load_3D_points")}
-            return NerfstudioDataParserConfig(data=found.path, eval_mode="interval", eval_interval=1, **kept)
+            kept = {name: getattr(self, name) for name in (*names, "auto_scale_poses")}
+            # it would ask whether to convert COLMAP's points, which are read as they are
+            points = self.load_3D_points and colmap_points(found.path) is None
+            return NerfstudioDataParserConfig(
+                data=Path(self.data), eval_mode="interval", eval_interval=1, load_3D_points=points, **kept
+            )
         if found.format == "instant-ngp":
-            return InstantNGPDataParserConfig(data=found.path, eval_mode="interval", eval_interval=1)
+            return InstantNGPDataParserConfig(data=Path(self.data), eval_mode="interval", eval_interval=1)
         if found.format == "blender":
             options = {"scale_factor": self.scale_factor, "alpha_color": self.alpha_color, "ply_path": self.ply_path}
             return BlenderDataParserConfig(data=found.path, **options)
@@ -133,11 +152,11 @@ class BitymiDataParserConfig(DataParserConfig):
         """What is done with the frame of a COLMAP model."""
         return Place(**{each.name: getattr(self, each.name) for each in dataclasses.fields(Place)})
 
-    def source(self, found: Found) -> Source:
-        """The COLMAP model and its photographs, found for photographs without poses."""
+    def source(self, found: Found, look: bool = True) -> Source:
+        """The COLMAP model and its photographs, found for photographs without poses; see `find_source`."""
         reduction = self.downscale_factor or 1
         if found.format == "colmap":
-            return find_source(found.path, found.folder, self.images_path, self.masks_path, reduction)
+            return find_source(found.path, found.folder, self.images_path, self.masks_path, reduction, look=look)
         return finding.source_of(found, self.masks_path, reduction)
 
 
@@ -179,7 +198,13 @@ class BitymiDataParser(DataParser):
             lists.update(take_lists(meta))
 
         outputs = self._read(found, "val", adapt)
-        self._tell(found, f"{found.path} ({found.format}, {len(outputs.image_filenames)} photographs)")
+        what = f"{found.path} ({found.format}, {len(outputs.image_filenames)} photographs)"
+        model = colmap_points(found.path) if found.format == "nerfstudio" and self.config.load_3D_points else None
+        if model is not None:
+            placed = points_of(read_model(model), outputs.dataparser_transform, outputs.dataparser_scale)
+            outputs = dataclasses.replace(outputs, metadata={**outputs.metadata, **placed})
+            what += f", points of {model}"
+        self._tell(found, what)
         return outputs, lists
 
     def _read(self, found: Found, split: str, adapt: Callable[[Path, Any], None]) -> DataparserOutputs:
@@ -194,8 +219,8 @@ class BitymiDataParser(DataParser):
 
     def _colmap(self, found: Found) -> tuple[DataparserOutputs, Lists]:
         """All views of a COLMAP model, and the lists of photographs beside it."""
-        source = self.config.source(found)
         look = self.downscale_factor is None
+        source = self.config.source(found, look)
         model = read_model(source.folder)
         self._tell(found, source.told(model))
         if look:

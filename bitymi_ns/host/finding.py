@@ -29,11 +29,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int) -> Source:
     Raises:
         InputError: no poses can be found; says what to photograph differently.
     """
-    from bitymi_ns.capture import (  # with it comes the whole of structure from motion
-        CaptureError,
-        SfmOptions,
-        find_poses,
-    )
+    from bitymi_ns.capture import CaptureError, SfmOptions, find_poses  # late: it is much, and seldom needed
 
     masks = None if masks_path is None else found.folder / masks_path
     try:
@@ -47,7 +43,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int) -> Source:
     )
     if masks is None and found.format == "photographs" and (found.path / "masks").is_dir():
         masks = found.path / "masks"
-    return find_source(poses.model, poses.images, Path(), masks, reduction, poses.left_out)
+    return find_source(poses.model, poses.images, Path(), masks, reduction, poses.left_out, look=False)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from bitymi_ns.host.cameras import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.poses import rotations
-from bitymi_ns.recognise import PHOTOGRAPHS
+from bitymi_ns.recognise import PHOTOGRAPHS, is_model
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")
@@ -157,6 +157,19 @@ def _check_lists(path: Path, meta: dict[str, Any]) -> None:
         )
     for key, other in ((keys[1], keys[2]), (keys[2], keys[1])):
         meta.setdefault(key, meta.get(other))
+
+
+def colmap_points(path: Path) -> Path | None:
+    """The COLMAP model whose points belong to a transforms.json that names no points, as earlier versions of
+    nerfstudio's tool left it; None = there is none."""
+    model = path.parent / "colmap/sparse/0"
+    if not is_model(model):
+        return None
+    try:
+        meta = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None  # what is wrong is said where it is read
+    return None if not isinstance(meta, dict) or "ply_file_path" in meta else model
 
 
 def take_lists(meta: dict[str, Any]) -> Lists:

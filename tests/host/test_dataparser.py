@@ -171,6 +171,21 @@ def test_options_that_are_for_something_else_exist() -> None:
     assert USED_BY.keys() <= BitymiDataParserConfig.__dataclass_fields__.keys()
 
 
+def test_points_of_the_model_that_a_capture_was_made_of(capture: Path, edit: Any) -> None:
+    """nerfstudio's parser would ask whether to convert them."""
+    applied = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    colmap_model(capture, capture / "colmap/sparse/0")
+    edit(capture, lambda meta: meta.pop("ply_file_path"))
+    outputs = load_any(capture).train_dataparser_outputs
+    edit(capture, lambda meta: meta.update(applied_transform=applied))  # what nerfstudio takes where there is none
+    stock = load(capture, load_3D_points=False).train_dataparser_outputs
+    assert torch.equal(outputs.dataparser_transform, stock.dataparser_transform)
+    moved = torch.tensor([[0, 0, 0.5], [0.1, 0, 0.5]]) @ stock.dataparser_transform[:, :3].T
+    expected = (moved + stock.dataparser_transform[:, 3]) * stock.dataparser_scale
+    assert torch.allclose(outputs.metadata["points3D_xyz"], expected, atol=1e-6)
+    assert outputs.metadata["points3D_rgb"].tolist() == [[200, 10, 10], [200, 10, 10]]
+
+
 # Blender
 
 

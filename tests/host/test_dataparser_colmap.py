@@ -328,7 +328,7 @@ def test_lists_beside_the_model(project: Path) -> None:
 
 
 def test_what_needs_no_photographs_opens_none(project: Path) -> None:
-    for path in images_of(project)[1:]:
+    for path in images_of(project):
         path.unlink()
     config = BitymiDataManagerConfig(data=project, dataparser=BitymiDataParserConfig())
     assert len(config.setup(device="cpu", test_mode="inference").train_dataset) == 10

@@ -7,6 +7,8 @@ rule for all.
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,7 +34,7 @@ from bitymi_ns.host.colmap_views import (
     views,
 )
 from bitymi_ns.host.dataset import views_of
-from bitymi_ns.host.errors import fail, say
+from bitymi_ns.host.errors import fail, listed, say
 from bitymi_ns.host.lens import lens
 from bitymi_ns.host.transforms import (
     Lists,
@@ -191,13 +193,16 @@ class BitymiDataParser(DataParser):
     def _transforms(self, found: Found) -> tuple[DataparserOutputs, Lists]:
         """All views of a transforms.json, and its lists of photographs for training and evaluation."""
         lists: Lists = {}
+        files: set[Path] = set()
 
         def adapt(path: Path, meta: Any) -> None:
             if found.format == "instant-ngp":
                 complete_instant_ngp(path, meta)
             lists.update(take_lists(meta))
+            files.update(Path(os.path.normpath(frame["file_path"])) for frame in meta["frames"])
 
         outputs = self._read(found, "val", adapt)
+        _check_not_merged(files, outputs.image_filenames)
         what = f"{found.path} ({found.format}, {len(outputs.image_filenames)} photographs)"
         model = colmap_points(found.path) if found.format == "nerfstudio" and self.config.load_3D_points else None
         if model is not None:
@@ -261,6 +266,24 @@ class BitymiDataParser(DataParser):
         held_out = sorted({*numbers("val"), *numbers("test")})
         rest = [i for i in range(len(names)) if i not in set(held_out)]
         return holdout.Split(numbers("train") if "train" in lists else rest, held_out, f"by {where}")
+
+
+def _check_not_merged(files: set[Path], read: Sequence[Path]) -> None:
+    """Stop where photographs of one name are taken for each other: nerfstudio looks for the reduced ones of all folders
+    in one.
+
+    Args:
+        files: that the capture names.
+        read: in their place.
+    """
+    if len(set(read)) >= len(files):
+        return
+    counts = Counter(path.name for path in files)
+    twins = sorted(path.as_posix() for path in files if counts[path.name] > 1)
+    fail(
+        f"{listed(twins)} have the same names in different folders, but {read[0].parent} can have one of each alone. "
+        "Use the photographs as they are (`bitymi-data --downscale-factor 1`), or give them different names."
+    )
 
 
 def _lists_in(folder: Path) -> Lists:

@@ -89,6 +89,19 @@ def test_reduced_photographs_of_nerfstudio(capture: Path, edit: Any) -> None:
     assert len(load_any(capture, downscale_factor=2).eval_dataset) == 1
 
 
+def test_photographs_of_one_name_in_two_folders(capture: Path, edit: Any) -> None:
+    for folder in ("images/left", "images_2"):
+        (capture / folder).mkdir()
+    Image.new("RGB", (48, 36), "red").save(capture / "images/left/frame_00001.png")
+    for path in images_of(capture):
+        Image.open(path).resize((24, 18)).save(capture / "images_2" / path.name)
+    edit(capture, lambda meta: meta["frames"][1].update(file_path="images/left/frame_00001.png"))
+    manager = load_any(capture, eval_names=("left/frame_00001.png",))
+    assert manager.eval_dataset.image_filenames == [capture / "images/left/frame_00001.png"]
+    with expect("images/frame_00001.png, images/left/frame_00001.png have the same names in different folders"):
+        load_any(capture, downscale_factor=2)
+
+
 def test_names_that_are_held_out(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one = load_any(capture, eval_names=("images/frame_00003.png", "frame_00005.png"))
     assert [path.name for path in one.eval_dataset.image_filenames] == ["frame_00003.png", "frame_00005.png"]

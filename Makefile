@@ -1,5 +1,5 @@
 # make setup   virtual environment, pinned dependencies, compiled extension
-# make demo    train, bake and evaluate the sample scene (or DATA=folder) into demo/
+# make demo    train, bake and evaluate the sample scene (or DATA=folder or video) into demo/
 # make test    the test suite
 # make bench   quality, speed, size and stability on the demo scene and on your captures, with a report (hours; training
 #              and baking resume): make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"]

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Train, bake, evaluate and report: the sample room, or your own capture.
 #
-#   scripts/demo.sh [FOLDER]     FOLDER: a nerfstudio capture (transforms.json and images)
+#   scripts/demo.sh [DATA]     DATA: whatever `ns-train bitymi --data` takes: photographs, a video, a COLMAP project,
+#                              a capture with transforms.json
 #
 # The commands are on PATH after `make setup` when called by `make demo`, or in an environment with this package
 # installed. Each step is skipped when its result is there; remove the result to do it again. A training that was
@@ -13,9 +14,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 method=${METHOD:-bitymi}
 if [ $# -ge 1 ]; then
-  [ -f "$data/transforms.json" ] || {
-    echo "demo: $1 is no nerfstudio capture (a folder with transforms.json and images);" \
-      "ns-process-data makes one from photographs or a video" >&2
+  [ -e "$data" ] || {
+    echo "demo: $1 does not exist" >&2
     exit 1
   }
   name=$(basename -- "$data")
@@ -36,7 +36,7 @@ export PYTHONWARNINGS=${PYTHONWARNINGS:-ignore::FutureWarning:nerfstudio.field_c
 
 say() { printf '\n== %s (%d s so far)\n' "$*" "$SECONDS"; }
 
-if [ ! -f "$data/transforms.json" ]; then
+if [ $# -eq 0 ] && [ ! -f "$data/transforms.json" ]; then
   say "Rendering the sample room into $data"
   bitymi sample --output-dir "$data"
 fi

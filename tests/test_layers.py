@@ -16,7 +16,7 @@ import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "train", "bake", "bundle", "host", "measure"]
-"""Innermost first. Beside them stand `files`, `ply`, `presets` and `sample`, which import none of these."""
+"""Innermost first. Beside them stand `files`, `ply`, `presets`, `recognise` and `sample`, which import none of these."""
 KNOW_NERFSTUDIO = ("host", "measure/knobs.py", "measure/pictures.py")
 
 

@@ -14,6 +14,10 @@ from torch import Tensor
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
+PANORAMAS = (
+    "360-degree pictures cannot be trained on as they are. Cut them into perspective views with "
+    "`ns-process-data images --camera-type equirectangular`, which finds their poses anew."
+)
 UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
 """Kinds of cameras whose photographs become those of a perspective camera on loading."""
 OFF_AXIS = 80
@@ -87,7 +91,8 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
             > math.tan(math.radians(OFF_AXIS)),
         ),
         (
-            "it is neither a perspective nor a fisheye camera, which are the kinds that can be trained on",
+            "it is neither a perspective nor a fisheye camera, which are the kinds that can be trained on, but "
+            f"{_kind_names(kind[~torch.isin(kind, kinds)])}",
             ~torch.isin(kind, kinds),
         ),
         (
@@ -100,11 +105,14 @@ def check_cameras(cameras: Cameras, names: Sequence[object]) -> None:
         ),
     ):
         if bool(wrong.any()):
-            fail(
-                f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. Correct the capture."
-            )
+            remedy = PANORAMAS if CameraType.EQUIRECTANGULAR.name in what else "Correct the capture."
+            fail(f"the camera of {names[int(wrong.flatten().nonzero()[0])]} cannot be used: {what}. {remedy}")
     if distortion is not None:
         _check_distortion(cameras, names)
+
+
+def _kind_names(kinds: Tensor) -> str:
+    return ", ".join(CameraType(value).name for value in kinds.unique().tolist())
 
 
 def check_views(cameras: Sequence[Cameras], names: Sequence[object]) -> None:

@@ -23,13 +23,16 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.host import transforms
-from bitymi_ns.host.colmap import check_model, models_in, options_for
+from bitymi_ns.host.colmap import check_model, options_for
+from bitymi_ns.host.colmap_model import read_model
+from bitymi_ns.host.colmap_views import mask_files
+from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
+from bitymi_ns.host.poses import check_spread
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
-
-PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic"}
+from bitymi_ns.recognise import PHOTOGRAPHS, Found, models_in
 
 
 class Cloud(NamedTuple):
@@ -56,6 +59,13 @@ def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> Cl
     if not data.exists():
         fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
     _check_options(dataparser)
+    if isinstance(dataparser, BitymiDataParserConfig):
+        dataparser.data = data
+        found = dataparser.find()
+        stock = dataparser.stock(found)
+        if stock is None:
+            return _check_model(dataparser, found, images)
+        data, dataparser = stock.data, stock
     if isinstance(dataparser, NerfstudioDataParserConfig):
         return _check_transforms(data, dataparser, images)
     if isinstance(dataparser, ColmapDataParserConfig):
@@ -78,6 +88,17 @@ def _check_options(dataparser: DataParserConfig) -> None:
             fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
+def _check_model(dataparser: BitymiDataParserConfig, found: Found, images: bool) -> Cloud:
+    if found.format != "colmap":
+        return Cloud()  # there are no poses yet
+    source = dataparser.source(found, images)
+    model = read_model(source.folder)
+    if images:
+        check_images(source.files(model))
+        mask_files(source, model)
+    return Cloud(len(model.xyz) if dataparser.load_3D_points else 0)
+
+
 def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> Cloud:
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
@@ -92,8 +113,8 @@ def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images
     if images and dataparser.downscale_factor is None:  # else copies of another size are read
         check_images([folder / frame["file_path"] for frame in frames])
     places = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
-    if dataparser.auto_scale_poses and not np.ptp(places, axis=0).any():
-        fail(f"{path}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+    if dataparser.auto_scale_poses:
+        check_spread(places, str(path))
     if not dataparser.load_3D_points:
         return Cloud()
     points = meta.get("ply_file_path")
@@ -169,6 +190,9 @@ def _interactive() -> bool:
 def declares_box(dataparser: DataParserConfig) -> bool:
     """Whether the capture itself states the box that holds its scene. Other parsers' boxes are defaults of nerfstudio,
     which say nothing about the capture."""
+    if isinstance(dataparser, BitymiDataParserConfig):
+        stock = dataparser.stock(dataparser.find())
+        return stock is not None and declares_box(stock)
     if isinstance(dataparser, (MinimalDataParserConfig, SDFStudioDataParserConfig)):
         return True
     if isinstance(dataparser, InstantNGPDataParserConfig):

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils as reader
 
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.point_cloud import point_count
+from bitymi_ns.recognise import is_model, models_in
 
 
 def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:
@@ -25,7 +27,7 @@ def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:
         How many points it has, as far as that can be told before they are read; else 0.
     """
     model = data / dataparser.colmap_path
-    if not _is_model(model):
+    if not is_model(model):
         models = models_in(data)
         what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
         if not models:
@@ -60,16 +62,6 @@ def _is_empty(points: Path) -> bool:
         return not any(line.strip() and not line.startswith(b"#") for line in file)
 
 
-def _is_model(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
-
-
-def models_in(data: Path) -> list[Path]:
-    """Folders of COLMAP models at most three levels below the capture, seen from it."""
-    found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
-    return sorted(path.relative_to(data) for path in found if _is_model(path))
-
-
 def options_for(data: Path, model: Path) -> str:
     """What to write on the command line to train on a model."""
     return f"colmap --data {data} --colmap-path {model}"
@@ -86,13 +78,13 @@ def checked_models(config: DataParserConfig) -> Iterator[None]:
         return
     cameras: dict[int, Any] = {}  # of the model, to which its images belong
 
-    def check_cameras(path: Path, found: dict[int, Any]) -> None:
-        _check_cameras(path, found)
+    def check_and_keep(path: Path, found: dict[int, Any]) -> None:
+        check_cameras(path, found)
         cameras.update(found)
 
     checks: dict[str, Callable[[Path, Any], None]] = {
-        "cameras": check_cameras,
-        "images": lambda path, found: _check_images(path, found, cameras),
+        "cameras": check_and_keep,
+        "images": lambda path, found: check_images(path, found, cameras),
         "points3D": lambda path, found: None,
     }
     kept = {}
@@ -107,29 +99,46 @@ def checked_models(config: DataParserConfig) -> Iterator[None]:
 
 
 def _read(original: Callable[[Path], Any], check: Callable[[Path, Any], None], path: Path) -> Any:
-    try:
+    with reading(path):
         found = original(path)
+    check(path, found)
+    return found
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """While it lasts, a file of a model is read: errors name it."""
+    try:
+        yield
     except FileNotFoundError as error:
         fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.", error)
     except (struct.error, ValueError, LookupError, AssertionError, MemoryError, OverflowError) as error:
         what = "is cut off or damaged" if path.suffix == ".bin" else f"has a line that cannot be read ({error})"
         hint = " Each image has two lines; the second, of its 2D points, may be empty." * (path.name == "images.txt")
         fail(f"{path} {what}.{hint} Copy the model again, or write it anew from COLMAP.", error)
-    check(path, found)
-    return found
 
 
-def _check_cameras(path: Path, cameras: dict[int, Any]) -> None:
+@functools.cache
+def parameter_count(model: str) -> int | None:
+    """How many parameters a camera model of COLMAP has; None where COLMAP has no such model."""
+    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+        return None
+    return len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params)
+
+
+def check_cameras(path: Path, cameras: dict[int, Any]) -> None:
+    """Stop at a camera whose parameters do not go with its camera model."""
     for number, camera in cameras.items():
-        model = reader.CAMERA_MODEL_NAMES.get(camera.model)
-        if model is not None and len(camera.params) != model.num_params:  # nerfstudio names models it does not know
+        count = parameter_count(camera.model)
+        if count is not None and len(camera.params) != count:
             fail(
-                f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has "
-                f"{model.num_params}. Correct its line."
+                f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}. "
+                "Correct its line."
             )
 
 
-def _check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
+def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
+    """Stop at images that have no pose, or no camera of the model."""
     if not images:
         fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path` after `colmap`.")
     for number, image in images.items():

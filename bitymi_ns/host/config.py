@@ -10,7 +10,6 @@ import torch
 import tyro
 import yaml
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -21,6 +20,7 @@ from bitymi_ns.host.bundle_config import find_bundle, folder_being_evaluated, st
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.capture import check_capture
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
+from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels, why_not_cuda
 from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.model import PARAMETER_GROUPS, BitymiModelConfig
@@ -139,6 +139,8 @@ class BitymiTrainerConfig(TrainerConfig):
             path = getattr(owner, "data", None)
             if path is not None:
                 owner.data = Path(path).expanduser().absolute()
+        if isinstance(datamanager.dataparser, BitymiDataParserConfig):
+            datamanager.dataparser.settle()
 
     def is_viewer_enabled(self) -> bool:
         return self.vis != "none" and super().is_viewer_enabled()
@@ -194,7 +196,7 @@ def optimizers(options: AdamConfig) -> dict[str, Any]:
 def trainer_config(preset: Preset) -> BitymiTrainerConfig:
     """The configuration of a training run by a preset."""
     trainer, data = preset.trainer, preset.data
-    dataparser = NerfstudioDataParserConfig(
+    dataparser = BitymiDataParserConfig(
         eval_mode=data.eval_mode, eval_interval=data.eval_interval, load_3D_points=data.load_3D_points
     )
     return BitymiTrainerConfig(

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from bitymi_ns.host import duplicates
 from bitymi_ns.host.cameras import check_cameras, check_views, to_camera
 from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
 from bitymi_ns.host.colmap import checked_models
+from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import allow_large_photographs, check_orientation, file_has_transparency
@@ -34,11 +38,29 @@ FEW_VIEWS = 10
 """Number of training views below which the multi-view scores rest on little."""
 
 
+if TYPE_CHECKING:
+    AnyDataParser = DataParserConfig
+else:
+    # ours for our methods alone: it needs this data manager, which knows lenses
+    AnyDataParser = tyro.conf.OmitSubcommandPrefixes[
+        tyro.extras.subcommand_type_from_defaults(
+            {
+                "bitymi-data": BitymiDataParserConfig(),
+                **all_dataparsers,
+                "nerfstudio-data": NerfstudioDataParserConfig(eval_mode="interval", load_3D_points=True),
+            },
+            prefix_names=False,
+        )
+    ]
+
+
 @dataclass
 class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     """Configuration of the data manager."""
 
     _target: type = field(default_factory=lambda: BitymiDataManager)
+    dataparser: AnyDataParser = field(default_factory=NerfstudioDataParserConfig)
+    """How the capture is read."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type that is kept in memory; uint8 takes a quarter of the space."""
     train_cameras_sampling_seed: int = 42
@@ -109,7 +131,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if len(self.train_dataset) == 0:
             fail(
                 f"no image is left for training in {self.config.data}: all {len(self.eval_dataset)} are held out for "
-                "evaluation. Take more photographs, or train on all of them with `nerfstudio-data --eval-mode all`."
+                "evaluation. Take more photographs, or train on all of them with `bitymi-data --eval-mode all`."
             )
         return list(range(len(self.train_dataset)))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import Note, masks_without_pixels, note, read_image, read_mask, wrong_size
+from bitymi_ns.host.lens import Lens
 from bitymi_ns.host.poses import rotations
 from bitymi_ns.train.views import over_background
 
@@ -36,7 +38,10 @@ class BitymiDataset(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         path = self._dataparser_outputs.image_filenames[image_idx]
-        image = self._scaled(read_image(path), Image.Resampling.BILINEAR)
+        image, lens = read_image(path), self._lens(image_idx)
+        if lens is not None:
+            image = lens.picture(image, path)
+        image = self._scaled(image, Image.Resampling.BILINEAR)
         camera = self.cameras[image_idx].reshape(())
         declared = (int(camera.width), int(camera.height))
         if image.size != declared:
@@ -72,7 +77,10 @@ class BitymiDataset(InputDataset):
         data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
         if masks is not None:
-            mask = self._scaled(read_mask(masks[image_idx]), Image.Resampling.NEAREST)
+            mask, lens = read_mask(masks[image_idx]), self._lens(image_idx)
+            if lens is not None:
+                mask = lens.mask(mask, masks[image_idx])
+            mask = self._scaled(mask, Image.Resampling.NEAREST)
             height, width = data["image"].shape[:2]
             if mask.size != (width, height):
                 fail(
@@ -84,6 +92,11 @@ class BitymiDataset(InputDataset):
                 data["image"] = _painted(data["image"], data["mask"], self.mask_color)
         data.update(self.get_metadata(data))
         return data
+
+    def _lens(self, image_idx: int) -> Lens | None:
+        """Through which a photograph was taken; None = its camera is that of the file."""
+        lenses = self._dataparser_outputs.metadata.get("lenses")
+        return None if lenses is None else lenses[image_idx]
 
     def _scaled(self, image: Image.Image, resample: Image.Resampling) -> Image.Image:
         if self.scale_factor == 1.0:
@@ -122,15 +135,21 @@ def without_blank_views(outputs: DataparserOutputs, which: str) -> DataparserOut
         f"The masks of {len(blank)} of {len(masks)} {which} photographs exclude every pixel: {named}. These views are "
         "left out."
     )
-    keep = [i for i in range(len(masks)) if i not in blank]
+    return views_of(outputs, [i for i in range(len(masks)) if i not in blank])
+
+
+def views_of(outputs: DataparserOutputs, keep: Sequence[int]) -> DataparserOutputs:
+    """These of the views, with all that belongs to them."""
+    count = len(outputs.image_filenames)
+    masks = outputs.mask_filenames
     metadata = {
-        key: [value[i] for i in keep] if isinstance(value, list) and len(value) == len(masks) else value
+        key: [value[i] for i in keep] if isinstance(value, list) and len(value) == count else value
         for key, value in outputs.metadata.items()
     }
     return dataclasses.replace(
         outputs,
         image_filenames=[outputs.image_filenames[i] for i in keep],
-        mask_filenames=[masks[i] for i in keep],
+        mask_filenames=None if masks is None else [masks[i] for i in keep],
         cameras=outputs.cameras[torch.tensor(keep, dtype=torch.long)],
         metadata=metadata,
     )

@@ -58,8 +58,8 @@ def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int) -
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
     """
-    pixels = cameras[0].width * cameras[0].height
-    kept = min(PHOTOGRAPH_BYTES, 3 * pixels * len(cameras)) + min(REDUCED_BYTES, 6 * pixels * len(cameras))
+    pixels, total = _pixels(cameras)
+    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     needed = PROGRAM + kept + PER_PIXEL * pixels + PER_FRAGMENT * fragments
     needed += PER_SURFEL * max(len(scene), most_surfels)
@@ -75,15 +75,23 @@ def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float)
         cameras: of the training views, on the CPU.
         finetune_bytes: that the fine-tuning may keep of the views; 0 = there is none.
     """
-    pixels = cameras[0].width * cameras[0].height
-    kept = min(PHOTOGRAPH_BYTES, 3 * pixels * len(cameras))
+    pixels, total = _pixels(cameras)
+    kept = min(PHOTOGRAPH_BYTES, 3 * total)
     needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels + PER_FRAGMENT * most_fragments(scene, cameras)
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
 
 
+def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Those of the largest view, and of all together."""
+    sizes = [camera.width * camera.height for camera in cameras]
+    return max(sizes), sum(sizes)
+
+
 def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> None:
     """One line, and a warning where the machine has less."""
-    photographs = f"{len(cameras)} training photographs of {cameras[0].width} x {cameras[0].height}"
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    width, height = max(sizes, key=lambda size: size[0] * size[1])
+    photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
     say(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.")
     # what this process has taken already is a part of what it needs
     available = psutil.virtual_memory().available + psutil.Process().memory_info().rss

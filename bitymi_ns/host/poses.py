@@ -95,6 +95,12 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
         )
 
 
+def check_spread(places: npt.NDArray[np.float64], where: str) -> None:
+    """Stop where all cameras [N, 3] are at one place; `where` they are from is for the message."""
+    if not np.ptp(places, axis=0).any():
+        fail(f"{where}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+
+
 def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
     """Stop, or warn, at single cameras that are far from all the others.
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import functools
+import glob
 import json
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.host.cameras import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.poses import rotations
+from bitymi_ns.recognise import PHOTOGRAPHS, is_model
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")
@@ -30,9 +33,16 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 
 
+Lists = dict[str, list[str]]
+"""Names of photographs by split: train, val, test."""
+
+
 @contextmanager
-def corrected_files(config: DataParserConfig) -> Iterator[None]:
-    """While it lasts, nerfstudio's reader of this kind of capture gets its JSON files as `load` gives them.
+def corrected_files(
+    config: DataParserConfig, adapt: Callable[[Path, Any], None] = lambda path, meta: None
+) -> Iterator[None]:
+    """While it lasts, nerfstudio's reader of this kind of capture gets its JSON files as `load` gives them, changed by
+    `adapt`.
 
     The poses have to be right before nerfstudio orients, centres and scales the capture by them.
     """
@@ -42,7 +52,13 @@ def corrected_files(config: DataParserConfig) -> Iterator[None]:
         yield
         return
     own_format = isinstance(config, NerfstudioDataParserConfig)
-    once = functools.cache(lambda path: load(path, own_format))  # each split reads the file; what is wrong is said once
+
+    @functools.cache  # each split reads the file; what is wrong is said once
+    def once(path: Path) -> Any:
+        meta = load(path, own_format)
+        adapt(path, meta)
+        return meta
+
     module.load_from_json = lambda path: copy.deepcopy(once(Path(path)))  # type: ignore[attr-defined]
     try:
         yield
@@ -141,6 +157,72 @@ def _check_lists(path: Path, meta: dict[str, Any]) -> None:
         )
     for key, other in ((keys[1], keys[2]), (keys[2], keys[1])):
         meta.setdefault(key, meta.get(other))
+
+
+def colmap_points(path: Path) -> Path | None:
+    """The COLMAP model whose points belong to a transforms.json that names no points, as earlier versions of
+    nerfstudio's tool left it; None = there is none."""
+    model = path.parent / "colmap/sparse/0"
+    if not is_model(model):
+        return None
+    try:
+        meta = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None  # what is wrong is said where it is read
+    return None if not isinstance(meta, dict) or "ply_file_path" in meta else model
+
+
+def take_lists(meta: dict[str, Any]) -> Lists:
+    """The lists of photographs for training and evaluation, which the file has no more afterwards."""
+    found = {split: meta.pop(f"{split}_filenames", None) for split in ("train", "val", "test")}
+    return {split: names for split, names in found.items() if names is not None}
+
+
+def without_endings(path: Path, meta: dict[str, Any]) -> None:
+    """Names of a Blender file as its reader expects them: it adds .png itself."""
+    for frame in meta["frames"]:
+        name = str(frame.get("file_path", ""))
+        if name.lower().endswith(".png") and (path.parent / name).is_file():
+            frame["file_path"] = name[: -len(".png")]
+
+
+def complete_instant_ngp(path: Path, meta: dict[str, Any]) -> None:
+    """What the format allows and its reader does not know: photographs of any ending or none, and two focal lengths.
+
+    Frames are put in the order of their names, so that the same photographs are held out as from other formats.
+    """
+    for key in ("equirectangular", "is_equirectangular", "latlong", "is_latlong"):
+        if meta.get(key):
+            fail(f"{path}: {key} is set. {PANORAMAS}")
+    frames = meta["frames"]
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
+            fail(f"{path}: frame {i} has no file_path or no transform_matrix")
+        name = os.path.normpath(_file_name(path, i, "file_path", frame["file_path"]))
+        fitting = [name] if (path.parent / name).is_file() else _with_endings(path.parent, name)
+        if len(fitting) > 1:
+            fail(f"{path}: frame {i} is of {name}, but there are {listed(fitting)}. Write the ending of the right one.")
+        frame["file_path"] = fitting[0] if fitting else name
+    missing = [frame["file_path"] for frame in frames if not (path.parent / frame["file_path"]).is_file()]
+    if missing:
+        fail(
+            f"{path}: {len(missing)} of {len(frames)} photographs are missing: {listed(missing)}. Copy them there, "
+            "correct the names or remove the frames."
+        )
+    frames.sort(key=lambda frame: path.parent / frame["file_path"])
+    if "fl_y" in meta or "camera_angle_y" in meta or "y_fov" in meta:  # its reader looks for both or takes fl_x
+        meta.setdefault("camera_angle_y", math.radians(meta.get("y_fov", 0.0)))
+        meta.setdefault("y_fov", math.degrees(meta["camera_angle_y"]))
+
+
+def _with_endings(folder: Path, name: str) -> list[str]:
+    """Photographs of this name without its ending, seen from the folder."""
+    place = folder / name
+    return sorted(
+        path.relative_to(folder).as_posix()
+        for path in place.parent.glob(f"{glob.escape(place.name)}.*")
+        if path.suffix.lower() in PHOTOGRAPHS and path.stem == place.name
+    )
 
 
 def _check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from nerfstudio.scripts import train as ns_train
+from nerfstudio.scripts.eval import ComputePSNR
 from PIL import Image
 
 from bitymi_ns.host import callbacks
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.export import ExportAtlas
+from tests.host.captures import mixed_project
 
 Start = Callable[..., BitymiTrainerConfig]
 
@@ -100,3 +103,22 @@ def test_photographs_that_show_nothing(start: Start, capture: Path) -> None:
             Image.new("RGB", (48, 36), (9, 9, 9)).save(path)
     with pytest.raises(InputError, match="nothing to learn from the 10 training photographs: of one colour"):
         ns_train.main(start(data=capture))
+
+
+def test_a_capture_of_several_cameras_trains_is_exported_and_evaluated(
+    start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Landscape through a lens, portrait, and a fisheye, in one COLMAP model."""
+    mixed_project(tmp_path / "mixed")
+    config = start(data=tmp_path / "mixed")
+    ns_train.main(config)
+    assert len(curve(config)) == 3 and np.isfinite([point["psnr"] for point in curve(config)]).all()
+    assert "training photographs of up to " in " ".join(capsys.readouterr().out.split())
+    place = json.loads((config.get_base_dir() / "dataparser_transforms.json").read_text())
+    run = config.get_base_dir() / "config.yml"
+    ExportAtlas(load_config=run, output_dir=tmp_path / "bundle", finetune_steps=4).main()
+    world = json.loads((tmp_path / "bundle/bundle.json").read_text())["world"]
+    assert np.allclose(world["transform"], place["transform"], atol=1e-6)
+    assert world["scale"] == pytest.approx(place["scale"], rel=1e-6)
+    ComputePSNR(load_config=run, output_path=tmp_path / "eval.json").main()
+    assert np.isfinite(json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"])

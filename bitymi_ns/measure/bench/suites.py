@@ -12,6 +12,7 @@ import yaml
 
 from bitymi_ns.measure.bench.matrix import Bundle, Row, SceneSpec
 from bitymi_ns.measure.bench.process import BenchError
+from bitymi_ns.recognise import NotRecognised, recognise
 
 FORMATS = ("fp16", "uint8", "bc7")
 """Atlas formats of `ns-export bitymi-atlas`."""
@@ -50,27 +51,26 @@ def suites() -> dict[str, Suite]:
 
 
 def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
-    """One's own captures, each a folder with `transforms.json`, or with `transforms_train.json` (the layout of
-    NeRF-Synthetic, with the points of `hull_pc.ply` where it has that file).
+    """One's own captures, each whatever `ns-train bitymi --data` takes; a Blender data set has the points of
+    `hull_pc.ply` where it has that file.
 
     Raises:
-        BenchError: a folder is no capture, or two have the same name.
+        BenchError: a folder holds nothing to train on, or two have the same name.
     """
     if not folders:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
     scenes = []
     for folder in folders:
         folder = folder.expanduser().resolve()
-        if (folder / "transforms_train.json").is_file():
-            points = ("--ply-path", "hull_pc.ply") if (folder / "hull_pc.ply").is_file() else ()
-            scenes.append(SceneSpec(folder.name, folder, parser=("blender-data", *points), hold_out=0))
-        elif (folder / "transforms.json").is_file():
-            scenes.append(SceneSpec(folder.name, folder, hold_out=HOLD_OUT))
+        try:
+            found = recognise(folder)
+        except NotRecognised as error:
+            raise BenchError(f"{folder} is not a capture: {error}") from error
+        if found.format == "blender":
+            points = ("--ply-path", "hull_pc.ply") if (found.path / "hull_pc.ply").is_file() else ()
+            scenes.append(SceneSpec(folder.name, found.path, parser=("blender-data", *points), hold_out=0))
         else:
-            raise BenchError(
-                f"{folder} is not a capture: it has neither transforms.json (ns-process-data writes it) nor "
-                "transforms_train.json"
-            )
+            scenes.append(SceneSpec(folder.name, folder, hold_out=HOLD_OUT))
     names = [scene.name for scene in scenes]
     if len(set(names)) < len(names):
         raise BenchError(f"captures need folders of different names, not {', '.join(names)}")

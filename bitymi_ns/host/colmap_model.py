@@ -1,0 +1,191 @@
+"""COLMAP models as they are on disk: cameras, poses and points, in COLMAP's own frame.
+
+COLMAP's reader (pycolmap) stops at nothing in a file that is cut off, takes the name of a photograph in a text file to
+end at its first space, and reads no model without points. So files are read here, where what is wrong is said by file
+and entry; camera models and their geometry are pycolmap's (`host/lens.py`).
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from bitymi_ns.host.colmap import check_cameras, check_images, parameter_count, reading
+from bitymi_ns.host.errors import fail
+
+
+class ModelCamera(NamedTuple):
+    """A camera of a model: the name of its camera model, the size of its pictures in pixels, and its parameters."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class ModelImage(NamedTuple):
+    """A photograph of a model: its name, its camera, and the rotation (wxyz) and translation of world to camera."""
+
+    name: str
+    camera_id: int
+    qvec: npt.NDArray[np.float64]
+    tvec: npt.NDArray[np.float64]
+
+
+class Model(NamedTuple):
+    """A model.
+
+    Attributes:
+        cameras: by number.
+        images: in the order of their names.
+        xyz: [N, 3] float64, the points.
+        rgb: [N, 3] uint8, their colours.
+    """
+
+    cameras: dict[int, ModelCamera]
+    images: list[ModelImage]
+    xyz: npt.NDArray[np.float64]
+    rgb: npt.NDArray[np.uint8]
+
+
+def read_model(folder: Path) -> Model:
+    """Read the model in this folder, binary or text; the text where there are both, as nerfstudio does.
+
+    A model is read once, also where several commands of a run ask for it.
+
+    Raises:
+        InputError: what is wrong with it, by file and entry.
+    """
+    files = [_file(folder, name) for name in ("cameras", "images", "points3D")]
+    stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
+    return _read_model(folder, stamps)
+
+
+@functools.lru_cache(maxsize=1)
+def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
+    path = _file(folder, "cameras")
+    with reading(path):
+        cameras = dict(_cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path))
+    check_cameras(path, cameras)
+    path = _file(folder, "images")
+    with reading(path):
+        images = dict(_images_text(path) if path.suffix == ".txt" else _images_binary(path))
+    check_images(path, images, cameras)
+    first: dict[str, int] = {}
+    for number, image in images.items():
+        if first.setdefault(image.name, number) != number:
+            fail(
+                f"{path}: images {first[image.name]} and {number} are both of {image.name}. Correct the name of one of "
+                "them or remove it."
+            )
+    path = _file(folder, "points3D")
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if path.is_file():
+        with reading(path):
+            xyz, rgb = _points_text(path) if path.suffix == ".txt" else _points_binary(path)
+    # nerfstudio sorts paths, not text: so the same photographs are held out
+    return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb)
+
+
+def _file(folder: Path, name: str) -> Path:
+    text = folder / f"{name}.txt"
+    return text if text.is_file() else folder / f"{name}.bin"
+
+
+class _Binary:
+    """A binary file from its start to its end, neither less nor more."""
+
+    def __init__(self, path: Path) -> None:
+        self.data, self.at = path.read_bytes(), 0
+
+    def take(self, format: str) -> tuple[Any, ...]:
+        values = struct.unpack_from("<" + format, self.data, self.at)
+        self.skip(struct.calcsize("<" + format))
+        return values
+
+    def skip(self, size: int) -> None:
+        self.at += size
+        if self.at > len(self.data):
+            raise ValueError("ends too early")
+
+    def name(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        text = os.fsdecode(self.data[self.at : end])
+        self.skip(end + 1 - self.at)
+        return text
+
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise ValueError("has more than it states")
+
+
+def _cameras_binary(path: Path) -> Iterator[tuple[int, ModelCamera]]:
+    file = _Binary(path)
+    for _ in range(file.take("Q")[0]):
+        number, kind, width, height = file.take("IiQQ")
+        name = pycolmap.CameraModelId(kind).name
+        yield number, ModelCamera(name, width, height, file.take(f"{parameter_count(name)}d"))
+    file.end()
+
+
+def _images_binary(path: Path) -> Iterator[tuple[int, ModelImage]]:
+    file = _Binary(path)
+    for _ in range(file.take("Q")[0]):
+        number, *pose, camera = file.take("I7dI")
+        yield number, ModelImage(file.name(), camera, np.array(pose[:4]), np.array(pose[4:]))
+        file.skip(24 * file.take("Q")[0])  # 2D points
+    file.end()
+
+
+def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    file = _Binary(path)
+    starts = []
+    for _ in range(file.take("Q")[0]):
+        starts.append(file.at)
+        file.skip(43)  # number, position, colour, error
+        file.skip(8 * file.take("Q")[0])  # track
+    file.end()
+    rows = np.frombuffer(file.data, np.uint8)[np.array(starts, int)[:, None] + np.arange(8, 35)]
+    return rows[:, :24].copy().view("<f8").reshape(-1, 3), rows[:, 24:].copy()
+
+
+def _lines(path: Path) -> Iterator[str]:
+    with open(path, encoding="utf8", errors="surrogateescape") as file:
+        for line in file:
+            if not line.startswith("#"):
+                yield line.strip()
+
+
+def _cameras_text(path: Path) -> Iterator[tuple[int, ModelCamera]]:
+    for line in filter(None, _lines(path)):
+        number, model, width, height, *params = line.split()
+        if parameter_count(model) is None:
+            raise ValueError(f"COLMAP has no camera model {model}")
+        yield int(number), ModelCamera(model, int(width), int(height), tuple(map(float, params)))
+
+
+def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
+    lines = _lines(path)
+    for line in lines:
+        if not line:
+            continue
+        number, *pose, camera, name = line.split(maxsplit=9)
+        numbers = np.array(list(map(float, pose)))
+        yield int(number), ModelImage(name, int(camera), numbers[:4], numbers[4:])
+        observations = next(lines, "").split()
+        if len(observations) % 3:
+            raise ValueError(f"the 2D points of image {number} are no triples")
+
+
+def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    rows = [[float(word) for word in line.split(maxsplit=7)[1:7]] for line in _lines(path) if line]
+    values = np.array(rows).reshape(-1, 6)
+    return values[:, :3], values[:, 3:].astype(np.uint8)

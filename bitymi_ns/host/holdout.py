@@ -1,0 +1,105 @@
+"""Which photographs of a capture are held out of training, for evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import Literal, NamedTuple
+
+import numpy as np
+from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filename, get_train_eval_split_fraction
+
+from bitymi_ns.host.errors import fail, listed
+
+Mode = Literal["fraction", "filename", "interval", "all"]
+
+
+class Split(NamedTuple):
+    """Numbers of the photographs on each side, ascending, and by what rule."""
+
+    train: list[int]
+    held_out: list[int]
+    rule: str
+
+    def told(self, names: Sequence[Path]) -> str:
+        """A line on what is held out of these."""
+        if not self.held_out:
+            return f"All {len(self.train)} photographs are trained on: none is held out for evaluation."
+        if self.rule == "all":
+            return f"All {len(names)} photographs are trained on, and evaluated on, too (--eval-mode all)."
+        shown = listed([names[i].name for i in self.held_out], most=2)
+        return f"Held out for evaluation: {len(self.held_out)} of {len(names)} photographs, {self.rule} ({shown})."
+
+
+def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
+    """The split of photographs in this order by nerfstudio's rules."""
+    numbers = list(range(len(names)))
+    if mode == "interval":
+        which = f"every {interval}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(interval, 'th') } by name"
+        return Split([i for i in numbers if i % interval], [i for i in numbers if i % interval == 0], which)
+    if mode == "all":
+        return Split(numbers, numbers, "all")
+    if mode == "fraction":
+        train, held_out = get_train_eval_split_fraction(list(names), fraction)
+        rule = f"evenly spaced ones (--train-split-fraction {fraction:g})"
+    else:
+        try:
+            train, held_out = get_train_eval_split_filename(list(names))
+        except ValueError as error:
+            fail(f"--eval-mode filename: {error}. Use `--eval-names`, or another mode.", error)
+        rule = "those with eval in their names"
+    return Split(np.asarray(train, int).tolist(), np.asarray(held_out, int).tolist(), rule)
+
+
+def by_names(names: Sequence[Path], wanted: Sequence[str], where: str) -> Split:
+    """Hold out the photographs of these names.
+
+    Args:
+        names: of all photographs, with their folders.
+        wanted: names, each with as many of its folders as tell it from others.
+        where: they were given, for messages.
+
+    Raises:
+        InputError: one of them is the name of no photograph, or of several.
+    """
+    held_out = set(find(names, wanted, where))
+    return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {where}")
+
+
+def find(names: Sequence[Path], wanted: Sequence[str], where: str) -> list[int]:
+    """The numbers of the photographs of these names; see `by_names`."""
+    numbers: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        numbers.setdefault(name.name, []).append(i)
+    unknown, found = [], []
+    for name in wanted:
+        parts = PurePath(name.replace("\\", "/")).parts
+        fitting = [i for i in numbers.get(parts[-1] if parts else "", []) if names[i].parts[-len(parts) :] == parts]
+        if len(fitting) > 1:
+            fail(
+                f"{where}: {name} is the name of {len(fitting)} photographs, {listed([names[i] for i in fitting])}. "
+                "Give its folder, too."
+            )
+        found += fitting
+        unknown += [] if fitting else [name]
+    if unknown:
+        fail(
+            f"{where}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {listed(unknown)}. "
+            f"Its photographs are {listed([name.name for name in names])}."
+        )
+    return found
+
+
+def read_names(given: Sequence[str]) -> tuple[str, ...]:
+    """Names as they were given, or those in a text file, one per line, where its name was given instead."""
+    if len(given) != 1 or not given[0].lower().endswith((".txt", ".lst", ".list")):
+        return tuple(given)
+    path = Path(given[0]).expanduser()
+    try:
+        lines = path.read_text("utf8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        fail(f"--eval-names: {path} cannot be read: {error}. Give names, or a text file with one per line.", error)
+    names = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
+    if not names:
+        fail(f"--eval-names: {path} lists no names. Write the name of one photograph per line.")
+    return names

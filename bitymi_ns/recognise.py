@@ -1,0 +1,249 @@
+"""What a folder or file holds that somebody wants to train on: a capture in one of several formats, photographs, or a
+video."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
+
+PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif"}
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp"}
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
+"""Where a COLMAP model usually lies in a capture, the most usual place first."""
+BESIDES = {"masks", "depths", "sparse", "colmap"}
+"""Folders of a capture that hold no photographs."""
+NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
+"""Entries that a transforms.json has from nerfstudio alone."""
+INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
+
+
+class NotRecognised(ValueError):
+    """A path that holds nothing to train on: what is there instead, and what to do."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is to be read.
+
+    Attributes:
+        format: how.
+        path: nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap:
+            the folder of the model; photographs: the folder; video: the file.
+        folder: of the capture, to which the names in its files are relative.
+        others: what is there besides and is not read, with its format.
+    """
+
+    format: Format
+    path: Path
+    folder: Path
+    others: tuple[tuple[Format, Path], ...] = ()
+
+    def how_to_choose(self) -> str:
+        """A sentence on what is not read and how to have it read; empty where there is nothing else."""
+        if not self.others:
+            return ""
+        ways = []
+        for format, path in self.others:
+            option = f"--format {format}"
+            if format == "colmap" and self.format == "colmap":
+                option = f"--colmap-path {path.relative_to(self.folder)}"
+            elif format == "video":
+                option = f"--data {path}"
+            ways.append(f"{_seen_from(path, self.folder)} (`bitymi-data {option}`)")
+        more = f" and {len(ways) - 3} more" if len(ways) > 3 else ""
+        return f"Not read: {', '.join(ways[:3])}{more}."
+
+
+def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
+    """What a path holds.
+
+    Args:
+        data: a folder, or a file: transforms.json, a video, or a file of a COLMAP model.
+        format: what to look for; auto = whatever there is, files with poses before photographs without.
+        colmap_path: the folder of a COLMAP model, seen from the capture; it is that which is read.
+
+    Raises:
+        NotRecognised: there is nothing of that format.
+    """
+    if not data.exists():
+        raise NotRecognised(f"the capture {data} does not exist. Give a folder or a file with --data.")
+    if colmap_path is not None:
+        if format not in ("auto", "colmap"):
+            raise NotRecognised(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
+        return _colmap_given(data, colmap_path)
+    folder = data if data.is_dir() else data.parent
+    candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
+    fitting = [each for each in candidates if format in ("auto", each[0])]
+    if format == "instant-ngp" and not fitting:  # the user knows better than the entries of the file
+        fitting = [("instant-ngp", path) for found, path in candidates if found == "nerfstudio"]
+    elif format == "nerfstudio" and not fitting:
+        fitting = [("nerfstudio", path) for found, path in candidates if found == "instant-ngp"]
+    if not fitting:
+        raise NotRecognised(_nothing(data, format, candidates))
+    (chosen, path), *_ = fitting
+    others = tuple(each for each in candidates if each[1] != path and _is_another(chosen, each[0]))
+    return Found(chosen, path, path if chosen == "blender" else folder, others)
+
+
+def _is_another(chosen: Format, other: Format) -> bool:
+    """Photographs lie beside every capture: they are something else only to a video."""
+    return other != "photographs" or chosen == "video"
+
+
+def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
+    suffix = file.suffix.lower()
+    if file.name.startswith("transforms_") and suffix == ".json":
+        yield "blender", file.parent
+    elif suffix == ".json":
+        yield _kind_of(file), file
+    elif suffix in VIDEOS:
+        yield "video", file
+    elif file.stem in ("cameras", "images", "points3D") and is_model(file.parent):
+        yield "colmap", file.parent
+
+
+def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
+    """Everything there is, in the order in which it is preferred."""
+    if (folder / "transforms.json").is_file():
+        yield _kind_of(folder / "transforms.json"), folder / "transforms.json"
+    if (folder / "transforms_train.json").is_file():
+        yield "blender", folder
+    for model in models_in(folder):
+        yield "colmap", folder / model
+    photographs = _photographs_in(folder)
+    if photographs is not None:
+        yield "photographs", photographs
+    for video in sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()):
+        yield "video", video
+
+
+def _kind_of(file: Path) -> Format:
+    """Whether a transforms.json is for nerfstudio or for instant-ngp, which use the same name.
+
+    A file that cannot be read is taken for nerfstudio's; its reader says what is wrong.
+    """
+    try:
+        meta = json.loads(file.read_bytes())
+    except (OSError, ValueError):
+        return "nerfstudio"
+    if not isinstance(meta, dict) or meta.keys() & NERFSTUDIOS_OWN:
+        return "nerfstudio"
+    if "aabb_scale" in meta:
+        return "instant-ngp"
+    frames: Any = meta.get("frames")
+    first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
+    complete = INTRINSICS <= meta.keys() | first.keys()
+    return "instant-ngp" if not complete and meta.keys() & {"camera_angle_x", "x_fov"} else "nerfstudio"
+
+
+def is_model(folder: Path) -> bool:
+    """Whether it holds the cameras of a COLMAP model."""
+    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
+
+
+def models_in(data: Path) -> list[Path]:
+    """Folders of COLMAP models at most three levels below a folder, seen from it; the one to read first.
+
+    That is the one in a usual place. Of models side by side, which COLMAP makes of photographs that it could not
+    connect, it is the one of most images.
+    """
+    found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
+    models = [path.relative_to(data) for path in found if is_model(path)]
+    models = [model for model in models if not any(part.startswith(".") for part in model.parts)]
+
+    def place(model: Path) -> tuple[int, str, int, str]:
+        usual = [Path(name) for name in MODELS]
+        beside = usual.index(model) if model in usual else len(usual)
+        if model.name.isdigit():  # stands where the first of its neighbours would
+            first = model.with_name("0")
+            beside = usual.index(first) if first in usual else len(usual)
+        return beside, str(model.parent), -image_count(data / model), str(model)
+
+    return sorted(models, key=place)
+
+
+def image_count(model: Path) -> int:
+    """How many images the model in this folder states; 0 where it states none."""
+    try:
+        if (model / "images.bin").is_file():
+            with open(model / "images.bin", "rb") as file:
+                return int(struct.unpack("<Q", file.read(8))[0])
+        with open(model / "images.txt", encoding="utf8", errors="replace") as text:
+            return sum(1 for line in text if line.strip() and not line.startswith("#")) // 2
+    except (OSError, struct.error):
+        return 0
+
+
+def _photographs_in(folder: Path) -> Path | None:
+    """The folder to search for photographs: this one where they lie in it or in its `images`, else the one below."""
+    if _has_photographs(folder) or _has_photographs(folder / "images"):
+        return folder
+    below = sorted(
+        path
+        for path in folder.iterdir()
+        if path.is_dir() and path.name not in BESIDES and not path.name.startswith(".")
+    )
+    holding = [path for path in below if _has_photographs(path)]
+    if not holding:
+        return None
+    return holding[0] if len(holding) == 1 else folder
+
+
+def _has_photographs(folder: Path) -> bool:
+    return folder.is_dir() and any(
+        path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") for path in folder.iterdir()
+    )
+
+
+def _colmap_given(data: Path, colmap_path: Path) -> Found:
+    folder = data if data.is_dir() else data.parent
+    model = folder / colmap_path
+    if is_model(model):
+        return Found("colmap", model, folder)
+    what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
+    there = models_in(folder)
+    if not there:
+        raise NotRecognised(f"the COLMAP model {model} {what}, and there is none in other folders of {folder}.")
+    raise NotRecognised(f"the COLMAP model {model} {what}. Give `--colmap-path {there[0]}`.")
+
+
+def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
+    """Why a path is no capture, and what to do."""
+    if format != "auto":
+        there = f" It holds {_listed(data, candidates)}: leave --format out." if candidates else ""
+        return f"{data} holds nothing of the format {format}.{there}"
+    if not data.is_dir():
+        if data.suffix.lower() in PHOTOGRAPHS:
+            return f"{data} is one photograph. A scene needs many: give the folder that holds them."
+        return (
+            f"{data} is no file that can be trained on. Give a folder of photographs, a video "
+            f"({', '.join(sorted(VIDEOS)[:4])}, ...), a transforms.json, or the folder of a capture."
+        )
+    if not any(data.iterdir()):
+        return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
+    other = (data / "meta_data.json").is_file()
+    hint = " It has a meta_data.json: give `sdfstudio-data` after the options of the method." if other else ""
+    archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
+    if archive is not None:
+        hint = f" Unpack {archive.name} first."
+    return (
+        f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
+        f"no photographs and no video.{hint}"
+    )
+
+
+def _listed(data: Path, candidates: list[tuple[Format, Path]]) -> str:
+    return ", ".join(f"{_seen_from(path, data)} ({format})" for format, path in candidates[:3])
+
+
+def _seen_from(path: Path, folder: Path) -> str:
+    return str(path.relative_to(folder)) if path != folder and path.is_relative_to(folder) else str(path)
+
+
+FORMATS: tuple[Format, ...] = get_args(Format)

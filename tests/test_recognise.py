@@ -1,0 +1,188 @@
+"""What a folder or a file is taken for."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bitymi_ns.recognise import NotRecognised, image_count, models_in, recognise
+
+POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+FRAME = {"file_path": "images/a.jpg", "transform_matrix": POSE}
+PINHOLE = {"fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 4.0, "w": 8, "h": 8}
+
+
+def transforms(folder: Path, name: str = "transforms.json", **entries: Any) -> Path:
+    path = folder / name
+    path.write_text(json.dumps({"frames": [FRAME], **entries}))
+    return path
+
+
+def model(folder: Path, images: int = 3) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", 0))
+    (folder / "images.bin").write_bytes(struct.pack("<Q", images))
+    return folder
+
+
+def photograph(folder: Path, name: str = "a.jpg") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(b"")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("entries", "format"),
+    [
+        (PINHOLE, "nerfstudio"),
+        ({**PINHOLE, "aabb_scale": 4}, "instant-ngp"),
+        ({**PINHOLE, "aabb_scale": 4, "ply_file_path": "points.ply"}, "nerfstudio"),
+        ({"camera_angle_x": 0.7}, "instant-ngp"),
+        ({**PINHOLE, "camera_angle_x": 0.7}, "nerfstudio"),
+        ({"frames": [{**FRAME, **PINHOLE}]}, "nerfstudio"),
+        ({}, "nerfstudio"),  # whose reader says what is missing
+        ({"frames": 3}, "nerfstudio"),
+    ],
+)
+def test_a_transforms_json_is_told_from_instant_ngps(tmp_path: Path, entries: dict[str, Any], format: str) -> None:
+    path = transforms(tmp_path, **entries)
+    for given in (tmp_path, path):
+        found = recognise(given)
+        assert (found.format, found.path, found.folder) == (format, path, tmp_path)
+
+
+def test_a_file_that_is_no_json_is_left_to_its_reader(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text("{")
+    assert recognise(tmp_path).format == "nerfstudio"
+
+
+@pytest.mark.parametrize("asked", ["nerfstudio", "instant-ngp"])
+def test_which_reader_is_meant_can_be_said(tmp_path: Path, asked: Any) -> None:
+    transforms(tmp_path, **PINHOLE, aabb_scale=4)
+    assert recognise(tmp_path, asked).format == asked
+    transforms(tmp_path, **PINHOLE)
+    assert recognise(tmp_path, asked).format == asked
+
+
+def test_a_blender_data_set(tmp_path: Path) -> None:
+    path = transforms(tmp_path, "transforms_train.json", camera_angle_x=0.7)
+    for given in (tmp_path, path):
+        found = recognise(given)
+        assert (found.format, found.path) == ("blender", tmp_path)
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "colmap/sparse/0", "sparse", "dense/sparse", "."])
+def test_a_colmap_model_is_found_and_photographs_beside_it_are_not_another_thing(tmp_path: Path, place: str) -> None:
+    photograph(tmp_path / "images")
+    (tmp_path / "model").mkdir()
+    folder = tmp_path / "capture"
+    model(folder / place)
+    found = recognise(folder)
+    assert (found.format, found.path, found.folder, found.others) == ("colmap", folder / place, folder, ())
+    assert recognise(folder / place / "cameras.bin").path == folder / place
+
+
+def test_of_models_side_by_side_the_largest_is_read_and_the_others_are_named(tmp_path: Path) -> None:
+    for number, images in ((0, 5), (1, 40), (2, 7)):
+        model(tmp_path / f"sparse/{number}", images)
+    assert [str(path) for path in models_in(tmp_path)] == ["sparse/1", "sparse/2", "sparse/0"]
+    found = recognise(tmp_path)
+    assert found.path == tmp_path / "sparse/1"
+    assert "sparse/0 (`bitymi-data --colmap-path sparse/0`)" in found.how_to_choose()
+    assert recognise(tmp_path, colmap_path=Path("sparse/2")).path == tmp_path / "sparse/2"
+
+
+def test_the_usual_place_goes_before_others(tmp_path: Path) -> None:
+    model(tmp_path / "other/0", 90)
+    model(tmp_path / "colmap/sparse/0", 50)
+    model(tmp_path / "sparse/0", 5)
+    assert [str(path) for path in models_in(tmp_path)] == ["sparse/0", "colmap/sparse/0", "other/0"]
+
+
+def test_what_hidden_folders_hold_is_no_capture(tmp_path: Path) -> None:
+    model(tmp_path / ".kept/sparse/0")
+    photograph(tmp_path)
+    assert recognise(tmp_path).format == "photographs"
+
+
+def test_images_of_a_text_model_are_counted(tmp_path: Path) -> None:
+    folder = model(tmp_path / "sparse")
+    (folder / "images.bin").unlink()
+    assert image_count(folder) == 0
+    (folder / "images.txt").write_text("# two\n1 1 0 0 0 0 0 0 1 a.jpg\n1 1 -1\n2 1 0 0 0 0 0 0 1 b.jpg\n1 1 -1\n")
+    assert image_count(folder) == 2
+
+
+def test_two_things_in_one_folder(tmp_path: Path) -> None:
+    path = transforms(tmp_path, **PINHOLE)
+    model(tmp_path / "sparse/0")
+    photograph(tmp_path / "images")
+    found = recognise(tmp_path)
+    assert found.path == path
+    assert found.how_to_choose() == "Not read: sparse/0 (`bitymi-data --format colmap`)."
+    other = recognise(tmp_path, "colmap")
+    assert other.path == tmp_path / "sparse/0"
+    assert other.how_to_choose() == "Not read: transforms.json (`bitymi-data --format nerfstudio`)."
+
+
+@pytest.mark.parametrize(("below", "searched"), [("", ""), ("images", ""), ("input", "input"), ("holiday", "holiday")])
+def test_photographs(tmp_path: Path, below: str, searched: str) -> None:
+    photograph(tmp_path / below, "IMG 0001 \u00fc.JPG")
+    found = recognise(tmp_path)
+    assert (found.format, found.path) == ("photographs", tmp_path / searched)
+
+
+def test_photographs_in_several_folders_are_one_capture(tmp_path: Path) -> None:
+    photograph(tmp_path / "left")
+    photograph(tmp_path / "right")
+    assert recognise(tmp_path).path == tmp_path
+
+
+def test_a_video_alone_beside_photographs_or_in_a_folder(tmp_path: Path) -> None:
+    video = photograph(tmp_path, "walk.MP4") / "walk.MP4"
+    assert (recognise(video).format, recognise(tmp_path).path) == ("video", video)
+    photograph(tmp_path)
+    found = recognise(tmp_path)
+    assert found.format == "photographs" and f"--data {video}" in found.how_to_choose()
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], "is empty. Give a folder of photographs"),
+        (["notes.odt"], "holds nothing to train on: no transforms.json"),
+        (["photos.zip"], "Unpack photos.zip first"),
+        (["meta_data.json"], "give `sdfstudio-data` after the options"),
+        (["masks/a.png"], "holds nothing to train on"),
+    ],
+)
+def test_folders_with_nothing_to_train_on(tmp_path: Path, names: list[str], message: str) -> None:
+    for name in names:
+        photograph((tmp_path / name).parent, Path(name).name)
+    with pytest.raises(NotRecognised, match=message):
+        recognise(tmp_path)
+
+
+def test_files_that_cannot_be_trained_on(tmp_path: Path) -> None:
+    photograph(tmp_path, "a.jpg")
+    photograph(tmp_path, "a.odt")
+    for name, message in (("a.jpg", "is one photograph"), ("a.odt", "no file that can be"), ("b", "does not exist")):
+        with pytest.raises(NotRecognised, match=message):
+            recognise(tmp_path / name)
+
+
+def test_a_format_that_is_not_there(tmp_path: Path) -> None:
+    transforms(tmp_path, **PINHOLE)
+    with pytest.raises(NotRecognised, match=r"nothing of the format blender. It holds transforms.json \(nerfstudio\)"):
+        recognise(tmp_path, "blender")
+    with pytest.raises(NotRecognised, match="--colmap-path is for COLMAP models"):
+        recognise(tmp_path, "blender", Path("sparse/0"))
+    with pytest.raises(NotRecognised, match="sparse/0 does not exist, and there is none"):
+        recognise(tmp_path, colmap_path=Path("sparse/0"))
+    model(tmp_path / "sparse/1")
+    with pytest.raises(NotRecognised, match="does not exist. Give `--colmap-path sparse/1`"):
+        recognise(tmp_path, colmap_path=Path("sparse/0"))

@@ -42,7 +42,7 @@ STATED = {
     "where a camera stands": (r"-\(double\(\w\[k\]\) \*", ["camera.h"]),
     "reals as sort keys": (r"\? ~bits", ["primitives.h"]),
     "temperature": (r"min_\(.*kLogTauMax", ["view_color.h"]),
-    "golden angle": (r"3\.0 - (math\.sqrt\(5|5\.0)", ["init.py"]),
+    "golden angle": (r"3\.0 - (math\.sqrt\(5|5\.0)", ["sphere.py"]),
 }
 
 

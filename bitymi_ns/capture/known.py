@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
+from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bitymi_ns.capture.types import Progress
+from bitymi_ns.capture.cache import content_key, work_folder
+from bitymi_ns.capture.sfm import process
+from bitymi_ns.capture.sfm.job import CameraGroup, Job
+from bitymi_ns.capture.types import CaptureError, Progress
+from bitymi_ns.files import explained, write_file
+
+DONE = "points"
+"""File that is written when the model is whole."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +38,14 @@ class KnownView:
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2 of OpenCV."""
 
+    @property
+    def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
+        """COLMAP's camera model, size in pixels, and parameters."""
+        pinhole = (self.fx, self.fy, self.cx, self.cy)
+        if any(self.distortion):
+            return "OPENCV", self.width, self.height, (*pinhole, *self.distortion)
+        return "PINHOLE", self.width, self.height, pinhole
+
 
 def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | None = None) -> Path:
     """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept and continued as
@@ -43,5 +61,49 @@ def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | N
 
     Raises:
         CaptureError: too few points can be found; says what may be wrong.
+        KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
-    raise NotImplementedError
+    images = Path(images)
+    missing = [view.name for view in views if not (images / view.name).is_file()]
+    if missing:
+        raise CaptureError(f"{images / missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there")
+    if len(views) < 2:
+        raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
+    settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
+    with work_folder(images, content_key([images / view.name for view in views], settings)) as work:
+        model = work / "model"
+        if (work / DONE).exists():
+            return model
+        with explained(work, CaptureError):
+            process.run(_job(images, views, work), images, progress or (lambda step, done, total: None))
+            write_file(work / DONE, b"")
+            shutil.rmtree(work / "links", ignore_errors=True)
+            for name in ("database.db", "database.db-wal", "database.db-shm", "pairs.txt"):
+                with suppress(OSError):
+                    (work / name).unlink()
+        return model
+
+
+def _job(images: Path, views: Sequence[KnownView], work: Path) -> Job:
+    links = work / "links"
+    shutil.rmtree(links, ignore_errors=True)
+    links.mkdir()
+    groups: dict[tuple[str, int, int, tuple[float, ...]], list[str]] = defaultdict(list)
+    names, poses = {}, {}
+    for i, view in enumerate(views):
+        plain = f"{i:06d}{Path(view.name).suffix.lower()}"
+        (links / plain).symlink_to((images / view.name).resolve())
+        groups[view.camera].append(plain)
+        names[plain] = view.name
+        poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
+    return Job(
+        work=str(work.resolve()),
+        images=str(links.resolve()),
+        masks=None,
+        cameras=[CameraGroup(m, w, h, list(params), True, members) for (m, w, h, params), members in groups.items()],
+        order=list(names),
+        names=names,
+        sequence=False,
+        positions={},
+        poses=poses,
+    )

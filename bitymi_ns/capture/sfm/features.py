@@ -34,7 +34,7 @@ def extract(job: Job, database: Path, tell: Tell) -> None:
 def camera_ids(job: Job, database: Path) -> list[int]:
     """The groups' cameras in the database, written there by the first run."""
     with pycolmap.Database.open(database) as opened:
-        if opened.num_cameras == 0:
+        if opened.num_cameras() == 0:
             for group in job.cameras:
                 opened.write_camera(camera_of(group))
         return [camera.camera_id for camera in opened.read_all_cameras()]

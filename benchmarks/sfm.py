@@ -71,7 +71,14 @@ def pose_errors(model: pycolmap.Reconstruction, given: Path) -> tuple[float, flo
     extent = np.linalg.norm(theirs[:, :3, 3] - theirs[:, :3, 3].mean(axis=0), axis=1).max()
     relative = np.swapaxes(theirs[:, :3, :3], 1, 2) @ found.rotation.matrix() @ ours[:, :, :3]
     # Rounded poses make small angles from the trace alone unsafe; the skew part is exact there.
-    skew = np.stack([relative[:, 2, 1] - relative[:, 1, 2], relative[:, 0, 2] - relative[:, 2, 0], relative[:, 1, 0] - relative[:, 0, 1]], 1)
+    skew = np.stack(
+        [
+            relative[:, 2, 1] - relative[:, 1, 2],
+            relative[:, 0, 2] - relative[:, 2, 0],
+            relative[:, 1, 0] - relative[:, 0, 1],
+        ],
+        1,
+    )
     angle = np.degrees(np.arctan2(np.linalg.norm(skew, axis=1), np.trace(relative, axis1=1, axis2=2) - 1))
     return float(np.median(angle)), float(np.median(distance) / extent * 100)
 

@@ -48,7 +48,9 @@ def read_exif(image: Image.Image) -> Exif:
     fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
     time = str(detail.get(ExifTags.Base.DateTimeOriginal) or "").strip()
     return Exif(
-        camera=" ".join([str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])),
+        camera=" ".join(
+            [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
+        ),
         focal_length=focal,
         doubt=doubt,
         position=_position(gps),

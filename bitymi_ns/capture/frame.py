@@ -40,7 +40,9 @@ class WorldFrame:
         return asdict(self)
 
 
-def local_positions(places: Mapping[str, tuple[float, float, float]]) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
+def local_positions(
+    places: Mapping[str, tuple[float, float, float]],
+) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
     """East, north and up in metres from the middle of the places, and that middle.
 
     Args:
@@ -55,15 +57,17 @@ def local_positions(places: Mapping[str, tuple[float, float, float]]) -> tuple[d
     north = EARTH * (1 - eccentricity) / w**1.5
     east = EARTH / np.sqrt(w) * np.cos(latitude)
     local = {
-        name: [float(np.radians(lon - middle[1]) * east), float(np.radians(lat - middle[0]) * north), float(alt - middle[2])]
+        name: [
+            float(np.radians(lon - middle[1]) * east),
+            float(np.radians(lat - middle[0]) * north),
+            float(alt - middle[2]),
+        ]
         for name, (lat, lon, alt) in places.items()
     }
     return local, (float(middle[0]), float(middle[1]), float(middle[2]))
 
 
-def settle(
-    model: pycolmap.Reconstruction, places: Mapping[str, tuple[float, float, float]]
-) -> WorldFrame:
+def settle(model: pycolmap.Reconstruction, places: Mapping[str, tuple[float, float, float]]) -> WorldFrame:
     """Move a model into a world with z up, by GPS where that is enough, else by the cameras; changed in place."""
     local, origin = local_positions(places)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}

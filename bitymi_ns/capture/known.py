@@ -66,7 +66,9 @@ def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | N
     images = Path(images)
     missing = [view.name for view in views if not (images / view.name).is_file()]
     if missing:
-        raise CaptureError(f"{images / missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there")
+        raise CaptureError(
+            f"{images / missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there"
+        )
     if len(views) < 2:
         raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
     settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]

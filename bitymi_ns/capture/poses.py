@@ -139,7 +139,12 @@ def _find(
 
 
 def _too_few_left(
-    source: Path, folder: Path, photos: Sequence[Photo], left_out: Mapping[str, str], twins: Mapping[str, str], video: bool
+    source: Path,
+    folder: Path,
+    photos: Sequence[Photo],
+    left_out: Mapping[str, str],
+    twins: Mapping[str, str],
+    video: bool,
 ) -> str:
     if video:
         return (
@@ -220,7 +225,9 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
     stated = [photo.exif.focal_length for photo in photos]
     focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
     model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model
-    camera = pycolmap.Camera.create_from_model_name(0, model, focal or GUESSED_FOCAL * max(width, height), width, height)
+    camera = pycolmap.Camera.create_from_model_name(
+        0, model, focal or GUESSED_FOCAL * max(width, height), width, height
+    )
     return CameraGroup(model, width, height, camera.params.tolist(), focal is not None, names)
 
 
@@ -231,7 +238,13 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     frame = settle(model, {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None})
     values |= {"metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
     values["cameras"] = [
-        {"model": c.model_name, "width": c.width, "height": c.height, "params": c.params.tolist(), "prior": c.has_prior_focal_length}
+        {
+            "model": c.model_name,
+            "width": c.width,
+            "height": c.height,
+            "params": c.params.tolist(),
+            "prior": c.has_prior_focal_length,
+        }
         for c in model.cameras.values()
     ]
     keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds")

@@ -14,7 +14,9 @@ from bitymi_ns.files import complete_file, complete_folder
 JPEG_QUALITY = 97
 
 
-def upright_photos(photos: Sequence[Photo], folder: Path, work: Path, progress: Progress) -> tuple[Path, dict[str, str]]:
+def upright_photos(
+    photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
+) -> tuple[Path, dict[str, str]]:
     """A folder in which every photograph stands upright in a format that everything reads.
 
     Args:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import io
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -49,10 +49,17 @@ def _page(values: Mapping[str, object]) -> str:
     ]
     for title, entries in (("Left out", values["left_out"]), ("Notes", values["notes"])):
         if entries:
-            lines += [f"## {title}", "", "| photograph | why |" if title == "Left out" else "| photograph | |", "|---|---|"]
+            lines += [
+                f"## {title}",
+                "",
+                "| photograph | why |" if title == "Left out" else "| photograph | |",
+                "|---|---|",
+            ]
             lines += [f"| {_cell(name)} | {_cell(why)} |" for name, why in entries.items()] + [""]
     lines += ["## Cameras", "", "| model | parameters | focal length known from EXIF |", "|---|---|---|"]
-    lines += [f"| {c['model']} | {', '.join(f'{p:.5g}' for p in c['params'])} | {c['prior']} |" for c in values["cameras"]]
+    lines += [
+        f"| {c['model']} | {', '.join(f'{p:.5g}' for p in c['params'])} | {c['prior']} |" for c in values["cameras"]
+    ]
     lines += ["", "## Seconds", "", "| stage | seconds |", "|---|---|"]
     lines += [f"| {stage} | {seconds:.1f} |" for stage, seconds in values["seconds"].items()]
     return "\n".join(lines) + "\n"
@@ -100,5 +107,7 @@ def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:
 def _reach(points: np.ndarray, centers: np.ndarray) -> float:
     """Half the side of a square that holds the cameras and nine of ten points."""
     middle = np.median(np.vstack([points, centers]), axis=0)
-    far = [np.abs(centers - middle).max()] + ([np.quantile(np.abs(points - middle).max(axis=1), 0.9)] if len(points) else [])
+    far = [np.abs(centers - middle).max()] + (
+        [np.quantile(np.abs(points - middle).max(axis=1), 0.9)] if len(points) else []
+    )
     return 1.1 * float(max(far)) or 1.0

@@ -48,7 +48,9 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         return target
     seen, motion, sharp = _survey(video, progress)
     if len(seen) < 3:
-        raise CaptureError(f"{video} holds {len(seen)} frames: film for at least ten seconds while you walk round the scene")
+        raise CaptureError(
+            f"{video} holds {len(seen)} frames: film for at least ten seconds while you walk round the scene"
+        )
     if motion[-1] < STILL:
         raise CaptureError(
             f"{video} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn the "
@@ -148,7 +150,9 @@ def _opened(video: Path) -> av.container.InputContainer:
     try:
         container = av.open(str(video))
     except (av.FFmpegError, OSError, ValueError) as error:
-        raise CaptureError(f"{video} cannot be read as a video ({error.strerror or error}): record or export it again") from error
+        raise CaptureError(
+            f"{video} cannot be read as a video ({error.strerror or error}): record or export it again"
+        ) from error
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{video} holds no pictures, only sound: name another file")
@@ -167,7 +171,9 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
                 number += 1
         except av.FFmpegError as error:
             if number == 0:
-                raise CaptureError(f"{video} cannot be decoded ({error.strerror}): record or export it again") from error
+                raise CaptureError(
+                    f"{video} cannot be decoded ({error.strerror}): record or export it again"
+                ) from error
 
 
 def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:

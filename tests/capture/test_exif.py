@@ -67,7 +67,9 @@ def test_position_time_and_camera_are_read() -> None:
     def fill(exif: Image.Exif) -> None:
         exif[B.Make], exif[B.Model] = "Maker", "Phone"
         exif.get_ifd(ExifTags.IFD.Exif).update({B.DateTimeOriginal: "2024:05:01 10:00:00", B.FocalLength: 4.2})
-        exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "S", 2: (33.0, 30.0, 0.0), 3: "E", 4: (151.0, 0.0, 36.0), 5: b"\x01", 6: 5.0})
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(
+            {1: "S", 2: (33.0, 30.0, 0.0), 3: "E", 4: (151.0, 0.0, 36.0), 5: b"\x01", 6: 5.0}
+        )
 
     found = with_exif(fill)
     assert found.camera == "Maker Phone 4.2 mm" and found.time == "2024:05:01 10:00:00"

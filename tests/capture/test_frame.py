@@ -41,7 +41,9 @@ def test_gps_gives_metres_and_up() -> None:
     assert frame.up == "gps" and frame.metres_per_unit == 1 and frame.gps_error < 5
     found = centers(model)
     names = list(true)
-    spans = [np.linalg.norm(found[a] - found[b]) / np.linalg.norm(true[a] - true[b]) for a in names for b in names if a < b]
+    spans = [
+        np.linalg.norm(found[a] - found[b]) / np.linalg.norm(true[a] - true[b]) for a in names for b in names if a < b
+    ]
     assert np.median(spans) == pytest.approx(1, abs=0.05)
 
 

@@ -13,10 +13,9 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
-from bitymi_ns.capture.nerfstudio import write_capture
-from bitymi_ns.capture.poses import by_camera, camera_group
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.photos import Photo
+from bitymi_ns.capture.poses import by_camera, camera_group
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import View, render
 from bitymi_ns.sample.room import Room
@@ -88,7 +87,9 @@ def test_it_runs_once(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not list(capture.glob(".bitymi/*/database.db"))
 
 
-def test_a_capture_of_nerfstudio_is_written(capture: Path, tmp_path: Path, views: list[View], capsys: pytest.CaptureFixture) -> None:
+def test_a_capture_of_nerfstudio_is_written(
+    capture: Path, tmp_path: Path, views: list[View], capsys: pytest.CaptureFixture
+) -> None:
     assert main(["sfm", str(capture), "--output", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
     assert "8 of 11 photographs have a pose" in printed and "left out: kaputt.jpg" in printed
@@ -206,7 +207,12 @@ def photo(name: str, size: tuple[int, int] = (400, 300), **exif: object) -> Phot
 
 
 def test_photographs_share_a_camera_by_size_and_exif() -> None:
-    photos = [photo("a", camera="x"), photo("b", camera="x"), photo("c", camera="y"), photo("d", (300, 400), camera="x")]
+    photos = [
+        photo("a", camera="x"),
+        photo("b", camera="x"),
+        photo("c", camera="y"),
+        photo("d", (300, 400), camera="x"),
+    ]
     assert [[p.name for p in group] for group in by_camera(photos)] == [["a", "b"], ["c"], ["d"]]
 
 

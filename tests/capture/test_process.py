@@ -26,7 +26,12 @@ def database(folder: Path) -> Path | None:
 
 def started(folder: Path, **options: object) -> subprocess.Popen:
     return subprocess.Popen(
-        [*COMMAND, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, **options
+        [*COMMAND, str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
     )
 
 
@@ -49,7 +54,9 @@ def workers(folder: Path) -> list[str]:
     return found
 
 
-def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(copied: Copy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(
+    copied: Copy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = copied("killed")
     run = started(folder)
     wait_for(lambda: (db := database(folder)) is not None and rows(db, "keypoints") >= 3)

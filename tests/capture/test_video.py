@@ -80,7 +80,9 @@ def test_the_rotation_of_a_phone_is_applied(tmp_path: Path, wide: np.ndarray) ->
     data = (tmp_path / "a.mp4").read_bytes()
     # The matrix in the track's header (tkhd): 1 0 0, 0 1 0, 0 0 1 becomes that of a phone held upright.
     flat = b"".join(int(v).to_bytes(4, "big", signed=True) for v in (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30))
-    turned = b"".join(int(v).to_bytes(4, "big", signed=True) for v in (0, 65536, 0, -65536, 0, 0, 240 << 16, 0, 1 << 30))
+    turned = b"".join(
+        int(v).to_bytes(4, "big", signed=True) for v in (0, 65536, 0, -65536, 0, 0, 240 << 16, 0, 1 << 30)
+    )
     at = data.index(flat, data.index(b"tkhd"))
     (tmp_path / "b.mp4").write_bytes(data[:at] + turned + data[at + len(flat) :])
     taken = sorted(extract_frames(tmp_path / "b.mp4", tmp_path, 4, silent).iterdir())
@@ -93,7 +95,9 @@ def test_the_rotation_of_a_phone_is_applied(tmp_path: Path, wide: np.ndarray) ->
 def test_a_video_without_motion_is_refused(tmp_path: Path, wide: np.ndarray) -> None:
     rng = np.random.default_rng(0)
     still = wide[40:280, :320].astype(float)
-    write_video(tmp_path / "a.mp4", [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(30)])
+    write_video(
+        tmp_path / "a.mp4", [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(30)]
+    )
     with pytest.raises(CaptureError, match="shows no motion: .* Film while you walk"):
         extract_frames(tmp_path / "a.mp4", tmp_path, None, silent)
     assert not (tmp_path / "images").exists()

@@ -17,6 +17,12 @@ PARALLAX = 1.0
 """Degrees; if the rays to the points differ by less, the photographs were taken from one spot."""
 ROTATED = 2.0
 """Pixels of the features' images within which a turn alone explains a match."""
+MOST = 0.9
+"""Share of a pair's matches, and of the pairs, that a turn alone has to explain. Fewer are a far background, or
+neighbours that are almost at one place."""
+PAIRS_TRIED = 60
+GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
+"""Focal lengths, in units of the longer side, that are tried where it is not known."""
 
 SHOOT = (
     "Walk round the scene and photograph it from many places, each photograph sharing at least two thirds of what it "
@@ -95,7 +101,7 @@ def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[
     return reasons
 
 
-def why_none(job: Job, database: Path, graph: ViewGraph) -> NoPoses:
+def why_none(job: Job, graph: ViewGraph) -> NoPoses:
     """Why there is no model at all."""
     count = len(job.order)
     bare = sum(features < FEW_FEATURES for features in graph.features.values())
@@ -108,8 +114,6 @@ def why_none(job: Job, database: Path, graph: ViewGraph) -> NoPoses:
     if not parts or len(parts[0]) < max(3, 0.2 * count):
         together = f"at most {len(parts[0])} of {count} hang together" if parts else "no two of them show the same"
         return NoPoses(f"the photographs do not overlap: {together}. {SHOOT}")
-    if only_turned(job, database):
-        return from_one_spot()
     return NoPoses(
         f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have moved "
         f"between them, or the camera hardly did. {SHOOT}"
@@ -143,36 +147,38 @@ def only_turned(job: Job, database: Path) -> bool:
         images = {image.image_id: image for image in opened.read_all_images()}
         points = {i: opened.read_keypoints(i)[:, :2] for i in images}
         pairs, geometries = opened.read_two_view_geometries()
-    turned = total = 0
-    strongest = sorted(zip(pairs, geometries, strict=True), key=lambda item: -len(item[1].inlier_matches))[:40]
-    for pair, geometry in strongest:
+    counted = sorted(zip(pairs, geometries, strict=True), key=lambda item: -len(item[1].inlier_matches))
+    counted = [item for item in counted if len(item[1].inlier_matches) >= 15]
+    tried = counted[:: max(1, len(counted) // PAIRS_TRIED)]  # wide pairs too: neighbours alone show little parallax
+    turned = 0
+    for pair, geometry in tried:
         matches = np.asarray(geometry.inlier_matches)
-        if len(matches) < 15:
-            continue
         first, second = pycolmap.pair_id_to_image_pair(pair)
         group = groups[images[first].name]
         long = max(group.width, group.height)
         center = np.array([group.width, group.height]) / 2
         rays = (points[first][matches[:, 0]] - center, points[second][matches[:, 1]] - center)
         limit = ROTATED * max(1.0, long / job.max_image_size)
-        focals = [group.params[0]] if group.prior else [long * f for f in (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)]
-        total += 1
-        turned += any(_turn_error(*rays, focal) < limit for focal in focals)
-    return total > 0 and turned > 0.7 * total
+        focals = [group.params[0]] if group.prior else [long * f for f in GUESSES]
+        turned += any(np.mean(_turn_errors(*rays, focal) < limit) > MOST for focal in focals)
+    return len(tried) > 0 and turned > MOST * len(tried)
 
 
-def _turn_error(first: np.ndarray, second: np.ndarray, focal: float) -> float:
-    """Median distance in pixels between points [n,2] and those that the best turn takes to them."""
+def _turn_errors(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
+    """Distances [n] in pixels between points and those that the best turn takes to them.
+
+    Args:
+        first, second: [n,2] pixels from the principal point.
+        focal: pixels.
+    """
     a = np.column_stack([first / focal, np.ones(len(first))])
     b = np.column_stack([second / focal, np.ones(len(second))])
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     b /= np.linalg.norm(b, axis=1, keepdims=True)
-    error = np.inf
     keep = np.ones(len(a), bool)
-    for _ in range(3):  # least squares, then without the worst half, which may be wrong matches
+    for _ in range(3):  # least squares, then without the worst half, in which the wrong matches are
         u, _, vt = np.linalg.svd(b[keep].T @ a[keep])
         turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
         distances = np.linalg.norm(a @ turn.T - b, axis=1) * focal
-        error = float(np.median(distances))
-        keep = distances <= error
-    return error
+        keep = distances <= np.median(distances)
+    return distances

@@ -93,6 +93,3 @@ def rows(database: Path, table: str) -> int:
             connection.close()
     except sqlite3.Error:
         return 0
-
-
-

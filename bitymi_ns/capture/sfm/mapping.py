@@ -28,10 +28,14 @@ def reconstruct(job: Job, database: Path, connected: int, tell: Tell) -> pycolma
     """
     found = None
     if job.mapper in ("auto", "global"):
-        found = _best(_in_folder(job, "global", lambda folder: _global(job, database, folder, tell)), job, database, tell)
+        found = _best(
+            _in_folder(job, "global", lambda folder: _global(job, database, folder, tell)), job, database, tell
+        )
         if job.mapper == "global" or (found is not None and _satisfies(found, job, connected)):
             return found
-    other = _best(_in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell)
+    other = _best(
+        _in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell
+    )
     models = [model for model in (found, other) if model is not None]
     return max(models, key=lambda m: (m.num_reg_images(), -m.compute_mean_reprojection_error()), default=None)
 

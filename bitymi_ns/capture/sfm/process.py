@@ -65,10 +65,15 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
 
 def _why_ended(work: Path, source: Path, code: int) -> str:
     log = (work / LOG).read_text("utf8", errors="replace")
-    said = [line for line in log.splitlines() if line.strip() and not line.startswith(("*** ", "    @ "))]
+    said = [
+        line for line in log.splitlines() if line.strip() and "@ 0x" not in line.replace("@  ", "@ ").replace("  ", " ")
+    ]
     last = said[-1].split("] ", 1)[-1] if said else ""
     free = shutil.disk_usage(work).free
-    full = any(word in log for word in ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database"))
+    full = any(
+        word in log
+        for word in ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
+    )
     if full or free < LITTLE_SPACE:
         return (
             f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). Free some "

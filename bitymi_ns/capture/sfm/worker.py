@@ -58,11 +58,13 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
     pairs.match(job, database, stages)
     graph = explain.view_graph(database)
     parts = graph.components()
+    if explain.only_turned(job, database):
+        raise explain.from_one_spot()
     model = mapping.reconstruct(job, database, len(parts[0]), stages) if parts and len(parts[0]) >= LEAST else None
     if model is None or model.num_reg_images() < LEAST:
-        raise explain.why_none(job, database, graph)
+        raise explain.why_none(job, graph)
     angle = explain.parallax(model)
-    if angle < explain.PARALLAX or explain.only_turned(job, database):
+    if angle < explain.PARALLAX:
         raise explain.from_one_spot()
     placed = {image.name for image in model.images.values() if image.has_pose}
     model.extract_colors_for_all_images(job.images)

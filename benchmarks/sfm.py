@@ -1,5 +1,5 @@
-"""Camera poses of a capture by `find_poses` and by COLMAP's command-line defaults, in one run: time, photographs placed,
-reprojection error, and the distance of the poses from given ones.
+"""Camera poses of a capture by `find_poses` and by COLMAP's command-line defaults, in one run: time, photographs
+placed, reprojection error, and the distance of the poses from given ones.
 
     python benchmarks/sfm.py CAPTURE...        folders with images/ and transforms.json
     python benchmarks/sfm.py --only ours CAPTURE

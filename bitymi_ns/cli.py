@@ -57,7 +57,7 @@ class Sample:
 
 @dataclass
 class Sfm:
-    """Find the camera poses of photographs or of a video, and write them as a COLMAP model and as a nerfstudio capture."""
+    """Find the camera poses of photographs or of a video; write a COLMAP model and a nerfstudio capture."""
 
     source: tyro.conf.Positional[Path]
     """Folder of photographs (or with `images`, and `masks`, in it), or a video."""
@@ -66,9 +66,9 @@ class Sfm:
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
-        from bitymi_ns.bake.progress import rich_progress
         from bitymi_ns.capture import find_poses
         from bitymi_ns.capture.nerfstudio import write_capture
+        from bitymi_ns.progress import rich_progress
 
         with rich_progress() as progress:
             poses = find_poses(self.source, self.options, progress)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.evaluate import size_classes, texel_index
 from bitymi_ns.bake.plan import STEPS, Field, Plan, along_axes, interpolation, references, weighted_rms
-from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.progress import Progress, no_progress
 
 
 @dataclass

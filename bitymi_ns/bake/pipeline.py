@@ -20,12 +20,12 @@ from bitymi_ns.bake.limits import within
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.plan import Field, kernel_parameters, make_plan, paper_texels
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField

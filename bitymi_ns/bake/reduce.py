@@ -10,7 +10,7 @@ from torch import Tensor
 from bitymi_ns.bake.evaluate import texel_index
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.plan import Field, Plan, Reference, along_axes, fit, interpolation, references, weighted_rms
-from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.progress import Progress, no_progress
 
 _FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a grid may be for it to be tried
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from bitymi_ns.bake.evaluate import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops import (
     Fragments,
     TexelFragments,
@@ -26,6 +25,7 @@ from bitymi_ns.ops import (
     texel_image,
     view_color,
 )
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,8 +58,3 @@ def work_folder(source: Path, key: str) -> Iterator[Path]:
 def user_cache() -> Path:
     """The user's folder for what can be made again."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bitymi-ns"
-
-
-def plain_name(text: str) -> str:
-    """A file name of letters, digits, dots and dashes alone, for what COLMAP writes down."""
-    return re.sub(r"[^\w.-]+", "_", text)

@@ -14,8 +14,9 @@ import numpy as np
 from bitymi_ns.capture.cache import content_key, work_folder
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import CameraGroup, Job
-from bitymi_ns.capture.types import CaptureError, Progress
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import explained, write_file
+from bitymi_ns.progress import Progress, no_progress
 
 DONE = "points"
 """File that is written when the model is whole."""
@@ -77,7 +78,7 @@ def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | N
         if (work / DONE).exists():
             return model
         with explained(work, CaptureError):
-            process.run(_job(images, views, work), images, progress or (lambda step, done, total: None))
+            process.run(_job(images, views, work), images, progress or no_progress)
             write_file(work / DONE, b"")
             shutil.rmtree(work / "links", ignore_errors=True)
             for name in ("database.db", "database.db-wal", "database.db-shm", "pairs.txt"):

@@ -1,4 +1,4 @@
-"""A capture as nerfstudio reads it: photographs, transforms.json and a point cloud, with the COLMAP model beside them."""
+"""A capture as nerfstudio reads it: photographs, transforms.json, a point cloud, and the COLMAP model beside them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.types import Poses, Progress
+from bitymi_ns.capture.types import Poses
 from bitymi_ns.files import complete_folder
+from bitymi_ns.progress import Progress
 
 CLOUD = "sparse_pc.ply"
 
@@ -18,8 +19,8 @@ CLOUD = "sparse_pc.ply"
 def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
     """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
 
-    Photographs are copied as they are, so their cameras are distorted; nerfstudio-data undistorts them on loading. There
-    is no applied_transform: COLMAP model, cameras and points share one world with z up.
+    Photographs are copied as they are, so their cameras are distorted; nerfstudio-data undistorts them on loading.
+    There is no applied_transform: COLMAP model, cameras and points share one world with z up.
 
     Raises:
         OSError: it cannot be written.

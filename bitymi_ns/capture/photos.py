@@ -12,7 +12,8 @@ import pillow_heif
 from PIL import Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
-from bitymi_ns.capture.types import CaptureError, Progress
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.progress import Progress
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
 PLAIN_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")

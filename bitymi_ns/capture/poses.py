@@ -22,9 +22,10 @@ from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import CameraGroup, Job
-from bitymi_ns.capture.types import CaptureError, Poses, Progress, SfmOptions
+from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
 from bitymi_ns.capture.video import extract_frames
 from bitymi_ns.files import complete_folder, explained, write_file
+from bitymi_ns.progress import Progress, no_progress
 
 GUESSED_FOCAL = 1.2
 """First guess of a focal length that is not known, in units of the longer side; COLMAP's own."""
@@ -46,7 +47,7 @@ def find_poses(source: Path, options: SfmOptions | None = None, progress: Progre
         KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
     options = options or SfmOptions()
-    tell = progress or (lambda step, done, total: None)
+    tell = progress or no_progress
     source, folder, names = _what(Path(source))
     masks = prepare.mask_folder(source, folder, options.masks) if folder.is_dir() else None
     inputs = [folder / name for name in names] if names else [source]
@@ -87,8 +88,8 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
 def _few(count: int) -> str:
     held = {0: "no photographs", 1: "one photograph"}.get(count, f"{count} photographs")
     return (
-        f"{held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take photographs of which "
-        "each shares at least two thirds with the one before"
+        f"{held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take photographs of "
+        "which each shares at least two thirds with the one before"
     )
 
 
@@ -155,8 +156,8 @@ def _too_few_left(
     more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
     if len(twins) >= len(left_out) - len(twins):
         return (
-            f"of the photographs in {folder}, only {len(photos)} differ ({some}{more}): take photographs from different "
-            "places"
+            f"of the photographs in {folder}, only {len(photos)} differ ({some}{more}): take photographs from "
+            "different places"
         )
     return f"of the photographs in {folder}, only {len(photos)} can be used ({some}{more}). Copy or export them again"
 
@@ -192,7 +193,7 @@ def make_job(
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:
         (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
-    mask_files = prepare.colmap_masks(photos, plain, masks, work)[0] if masks is not None else None
+    mask_files = prepare.colmap_masks(photos, plain, masks, work) if masks is not None else None
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
     return Job(
         work=str(work.resolve()),

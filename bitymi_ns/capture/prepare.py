@@ -8,8 +8,9 @@ from pathlib import Path, PurePosixPath
 from PIL import Image
 
 from bitymi_ns.capture.photos import PHOTO_SUFFIXES, Photo, upright
-from bitymi_ns.capture.types import CaptureError, Progress
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_file, complete_folder
+from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
 
@@ -67,36 +68,31 @@ def mask_of(masks: Path, name: str) -> Path | None:
     return next((masks / c for c in candidates if (masks / c).is_file()), None)
 
 
-def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, work: Path) -> tuple[Path, list[str]]:
-    """Write the masks as COLMAP reads them: grey PNGs of the size of the upright photographs.
+def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, work: Path) -> Path:
+    """Write the masks as COLMAP reads them, grey PNGs of the size of the upright photographs, and return their folder.
 
-    Returns:
-        their folder, and the names of the photographs that have none.
+    A photograph without a mask is used as a whole.
+
+    Args:
+        photos: the photographs.
+        names: what COLMAP calls each.
+        masks: folder of the masks.
+        work: gets the folder.
 
     Raises:
         CaptureError: a mask cannot be read, or has another aspect than its photograph, or there is none at all.
     """
     target = work / "masks"
-    without = []
-    found = 0
-    for photo in photos:
-        path = mask_of(masks, photo.name)
-        if path is None:
-            without.append(photo.name)
-            continue
-        found += 1
-        there = target / f"{names[photo.name]}.png"
-        if there.exists():
-            continue
-        there.parent.mkdir(parents=True, exist_ok=True)
-        mask = _read_mask(path, photo)
-        with complete_file(there) as file:
-            mask.save(file, "PNG")
+    found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
     if not found:
         raise CaptureError(
             f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for photo.jpg"
         )
-    return target, without
+    target.mkdir(exist_ok=True)
+    for photo, path in found:
+        with complete_file(target / f"{names[photo.name]}.png") as file:
+            _read_mask(path, photo).save(file, "PNG")
+    return target
 
 
 def _read_mask(path: Path, photo: Photo) -> Image.Image:
@@ -111,5 +107,5 @@ def _read_mask(path: Path, photo: Photo) -> Image.Image:
             f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {photo.name} stands upright with "
             f"{photo.width} x {photo.height}: save it in the same proportions"
         )
-    # Any grey above 0 is kept by COLMAP, so a reduced edge must not leave faint remains.
+    # COLMAP keeps whatever is above 0, so the soft edge of a mask is cut in its middle.
     return mask.resize(size, Image.NEAREST).point(lambda value: 255 if value > 127 else 0)

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 
 class CaptureError(ValueError):
     """Photographs or a video of which no poses can be found: what is wrong, in which file, and what to do."""
-
-
-class Progress(Protocol):
-    """Called after every chunk of work with the step's name and how much of it is done."""
-
-    def __call__(self, step: str, done: int, total: int) -> None: ...
 
 
 @dataclass(frozen=True)

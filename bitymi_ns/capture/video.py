@@ -11,8 +11,9 @@ from PIL import Image
 
 from bitymi_ns.capture.photos import sharpness
 from bitymi_ns.capture.prepare import JPEG_QUALITY
-from bitymi_ns.capture.types import CaptureError, Progress
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
+from bitymi_ns.progress import Progress
 
 SMALL = 160
 """Longer side in pixels of the frames by which motion is measured."""
@@ -53,8 +54,8 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         )
     if motion[-1] < STILL:
         raise CaptureError(
-            f"{video} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn the "
-            "camera to keep it in view"
+            f"{video} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
+            "the camera to keep it in view"
         )
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
     chosen = choose(np.array(motion), np.array(sharp), wanted)

@@ -115,8 +115,8 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
         together = f"at most {len(parts[0])} of {count} hang together" if parts else "no two of them show the same"
         return NoPoses(f"the photographs do not overlap: {together}. {SHOOT}")
     return NoPoses(
-        f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have moved "
-        f"between them, or the camera hardly did. {SHOOT}"
+        f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have "
+        f"moved between them, or the camera hardly did. {SHOOT}"
     )
 
 

@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.types import CaptureError, Progress
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import size_text
+from bitymi_ns.progress import Progress
 
 LOG = "colmap.log"
 LITTLE_SPACE = 50_000_000

@@ -38,8 +38,8 @@ def triangulate(job: Job, tell: Tell) -> dict[str, object]:
     tell("triangulating", 1, 1)
     if model.num_points3D() < LEAST:
         raise NoPoses(
-            f"only {model.num_points3D()} points can be triangulated from the given poses: the poses may belong to other "
-            "photographs, or be camera to world where world to camera is meant, or have other axes"
+            f"only {model.num_points3D()} points can be triangulated from the given poses: the poses may belong to "
+            "other photographs, or be camera to world where world to camera is meant, or have other axes"
         )
     # The poses are written back as given: the triangulation leaves them as they are, but for rounding.
     for image in model.images.values():

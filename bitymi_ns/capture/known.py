@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections import defaultdict
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from bitymi_ns.capture.cache import content_key, work_folder
 from bitymi_ns.capture.sfm import process
-from bitymi_ns.capture.sfm.job import CameraGroup, Job
+from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import explained, write_file
 from bitymi_ns.progress import Progress, no_progress
@@ -74,16 +73,14 @@ def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | N
         raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
     settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
     with work_folder(images, content_key([images / view.name for view in views], settings)) as work:
-        model = work / "model"
+        model = work / MODEL
         if (work / DONE).exists():
             return model
         with explained(work, CaptureError):
             process.run(_job(images, views, work), images, progress or no_progress)
             write_file(work / DONE, b"")
             shutil.rmtree(work / "links", ignore_errors=True)
-            for name in ("database.db", "database.db-wal", "database.db-shm", "pairs.txt"):
-                with suppress(OSError):
-                    (work / name).unlink()
+            process.forget(work)
         return model
 
 

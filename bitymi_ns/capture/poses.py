@@ -8,7 +8,6 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from bitymi_ns.capture.photos import VIDEO_SUFFIXES, Photo, find_photos, photo_f
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.sfm import process
-from bitymi_ns.capture.sfm.job import CameraGroup, Job
+from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
 from bitymi_ns.capture.video import extract_frames
 from bitymi_ns.files import complete_folder, explained, write_file
@@ -234,7 +233,7 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
 
 def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
     """Settle the model in its world and write it with its report; what was needed on the way there goes."""
-    model = pycolmap.Reconstruction(work / "model")
+    model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
     frame = settle(model, {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None})
     values |= {"metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
@@ -257,11 +256,9 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         write_report(result, values, model)
         kept = {"images": str(images.resolve()), **{key: values[key] for key in keys}}
         write_file(result / "poses.json", json.dumps(kept).encode())
-    for name in ("links", "masks", "model"):
+    for name in ("links", "masks", MODEL):
         shutil.rmtree(work / name, ignore_errors=True)
-    for name in ("database.db", "database.db-wal", "database.db-shm", "pairs.txt"):
-        with suppress(OSError):
-            (work / name).unlink()
+    process.forget(work)
     found = _finished(work)
     assert found is not None
     return found

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pycolmap
@@ -18,17 +14,19 @@ SMALL = 1000
 
 def extract(job: Job, database: Path, tell: Tell) -> None:
     """Find the features of the photographs that have none yet."""
-    with counted(database, "keypoints", "finding features", len(job.order), tell):
-        for group, camera_id in zip(job.cameras, camera_ids(job, database), strict=True):
-            pycolmap.extract_features(
-                database,
-                job.images,
-                image_names=group.names,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=_reader(job, group, camera_id),
-                extraction_options=_extraction(job, group),
-                device=pycolmap.Device.cpu,
-            )
+    total = len(job.order)
+    tell("finding features", 0, total, counts="keypoints")
+    for group, camera_id in zip(job.cameras, camera_ids(job, database), strict=True):
+        pycolmap.extract_features(
+            database,
+            job.images,
+            image_names=group.names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=_reader(job, group, camera_id),
+            extraction_options=_extraction(job, group),
+            device=pycolmap.Device.cpu,
+        )
+    tell("finding features", total, total)
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
@@ -61,35 +59,3 @@ def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptio
     options.sift.max_num_features = job.max_features
     options.sift.first_octave = -1 if min(max(group.width, group.height), job.max_image_size) < SMALL else 0
     return options
-
-
-@contextmanager
-def counted(database: Path, table: str, stage: str, total: int, tell: Tell) -> Iterator[None]:
-    """Tell how many rows a table has while the block fills it."""
-    ended = threading.Event()
-
-    def watch() -> None:
-        while not ended.wait(0.5):
-            tell(stage, min(rows(database, table), total), total)
-
-    tell(stage, 0, total)
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-    tell(stage, total, total)
-
-
-def rows(database: Path, table: str) -> int:
-    """How many rows a table of the database has; 0 while it cannot be read."""
-    try:
-        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
-        try:
-            return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-        finally:
-            connection.close()
-    except sqlite3.Error:
-        return 0

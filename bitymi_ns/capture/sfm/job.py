@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from typing import Protocol
 
-Tell = Callable[[str, int, int], None]
-"""Gets the stage, how much of it is done, and how much there is."""
+DATABASE = "database.db"
+PAIRS = "pairs.txt"
+MODEL = "model"
+"""Names within the folder of the work: COLMAP's database, the pairs to be compared, and the model that comes out."""
+
+
+class Tell(Protocol):
+    """Gets the stage, how much of it is done, how much there is, and the table of the database whose rows say how much
+    is done from now on."""
+
+    def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None: ...
 
 
 @dataclass(frozen=True)

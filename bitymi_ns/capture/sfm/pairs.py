@@ -9,8 +9,7 @@ import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from bitymi_ns.capture.sfm.features import counted
-from bitymi_ns.capture.sfm.job import Job, Tell
+from bitymi_ns.capture.sfm.job import PAIRS, Job, Tell
 from bitymi_ns.files import write_file
 
 FEW = 30
@@ -30,9 +29,9 @@ SEQUENCE_SHARE = 0.8
 
 def match(job: Job, database: Path, tell: Tell) -> None:
     """Choose pairs, and compare those that have not been compared yet."""
-    listed = Path(job.work) / "pairs.txt"
+    listed = Path(job.work) / PAIRS
     if not listed.exists():
-        names = [name for name in job.order]
+        names = job.order
         pairs = choose(job, database, tell)
         write_file(listed, "".join(f"{names[i]} {names[j]}\n" for i, j in pairs).encode())
     compare(listed, database, tell)
@@ -43,8 +42,9 @@ def compare(listed: Path, database: Path, tell: Tell) -> None:
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = listed
     total = len(listed.read_text("utf8").splitlines())
-    with counted(database, "two_view_geometries", "comparing photographs", total, tell):
-        pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+    tell("comparing photographs", 0, total, counts="two_view_geometries")
+    pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+    tell("comparing photographs", total, total)
 
 
 def choose(job: Job, database: Path, tell: Tell) -> list[tuple[int, int]]:

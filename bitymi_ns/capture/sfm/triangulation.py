@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.capture.sfm import features, pairs
-from bitymi_ns.capture.sfm.job import Job, NoPoses, Tell
+from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses, Tell
 from bitymi_ns.files import complete_folder
 
 LEAST = 10
@@ -21,7 +21,7 @@ def triangulate(job: Job, tell: Tell) -> dict[str, object]:
     Raises:
         NoPoses: the photographs do not show the same from the poses given.
     """
-    database = Path(job.work) / "database.db"
+    database = Path(job.work) / DATABASE
     features.extract(job, database, tell)
     pairs.match(job, database, tell)
     tell("triangulating", 0, 1)
@@ -45,7 +45,7 @@ def triangulate(job: Job, tell: Tell) -> dict[str, object]:
     for image in model.images.values():
         image.frame.rig_from_world = _pose(job.poses[image.name])
         image.name = job.names[image.name]
-    with complete_folder(Path(job.work) / "model") as folder:
+    with complete_folder(Path(job.work) / MODEL) as folder:
         model.write_binary(folder)
     return {
         "registered": model.num_reg_images(),

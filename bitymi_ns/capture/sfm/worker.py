@@ -1,7 +1,7 @@
 """The process that runs COLMAP: `python -m bitymi_ns.capture.sfm.worker`, a Job on stdin, lines of JSON on stdout.
 
-A line is {"stage", "done", "total"}, or at the end {"result"} or {"failure"}. The process ends when its stdin does, so
-that nothing goes on in the background after whoever started it was killed. What COLMAP has to say goes to stderr.
+A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends when its stdin
+does, so that nothing goes on after whoever started it was killed. What COLMAP has to say goes to stderr.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.capture.sfm import explain, features, mapping, pairs, triangulation
-from bitymi_ns.capture.sfm.job import Job, NoPoses
+from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
-MODEL = "model"
-"""Folder of the model within that of the work."""
 LEAST = 3
 """Fewer placed photographs are no capture."""
 
@@ -35,12 +33,12 @@ class Stages:
         self._stage = "starting"
         self._lock = threading.Lock()
 
-    def __call__(self, stage: str, done: int, total: int) -> None:
+    def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None:
         with self._lock:
             now = time.monotonic()
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
             self._stage, self._since = stage, now
-            send(stage=stage, done=done, total=total)
+            send(stage=stage, done=done, total=total, counts=counts)
 
 
 def send(**line: object) -> None:
@@ -53,7 +51,7 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
     Raises:
         NoPoses: there are none.
     """
-    database = Path(job.work) / "database.db"
+    database = Path(job.work) / DATABASE
     features.extract(job, database, stages)
     pairs.match(job, database, stages)
     graph = explain.view_graph(database)

@@ -36,8 +36,13 @@ def reconstruct(job: Job, database: Path, connected: int, tell: Tell) -> pycolma
     other = _best(
         _in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell
     )
-    models = [model for model in (found, other) if model is not None]
-    return max(models, key=lambda m: (m.num_reg_images(), -m.compute_mean_reprojection_error()), default=None)
+    return better(found, other)
+
+
+def better(*models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
+    """The model with most cameras, of equals that with the smallest error; None if there is none."""
+    found = [model for model in models if model is not None]
+    return max(found, key=lambda m: (m.num_reg_images(), -m.compute_mean_reprojection_error()), default=None)
 
 
 def pixel(job: Job) -> float:
@@ -82,10 +87,9 @@ def _global(job: Job, database: Path, folder: Path, tell: Tell) -> dict[int, pyc
     options.random_seed = 0
     copy = folder / "database.db"  # its focal lengths are changed, which the other mapper starts from
     shutil.copyfile(database, copy)
-    if not all(group.prior for group in job.cameras):
-        calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = 0
-        pycolmap.calibrate_view_graph(copy, calibration)
+    calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and finds out wrong ones from EXIF
+    calibration.random_seed = 0
+    pycolmap.calibrate_view_graph(copy, calibration)
     models = pycolmap.global_mapping(copy, job.images, folder, options)
     tell(stage, 1, 1)
     return models

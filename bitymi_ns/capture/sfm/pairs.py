@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from bitymi_ns.files import write_file
 
 FEW = 30
 """Up to so many photographs are all compared with all."""
+WORTH_ALL = 150
+"""Up to so many are compared with all where too few get a pose without."""
 NEIGHBOURS = 20
 """Photographs that each is compared with, by how alike they look, or by GPS."""
 COARSE_FEATURES = (256, 128)
@@ -37,6 +40,13 @@ def match(job: Job, database: Path, tell: Tell) -> None:
     compare(listed, database, tell)
 
 
+def match_rest(job: Job, database: Path, tell: Tell) -> None:
+    """Compare all with all."""
+    listed = Path(job.work) / PAIRS
+    write_file(listed, "".join(f"{first} {second}\n" for first, second in combinations(job.order, 2)).encode())
+    compare(listed, database, tell)
+
+
 def compare(listed: Path, database: Path, tell: Tell) -> None:
     """Compare the pairs of a list; those in the database are passed over."""
     options = pycolmap.ImportedPairingOptions()
@@ -50,9 +60,8 @@ def compare(listed: Path, database: Path, tell: Tell) -> None:
 def choose(job: Job, database: Path, tell: Tell) -> list[tuple[int, int]]:
     """Pairs of indices into `job.order`, the first index the smaller one."""
     count = len(job.order)
-    everything = [(i, j) for i in range(count) for j in range(i + 1, count)]
     if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
-        return everything
+        return list(combinations(range(count), 2))
     alike = likeness(job, database, tell)
     pairs = nearest(alike, NEIGHBOURS)
     if job.sequence or job.matching == "sequential" or is_sequence(alike):

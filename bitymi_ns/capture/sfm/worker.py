@@ -54,11 +54,13 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
     database = Path(job.work) / DATABASE
     features.extract(job, database, stages)
     pairs.match(job, database, stages)
-    graph = explain.view_graph(database)
-    parts = graph.components()
-    if explain.only_turned(job, database):
-        raise explain.from_one_spot()
-    model = mapping.reconstruct(job, database, len(parts[0]), stages) if parts and len(parts[0]) >= LEAST else None
+    graph, model = _mapped(job, database, stages)
+    registered = model.num_reg_images() if model is not None else 0
+    chosen = pairs.FEW < len(job.order) <= pairs.WORTH_ALL and job.matching == "auto"
+    if chosen and registered < mapping.ENOUGH * len(job.order):
+        pairs.match_rest(job, database, stages)
+        graph, again = _mapped(job, database, stages)
+        model = mapping.better(model, again)
     if model is None or model.num_reg_images() < LEAST:
         raise explain.why_none(job, graph)
     angle = explain.parallax(model)
@@ -76,6 +78,16 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
         "left_out": explain.left_out(graph, placed, job.names),
         **write(model, job),
     }
+
+
+def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph, pycolmap.Reconstruction | None]:
+    graph = explain.view_graph(database)
+    parts = graph.components()
+    if explain.only_turned(job, database):
+        raise explain.from_one_spot()
+    if not parts or len(parts[0]) < LEAST:
+        return graph, None
+    return graph, mapping.reconstruct(job, database, len(parts[0]), stages)
 
 
 def write(model: pycolmap.Reconstruction, job: Job) -> dict[str, object]:

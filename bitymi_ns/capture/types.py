@@ -35,6 +35,13 @@ class SfmOptions:
     frames: int | None = None
     """Number of frames to take of a video; None = by how much the camera moves."""
 
+    def __post_init__(self) -> None:
+        least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}
+        for name, limit in least.items():
+            value = getattr(self, name)
+            if value is not None and not limit <= value < 1e6:
+                raise CaptureError(f"{name} is {value}: give a number of at least {limit}")
+
 
 @dataclass(frozen=True)
 class Poses:

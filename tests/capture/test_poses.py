@@ -222,3 +222,11 @@ def test_a_focal_length_is_known_only_if_all_photographs_state_it() -> None:
     one = [photo("a", focal_length=350.0), photo("b")]
     assert camera_group(one, [], SfmOptions()).params[0] == 480 and not camera_group(one, [], SfmOptions()).prior
     assert camera_group(one, [], SfmOptions(focal_length=300.0)).params[0] == 300
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("max_image_size", 0), ("max_features", -1), ("frames", 2), ("focal_length", float("nan"))]
+)
+def test_options_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(CaptureError, match=f"{name} is .*: give a number of at least"):
+        SfmOptions(**{name: value})

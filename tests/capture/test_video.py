@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture import CaptureError, SfmOptions, find_poses
 from bitymi_ns.capture.video import choose, displacement, extract_frames
 
 
@@ -114,3 +114,12 @@ def test_a_video_that_breaks_off_gives_what_it_has(tmp_path: Path, wide: np.ndar
     whole = (tmp_path / "a.avi").read_bytes()
     (tmp_path / "a.avi").write_bytes(whole[: len(whole) // 2])
     assert len(numbers(extract_frames(tmp_path / "a.avi", tmp_path, None, silent))) >= 8
+
+
+def test_a_video_of_a_scene_gives_poses(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    path = tmp_path / "a walk.mp4"
+    write_video(path, [picture for picture in pictures for _ in range(2)])
+    poses = find_poses(path, SfmOptions(frames=8))
+    assert poses.given >= 6 and poses.registered >= poses.given - 1
+    assert poses.images.parent.parent == tmp_path / ".bitymi"
+    assert all(path.name.startswith("frame_") for path in poses.images.iterdir())

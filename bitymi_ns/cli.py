@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from bitymi_ns import KernelsUnavailable
+from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.cli import BenchRun
 from bitymi_ns.measure.bench.process import BenchError
@@ -52,6 +53,35 @@ class Sample:
                 progress=True,
             )
         print(f"Wrote {self.views} images and {self.points} points to {folder}")
+
+
+@dataclass
+class Sfm:
+    """Find the camera poses of photographs or of a video; write a COLMAP model and a nerfstudio capture."""
+
+    source: tyro.conf.Positional[Path]
+    """Folder of photographs (or with `images`, and `masks`, in it), or a video."""
+    output: Path | None = None
+    """Folder to write the capture to; none = the poses are kept beside the photographs, and their place is printed."""
+    options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
+
+    def run(self) -> None:
+        from bitymi_ns.capture import find_poses
+        from bitymi_ns.capture.nerfstudio import write_capture
+        from bitymi_ns.progress import rich_progress
+
+        with rich_progress() as progress:
+            poses = find_poses(self.source, self.options, progress)
+            if self.output is not None:
+                with explained(self.output, ValueError):
+                    write_capture(poses, self.output, progress)
+        for name, why in poses.left_out.items():
+            print(f"left out: {name}: {why}")
+        print(
+            f"{poses.registered} of {poses.given} photographs have a pose; mean reprojection error "
+            f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.md'}"
+        )
+        print(f"Wrote {self.output}" if self.output else f"COLMAP model: {poses.model}")
 
 
 @dataclass
@@ -205,6 +235,7 @@ class Verify:
 
 Command = (
     Annotated[Sample, tyro.conf.subcommand(name="sample")]
+    | Annotated[Sfm, tyro.conf.subcommand(name="sfm")]
     | Annotated[Report, tyro.conf.subcommand(name="report")]
     | Annotated[Stability, tyro.conf.subcommand(name="stability")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]

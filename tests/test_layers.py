@@ -16,7 +16,8 @@ import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "train", "bake", "bundle", "host", "measure"]
-"""Innermost first. Beside them stand `files`, `ply`, `presets`, `recognise` and `sample`, which import none of these."""
+BESIDE = ["files", "ply", "presets", "progress", "sample", "capture"]
+"""ORDER has the innermost first. These stand beside them and import none of them."""
 KNOW_NERFSTUDIO = ("host", "measure/knobs.py", "measure/pictures.py")
 
 
@@ -60,6 +61,14 @@ def test_a_layer_imports_only_what_stands_below(layer: str) -> None:
     for path in (PACKAGE / layer).rglob("*.py"):
         for name, _ in imports(path):
             assert ".".join(name.split(".")[:2]) not in above, f"{path} imports {name}"
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_what_stands_beside_the_layers_imports_none_of_them(name: str) -> None:
+    layers = {f"bitymi_ns.{layer}" for layer in [*ORDER, "cli"]}
+    for path in [path for module, path in MODULES.items() if f"{module}.".startswith(f"bitymi_ns.{name}.")]:
+        for imported, _ in imports(path):
+            assert ".".join(imported.split(".")[:2]) not in layers, f"{path} imports {imported}"
 
 
 def test_nerfstudio_is_known_to_the_host_and_to_what_measures_it_alone() -> None:

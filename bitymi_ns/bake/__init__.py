@@ -2,7 +2,7 @@
 
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, bake
-from bitymi_ns.bake.progress import Progress, rich_progress
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
+from bitymi_ns.progress import Progress, rich_progress
 
 __all__ = ["BakeOptions", "Baked", "Progress", "TuneOptions", "bake", "rich_progress", "tune_atlas"]

@@ -11,10 +11,10 @@ from torch import Tensor
 from bitymi_ns.bake.options import STEPS
 from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.plan import Field, Plan
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.reference import references
 from bitymi_ns.bake.resample import read_at
 from bitymi_ns.bake.statistics import Percentiles, TileError
+from bitymi_ns.progress import Progress, no_progress
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:

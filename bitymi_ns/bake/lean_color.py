@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.limits import beyond
 from bitymi_ns.bake.options import STEPS
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
 from bitymi_ns.ops import view_color
@@ -21,6 +20,7 @@ from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.shade import view_base
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.progress import Progress, no_progress
 
 FIT_STEPS = 6
 FIT_VIEWS = 16

@@ -15,12 +15,12 @@ from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import tile_means
 from bitymi_ns.bake.plan import Field, paper_texels
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
 from bitymi_ns.bake.subject import Subject, drawable
 from bitymi_ns.bake.ways import Tiles, Way, way_of
 from bitymi_ns.ops.view_kinds import kind_of
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 

@@ -15,7 +15,7 @@ from PIL import Image
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import coverage
-from bitymi_ns.bake.progress import Progress, no_progress
+from bitymi_ns.progress import Progress, no_progress
 
 Format = Literal["bc7", "uint8", "fp16"]
 RangeRule = Literal["sigma6", "minmax", "auto"]

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import size_classes, texel_index
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field_tiles import field_tiles
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.rotations import tangents
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.bake.statistics import FineTuning, Gain
 from bitymi_ns.ops import (
     Fragments,
@@ -27,6 +26,7 @@ from bitymi_ns.ops import (
     view_color,
 )
 from bitymi_ns.ops.backend import require
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
 from bitymi_ns.train.memory import OnDemand, Room

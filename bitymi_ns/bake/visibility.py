@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.progress import Progress, no_progress
 from bitymi_ns.ops import fitting_lists, project
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
 

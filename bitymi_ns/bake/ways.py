@@ -14,12 +14,12 @@ from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import tile_means
 from bitymi_ns.bake.plan import Field, Plan, kernel_parameters, make_plan
-from bitymi_ns.bake.progress import Progress
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.statistics import FieldLevels, ViewColorError
 from bitymi_ns.bake.subject import Subject
 from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.progress import Progress
 from bitymi_ns.scene.field import HashField
 
 

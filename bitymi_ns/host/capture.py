@@ -22,6 +22,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
 from PIL import Image, UnidentifiedImageError
 
+from bitymi_ns.capture.recognise import PHOTOGRAPHS, Found, models_in
 from bitymi_ns.host import transforms
 from bitymi_ns.host.colmap import check_model, options_for
 from bitymi_ns.host.colmap_model import read_model
@@ -32,7 +33,6 @@ from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
 from bitymi_ns.host.poses import check_spread
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
-from bitymi_ns.recognise import PHOTOGRAPHS, Found, models_in
 
 
 class Cloud(NamedTuple):

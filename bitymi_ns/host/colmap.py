@@ -15,9 +15,9 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils as reader
 
+from bitymi_ns.capture.recognise import is_model, models_in
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.point_cloud import point_count
-from bitymi_ns.recognise import is_model, models_in
 
 
 def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:

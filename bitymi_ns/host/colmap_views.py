@@ -19,12 +19,12 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 from PIL import Image
 
+from bitymi_ns.capture.recognise import PHOTOGRAPHS
 from bitymi_ns.host.colmap_model import Model, ModelCamera, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS
 from bitymi_ns.host.lens import Lens, Pinhole, lens
 from bitymi_ns.host.poses import check_spread
-from bitymi_ns.recognise import PHOTOGRAPHS
 
 USUAL_PLACES = ("images", "input", "image", "photos", "photographs", "rgb", "color")
 """Folders of photographs beside a COLMAP model, the most usual first."""

@@ -22,6 +22,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
 from bitymi_ns.host import finding, holdout
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import (
@@ -44,7 +45,6 @@ from bitymi_ns.host.transforms import (
     take_lists,
     without_endings,
 )
-from bitymi_ns.recognise import Found, NotRecognised, recognise
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model, which is found for those that come without."""

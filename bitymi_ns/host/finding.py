@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bitymi_ns.capture.recognise import Found
 from bitymi_ns.host.colmap_views import Source, find_source
 from bitymi_ns.host.errors import fail, say
-from bitymi_ns.recognise import Found
 
 
 def source_of(found: Found, masks_path: Path | None, reduction: int) -> Source:

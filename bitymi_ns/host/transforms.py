@@ -19,10 +19,10 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.capture.recognise import PHOTOGRAPHS, is_model
 from bitymi_ns.host.cameras import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.poses import rotations
-from bitymi_ns.recognise import PHOTOGRAPHS, is_model
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")

@@ -10,9 +10,9 @@ from typing import Any
 
 import yaml
 
+from bitymi_ns.capture.recognise import NotRecognised, recognise
 from bitymi_ns.measure.bench.matrix import Bundle, Row, SceneSpec
 from bitymi_ns.measure.bench.process import BenchError
-from bitymi_ns.recognise import NotRecognised, recognise
 
 FORMATS = ("fp16", "uint8", "bc7")
 """Atlas formats of `ns-export bitymi-atlas`."""

@@ -12,8 +12,8 @@ from typing import Any, Literal, get_args
 
 Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
 
-PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif"}
-VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp"}
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP model usually lies in a capture, the most usual place first."""
 BESIDES = {"masks", "depths", "sparse", "colmap"}
@@ -223,7 +223,7 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
         return (
             f"{data} is no file that can be trained on. Give a folder of photographs, a video "
-            f"({', '.join(sorted(VIDEOS)[:4])}, ...), a transforms.json, or the folder of a capture."
+            f"({', '.join(VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
         )
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."

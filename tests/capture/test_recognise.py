@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bitymi_ns.recognise import NotRecognised, image_count, models_in, recognise
+from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, recognise
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/a.jpg", "transform_matrix": POSE}

@@ -1,0 +1,118 @@
+"""What a photograph's EXIF says of its camera, place and time, as far as it can be believed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from PIL import ExifTags, Image
+
+FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
+"""Millimetres; focal lengths "in 35 mm film" are relative to it."""
+SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)
+"""Of whole photographs; another aspect shows that something was cut off."""
+SAME_ASPECT = 0.02
+"""Relative difference up to which two aspects count as one: sizes are rounded to whole blocks of pixels."""
+FOCAL_RANGE = (0.3, 15.0)
+"""Focal lengths that can be meant, in units of the longer side."""
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What is known of one photograph beyond its pixels."""
+
+    camera: str = ""
+    """Make, model, lens and focal length; photographs with the same one and the same size share a camera."""
+    focal_length: float | None = None
+    """In pixels of the photograph; None where there is none to be believed."""
+    doubt: str = ""
+    """Why the focal length that is there is not believed."""
+    position: tuple[float, float, float] | None = None
+    """Latitude and longitude in degrees, altitude in metres."""
+    time: str = ""
+    """When it was taken, sortable; empty where it is not known."""
+
+
+def read_exif(image: Image.Image) -> Exif:
+    """Read the EXIF of an opened image whose rotation has not been applied yet; broken entries count as missing."""
+    try:
+        tags = image.getexif()
+        detail = tags.get_ifd(ExifTags.IFD.Exif)
+        gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
+    except Exception:  # Pillow raises many kinds on broken EXIF
+        return Exif()
+    millimetres = _number(detail.get(ExifTags.Base.FocalLength))
+    names = [tags.get(ExifTags.Base.Make), tags.get(ExifTags.Base.Model), detail.get(ExifTags.Base.LensModel)]
+    focal, doubt = focal_length(detail, image.size)
+    fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
+    time = str(detail.get(ExifTags.Base.DateTimeOriginal) or "").strip()
+    return Exif(
+        camera=" ".join(
+            [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
+        ),
+        focal_length=focal,
+        doubt=doubt,
+        position=_position(gps),
+        time=f"{time}.{fraction}" if time and fraction else time,
+    )
+
+
+def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
+    """The focal length in pixels, and why the one that is there is not believed.
+
+    Args:
+        detail: the Exif IFD.
+        size: width and height of the stored image in pixels.
+    """
+    long, short = max(size), min(size)
+    film = _number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    millimetres = _number(detail.get(ExifTags.Base.FocalLength))
+    density = _number(detail.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_number(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2), 25.4)
+    stated = [_number(detail.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    if not film and not (millimetres and density):
+        return None, ""
+    if all(stated):
+        there, was = long / short, max(stated) / min(stated)
+        if abs(there / was - 1) > SAME_ASPECT:
+            return None, f"cropped: {long} x {short} pixels of {max(stated):.0f} x {min(stated):.0f}"
+    elif density:
+        return None, "its pixel density belongs to an image of unknown size"
+    if min(abs(long / short / aspect - 1) for aspect in SENSOR_ASPECTS) > SAME_ASPECT:
+        return None, f"cropped: no sensor has the aspect of {long} x {short} pixels"
+    if film:
+        pixels = film / FULL_FRAME_DIAGONAL * math.hypot(long, short)
+    else:
+        pixels = millimetres * density / unit * long / max(stated)
+    if not FOCAL_RANGE[0] * long <= pixels <= FOCAL_RANGE[1] * long:
+        return None, f"{pixels:.0f} pixels cannot be meant for an image {long} pixels long"
+    return pixels, ""
+
+
+def _number(value: object) -> float | None:
+    """A positive finite number, or None."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _position(gps: Mapping[int, object]) -> tuple[float, float, float] | None:
+    """Latitude, longitude and altitude; None unless the first two are there and can be meant."""
+    try:
+        angles = []
+        for tag, reference, limit in ((2, 1, 90), (4, 3, 180)):
+            degrees, minutes, seconds = (float(part) for part in gps[tag])  # type: ignore[attr-defined]
+            angle = degrees + minutes / 60 + seconds / 3600
+            if not angle <= limit:
+                return None
+            angles.append(-angle if str(gps.get(reference, "")).strip("\0 ").upper() in ("S", "W") else angle)
+        height = float(gps.get(6, 0.0))  # type: ignore[arg-type]
+        below = gps.get(5) in (1, b"\x01")
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    if angles == [0.0, 0.0] or not math.isfinite(height):
+        return None
+    return angles[0], angles[1], -height if below else height

@@ -1,0 +1,79 @@
+"""A capture as nerfstudio reads it: photographs, transforms.json, a point cloud, and the COLMAP model beside them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from bitymi_ns.capture.types import Poses
+from bitymi_ns.files import complete_folder
+from bitymi_ns.progress import Progress
+
+CLOUD = "sparse_pc.ply"
+
+
+def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
+    """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
+
+    Photographs are copied as they are, so their cameras are distorted; nerfstudio-data undistorts them on loading.
+    There is no applied_transform: COLMAP model, cameras and points share one world with z up.
+
+    Raises:
+        OSError: it cannot be written.
+        ValueError: the folder holds something.
+    """
+
+    def check() -> None:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ValueError(f"{folder} exists already: name another folder, or remove it")
+
+    model = pycolmap.Reconstruction(poses.model)
+    names = sorted(image.name for image in model.images.values() if image.has_pose)
+    with complete_folder(folder, check) as new:
+        for i, name in enumerate(names):
+            progress("copying photographs", i, len(names))
+            target = new / "images" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(poses.images / name, target)
+        progress("copying photographs", len(names), len(names))
+        shutil.copytree(poses.model, new / "sparse" / "0")
+        model.export_PLY(new / CLOUD)
+        (new / "transforms.json").write_text(json.dumps(transforms(model), indent=2, ensure_ascii=False) + "\n", "utf8")
+        for path in poses.report.iterdir():
+            if path.is_file() and path.name != "poses.json":
+                shutil.copyfile(path, new / path.name)
+
+
+def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
+    """The content of transforms.json: camera to world with OpenGL axes (x right, y up, z backward), cameras with
+    OpenCV's distortion; what all frames share stands outside them."""
+    frames = []
+    for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
+        pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
+        pose[:3, 1:3] *= -1
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()})
+        if model.num_cameras() > 1:
+            frames[-1] |= intrinsics(image.camera)
+    shared = intrinsics(next(iter(model.cameras.values()))) if model.num_cameras() == 1 else {"camera_model": "OPENCV"}
+    return {**shared, "ply_file_path": CLOUD, "frames": frames}
+
+
+def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
+    """nerfstudio's keys of a camera, for COLMAP's models up to OPENCV."""
+    distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+    first = sum(len(part) for part in (camera.focal_length_idxs(), camera.principal_point_idxs()))
+    distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))
+    return {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal_length_x,
+        "fl_y": camera.focal_length_y,
+        "cx": camera.principal_point_x,
+        "cy": camera.principal_point_y,
+        **distortion,
+    }

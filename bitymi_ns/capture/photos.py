@@ -1,0 +1,171 @@
+"""Finding photographs, and reading what the finding of poses has to know of each."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pillow_heif
+from PIL import Image, ImageOps
+
+from bitymi_ns.capture.exif import Exif, read_exif
+from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.progress import Progress
+
+PLAIN_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+"""What COLMAP and nerfstudio read as it is."""
+THUMB = 256
+"""Longer side in pixels of the grey thumbnails by which duplicates are found."""
+SHARPNESS_SIZE = 1024
+"""Longer side in pixels at which sharpness is judged."""
+
+pillow_heif.register_heif_opener()
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photograph that can be read."""
+
+    name: str
+    """Path relative to the folder, with slashes."""
+    path: Path
+    width: int
+    """Of the upright image, as the height."""
+    height: int
+    exif: Exif
+    plain: bool
+    """Whether it can be used as it is: upright, and in a format that everything reads."""
+    thumb: np.ndarray
+    """[h,w] float32 grey levels, longer side THUMB."""
+    sharpness: float
+    """Share of the fine detail in all detail; see `sharpness`."""
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """A key that sorts numbers in names by value: frame_2 before frame_10."""
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
+
+
+def photo_folder(source: Path) -> Path:
+    """The folder that the photographs of a capture stand in: itself, or `images` in it."""
+    images = source / "images"
+    return images if images.is_dir() and not _photos_in(source) else source
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if _is_photo(path)]
+
+
+def _is_photo(path: Path) -> bool:
+    return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
+
+
+def find_photos(folder: Path) -> list[str]:
+    """Names of the photographs in a folder and its folders, in natural order; masks and hidden folders are passed over.
+
+    Raises:
+        CaptureError: the folder is missing, or cannot be read.
+    """
+    try:
+        paths = [path for path in folder.rglob("*") if _is_photo(path)]
+    except OSError as error:
+        raise CaptureError(f"{folder} cannot be read: {error.strerror}") from error
+    parts = [path.relative_to(folder).parts for path in paths]
+    seen = [p for p in parts if not any(part.startswith(".") or part in ("masks", "mask") for part in p[:-1])]
+    return sorted(("/".join(p) for p in seen), key=natural)
+
+
+def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:
+    """Read all photographs, several at a time.
+
+    Returns:
+        those that can be read, and for each of the others why not.
+    """
+    photos: list[Photo] = []
+    broken: dict[str, str] = {}
+    with ThreadPoolExecutor() as pool:
+        pending = [pool.submit(read_photo, folder, name) for name in names]
+        try:
+            for i, (name, result) in enumerate(zip(names, pending, strict=True)):
+                progress("reading photographs", i, len(names))
+                try:
+                    photos.append(result.result())
+                except CaptureError as error:
+                    broken[name] = str(error)
+        finally:
+            for result in pending:
+                result.cancel()
+    progress("reading photographs", len(names), len(names))
+    return photos, broken
+
+
+def read_photo(folder: Path, name: str) -> Photo:
+    """Read one photograph to its last byte.
+
+    Raises:
+        CaptureError: it cannot be read; the message leaves out its name.
+    """
+    path = folder / name
+    try:
+        with Image.open(path) as image:
+            exif = read_exif(image)
+            orientation = image.getexif().get(0x0112, 1)
+            transposed = orientation in (5, 6, 7, 8)
+            width, height = image.size[::-1] if transposed else image.size
+            frames = getattr(image, "n_frames", 1)
+            mode = image.mode
+            if image.format == "JPEG":
+                image.draft("L", (SHARPNESS_SIZE, SHARPNESS_SIZE))  # decodes at a half, a quarter or an eighth
+            grey = ImageOps.exif_transpose(image.convert("L") if not mode.startswith("I;16") else _from_16_bits(image))
+    except CaptureError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise CaptureError("it has too many pixels to be a photograph") from error
+    except Exception as error:  # decoders raise many kinds on broken files
+        raise CaptureError(f"it cannot be read ({_first_line(error)}): the file is damaged or not an image") from error
+    if min(width, height) < 32:
+        raise CaptureError(f"it is only {width} x {height} pixels")
+    suffix = path.suffix.lower()
+    plain = orientation in (0, 1) and suffix in PLAIN_SUFFIXES and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
+    thumb = np.asarray(_reduced(grey, THUMB), np.float32)
+    detail = np.asarray(_reduced(grey, SHARPNESS_SIZE), np.float32)
+    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail))
+
+
+def _from_16_bits(image: Image.Image) -> Image.Image:
+    return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _reduced(image: Image.Image, size: int) -> Image.Image:
+    scale = size / max(image.size)
+    if scale >= 1:
+        return image
+    return image.resize((max(1, round(image.width * scale)), max(1, round(image.height * scale))), Image.BOX)
+
+
+def sharpness(grey: np.ndarray) -> float:
+    """Root mean square of the Laplacian over that of the gradient: low where fine detail is missing, whatever is seen.
+
+    Args:
+        grey: [h,w] float32.
+    """
+    right, down = np.diff(grey, axis=1), np.diff(grey, axis=0)
+    gradient = float(np.mean(right**2) + np.mean(down**2))
+    laplacian = float(np.mean(np.diff(right, axis=1) ** 2) + np.mean(np.diff(down, axis=0) ** 2))
+    return float(np.sqrt(laplacian / gradient)) if gradient > 0 else 0.0
+
+
+def upright(photo: Photo) -> Image.Image:
+    """The photograph as an upright RGB image of 8 bits."""
+    with Image.open(photo.path) as image:
+        if image.mode.startswith("I;16"):
+            return ImageOps.exif_transpose(_from_16_bits(image)).convert("RGB")
+        return ImageOps.exif_transpose(image).convert("RGB")

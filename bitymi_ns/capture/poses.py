@@ -1,0 +1,265 @@
+"""Finding the camera poses of photographs or of a video."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import pycolmap
+
+from bitymi_ns.capture import prepare
+from bitymi_ns.capture.cache import content_key, work_folder
+from bitymi_ns.capture.frame import local_positions, settle
+from bitymi_ns.capture.photos import Photo, find_photos, photo_folder, read_photos
+from bitymi_ns.capture.recognise import VIDEOS
+from bitymi_ns.capture.report import write_report
+from bitymi_ns.capture.selection import blurred, duplicates
+from bitymi_ns.capture.sfm import process
+from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
+from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
+from bitymi_ns.capture.video import extract_frames
+from bitymi_ns.files import complete_folder, explained, write_file
+from bitymi_ns.progress import Progress, no_progress
+
+GUESSED_FOCAL = 1.2
+"""First guess of a focal length that is not known, in units of the longer side; COLMAP's own."""
+LEAST = 3
+"""Photographs without which there is nothing to find."""
+
+
+def find_poses(source: Path, options: SfmOptions | None = None, progress: Progress | None = None) -> Poses:
+    """Find the camera poses of photographs or of the frames of a video, once: the result is kept beside them, or in the
+    user's cache folder where nothing can be written there, and a run that was ended goes on where it stopped.
+
+    Args:
+        source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
+        options: how; None = the defaults.
+        progress: told the stage and how far it is.
+
+    Raises:
+        CaptureError: no poses can be found; says what to photograph differently.
+        KeyboardInterrupt: Ctrl-C; what is done is kept.
+    """
+    options = options or SfmOptions()
+    tell = progress or no_progress
+    source, folder, names = _what(Path(source))
+    masks = prepare.mask_folder(source, folder, options.masks) if folder.is_dir() else None
+    inputs = [folder / name for name in names] if names else [source]
+    if masks is not None:
+        inputs += sorted(path for path in masks.rglob("*") if path.is_file())
+    settings = {**asdict(options), "masks": str(masks), "source": str(source.resolve())}
+    with work_folder(source, content_key(inputs, settings)) as work:
+        finished = _finished(work)
+        if finished is not None:
+            return finished
+        with explained(work, CaptureError):
+            return _find(source, folder, names, masks, options, work, tell)
+
+
+def _what(source: Path) -> tuple[Path, Path, list[str]]:
+    """The source, the folder of its photographs and their names; for a video no names.
+
+    Raises:
+        CaptureError: there is nothing, or too little.
+    """
+    if source.suffix.lower() in VIDEOS and source.is_file():
+        return source, source, []
+    if not source.exists():
+        raise CaptureError(f"{source} does not exist: name a folder of photographs, or a video")
+    if not source.is_dir():
+        raise CaptureError(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)})")
+    folder = photo_folder(source)
+    names = find_photos(folder)
+    videos = sorted(p for p in source.iterdir() if p.suffix.lower() in VIDEOS and not p.name.startswith("."))
+    if not names and len(videos) == 1:
+        return videos[0], videos[0], []
+    if len(names) < LEAST:
+        also = f" Of its {len(videos)} videos, name one." if videos and not names else ""
+        raise CaptureError(f"{folder} holds {_few(len(names))}.{also}")
+    return source, folder, names
+
+
+def _few(count: int) -> str:
+    held = {0: "no photographs", 1: "one photograph"}.get(count, f"{count} photographs")
+    return (
+        f"{held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take photographs of "
+        "which each shares at least two thirds with the one before"
+    )
+
+
+def _finished(work: Path) -> Poses | None:
+    """The poses that an earlier run has found."""
+    try:
+        values = json.loads((work / "result" / "poses.json").read_text("utf8"))
+    except (OSError, ValueError):
+        return None
+    images = Path(values.pop("images"))
+    if not images.is_dir():
+        return None
+    return Poses(model=work / "result" / "sparse" / "0", images=images, report=work / "result", **values)
+
+
+def _find(
+    source: Path, folder: Path, names: list[str], masks: Path | None, options: SfmOptions, work: Path, tell: Progress
+) -> Poses:
+    begun = time.monotonic()
+    seconds: dict[str, float] = {}
+    video = not names
+    if video:
+        folder = extract_frames(source, work, options.frames, tell)
+        names = find_photos(folder)
+        seconds["taking frames"] = time.monotonic() - begun
+    given = len(names)
+    read = time.monotonic()
+    photos, left_out = read_photos(folder, names, tell)
+    twins = duplicates(photos)
+    left_out |= {name: f"the same as {twin}" for name, twin in twins.items()}
+    photos = [photo for photo in photos if photo.name not in twins]
+    seconds["reading photographs"] = time.monotonic() - read
+    if len(photos) < LEAST:
+        raise CaptureError(_too_few_left(source, folder, photos, left_out, twins, video))
+    photos = _ordered(photos)
+    started = time.monotonic()
+    images, used = prepare.upright_photos(photos, folder, work, tell)
+    job = make_job(photos, images, used, masks, options, work, sequence=video)
+    seconds["preparing"] = time.monotonic() - started
+    result = process.run(job, source, tell)
+    left_out |= result.pop("left_out")
+    notes = {name: "blurred: it has much less fine detail than the others" for name in blurred(photos)}
+    notes |= {photo.name: f"focal length in EXIF not used: {photo.exif.doubt}" for photo in photos if photo.exif.doubt}
+    seconds |= result.pop("seconds")
+    seconds["all"] = time.monotonic() - begun
+    values = {"source": str(source), "given": given, "left_out": left_out, "notes": notes, "seconds": seconds}
+    return _write(work, images, {**values, **result}, photos, job)
+
+
+def _too_few_left(
+    source: Path,
+    folder: Path,
+    photos: Sequence[Photo],
+    left_out: Mapping[str, str],
+    twins: Mapping[str, str],
+    video: bool,
+) -> str:
+    if video:
+        return (
+            f"{source} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
+            "the camera to keep it in view"
+        )
+    some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
+    more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+    if len(twins) >= len(left_out) - len(twins):
+        return (
+            f"of the photographs in {folder}, only {len(photos)} differ ({some}{more}): take photographs from "
+            "different places"
+        )
+    return f"of the photographs in {folder}, only {len(photos)} can be used ({some}{more}). Copy or export them again"
+
+
+def _ordered(photos: list[Photo]) -> list[Photo]:
+    """By the times at which they were taken, if all have one and not all the same; else by name, as they are."""
+    times = {photo.exif.time for photo in photos}
+    return sorted(photos, key=lambda photo: photo.exif.time) if "" not in times and len(times) > 1 else photos
+
+
+def make_job(
+    photos: Sequence[Photo],
+    images: Path,
+    used: Mapping[str, str],
+    masks: Path | None,
+    options: SfmOptions,
+    work: Path,
+    sequence: bool,
+) -> Job:
+    """The job for these photographs, with links to them under names that COLMAP's lists can hold.
+
+    Args:
+        photos: in their order.
+        images, used: folder of the upright photographs, and their names in it.
+        masks: folder of the masks, or None.
+        options: how the poses are found.
+        work: gets the links and the masks.
+        sequence: whether neighbours overlap, as a video's frames do.
+    """
+    links = work / "links"
+    shutil.rmtree(links, ignore_errors=True)
+    links.mkdir()
+    plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
+    for photo in photos:
+        (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
+    mask_files = prepare.colmap_masks(photos, plain, masks, work) if masks is not None else None
+    positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
+    return Job(
+        work=str(work.resolve()),
+        images=str(links.resolve()),
+        masks=None if mask_files is None else str(mask_files.resolve()),
+        cameras=[camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)],
+        order=[plain[photo.name] for photo in photos],
+        names={plain[photo.name]: used[photo.name] for photo in photos},
+        sequence=sequence,
+        positions={plain[name]: place for name, place in positions.items()},
+        matching=options.matching,
+        mapper=options.mapper,
+        opencv_if_better=options.camera_model == "auto",
+        max_image_size=options.max_image_size,
+        max_features=options.max_features,
+    )
+
+
+def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
+    """Photographs of the same size, camera and focal length, by EXIF."""
+    groups: dict[tuple[object, ...], list[Photo]] = defaultdict(list)
+    for photo in photos:
+        groups[photo.exif.camera, photo.width, photo.height].append(photo)
+    return list(groups.values())
+
+
+def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions) -> CameraGroup:
+    """The first guess of the camera that took these photographs."""
+    width, height = photos[0].width, photos[0].height
+    stated = [photo.exif.focal_length for photo in photos]
+    focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
+    model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model
+    camera = pycolmap.Camera.create_from_model_name(
+        0, model, focal or GUESSED_FOCAL * max(width, height), width, height
+    )
+    return CameraGroup(model, width, height, camera.params.tolist(), focal is not None, names)
+
+
+def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
+    """Settle the model in its world and write it with its report; what was needed on the way there goes."""
+    model = pycolmap.Reconstruction(work / MODEL)
+    by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
+    frame = settle(model, {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None})
+    values |= {"metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
+    values["cameras"] = [
+        {
+            "model": c.model_name,
+            "width": c.width,
+            "height": c.height,
+            "params": c.params.tolist(),
+            "prior": c.has_prior_focal_length,
+        }
+        for c in model.cameras.values()
+    ]
+    keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds")
+    with complete_folder(work / "result") as result:
+        sparse = result / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        model.write_binary(sparse)
+        write_file(result / "frame.json", (json.dumps(frame.values(), indent=2) + "\n").encode())
+        write_report(result, values, model)
+        kept = {"images": str(images.resolve()), **{key: values[key] for key in keys}}
+        write_file(result / "poses.json", json.dumps(kept).encode())
+    for name in ("links", "masks", MODEL):
+        shutil.rmtree(work / name, ignore_errors=True)
+    process.forget(work)
+    found = _finished(work)
+    assert found is not None
+    return found

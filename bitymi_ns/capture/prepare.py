@@ -1,0 +1,112 @@
+"""The photographs and masks in the form in which COLMAP and nerfstudio read them alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from PIL import Image
+
+from bitymi_ns.capture.photos import Photo, upright
+from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.files import complete_file, complete_folder
+from bitymi_ns.progress import Progress
+
+JPEG_QUALITY = 97
+
+
+def upright_photos(
+    photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
+) -> tuple[Path, dict[str, str]]:
+    """A folder in which every photograph stands upright in a format that everything reads.
+
+    Args:
+        photos: the photographs to be used.
+        folder: the one they stand in.
+        work: gets `images` where some have to be converted; the others are links in it.
+
+    Returns:
+        the folder, which is the given one where all are fine as they are, and per photograph its name in there.
+    """
+    if all(photo.plain for photo in photos):
+        return folder, {photo.name: photo.name for photo in photos}
+    names = {photo.name: photo.name if photo.plain else f"{photo.name}.jpg" for photo in photos}
+    target = work / "images"
+    if not target.is_dir():
+        with complete_folder(target) as new:
+            for i, photo in enumerate(photos):
+                progress("turning photographs upright", i, len(photos))
+                path = new / names[photo.name]
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if photo.plain:
+                    path.symlink_to(photo.path.resolve())
+                else:
+                    upright(photo).save(path, quality=JPEG_QUALITY, subsampling=0)
+            progress("turning photographs upright", len(photos), len(photos))
+    return target, names
+
+
+def mask_folder(source: Path, photo_folder: Path, given: Path | None) -> Path | None:
+    """The folder of masks that belongs to a capture.
+
+    Raises:
+        CaptureError: the one that was given is not there.
+    """
+    if given is not None:
+        if not given.is_dir():
+            raise CaptureError(f"{given} is not a folder: name the folder of the masks")
+        return given
+    beside = [source / "masks", photo_folder.parent / "masks"] if photo_folder.name == "images" else [source / "masks"]
+    return next((path for path in beside if path.is_dir()), None)
+
+
+def mask_of(masks: Path, name: str) -> Path | None:
+    """The mask of a photograph: NAME.png after the whole name, as COLMAP has it, or the same name with any suffix of an
+    image, as nerfstudio has it."""
+    stem = str(PurePosixPath(name).with_suffix(""))
+    candidates = [f"{name}.png", *(stem + suffix for suffix in (".png", *PHOTOGRAPHS))]
+    return next((masks / c for c in candidates if (masks / c).is_file()), None)
+
+
+def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, work: Path) -> Path:
+    """Write the masks as COLMAP reads them, grey PNGs of the size of the upright photographs, and return their folder.
+
+    A photograph without a mask is used as a whole.
+
+    Args:
+        photos: the photographs.
+        names: what COLMAP calls each.
+        masks: folder of the masks.
+        work: gets the folder.
+
+    Raises:
+        CaptureError: a mask cannot be read, or has another aspect than its photograph, or there is none at all.
+    """
+    target = work / "masks"
+    found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
+    if not found:
+        raise CaptureError(
+            f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for photo.jpg"
+        )
+    target.mkdir(exist_ok=True)
+    for photo, path in found:
+        with complete_file(target / f"{names[photo.name]}.png") as file:
+            _read_mask(path, photo).save(file, "PNG")
+    return target
+
+
+def _read_mask(path: Path, photo: Photo) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            mask = image.convert("L")
+    except Exception as error:
+        raise CaptureError(f"the mask {path} cannot be read: save it anew, or remove it") from error
+    size = (photo.width, photo.height)
+    if abs(mask.width / mask.height / (photo.width / photo.height) - 1) > 0.02:
+        raise CaptureError(
+            f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {photo.name} stands upright with "
+            f"{photo.width} x {photo.height}: save it in the same proportions"
+        )
+    # COLMAP keeps whatever is above 0, so the soft edge of a mask is cut in its middle.
+    return mask.resize(size, Image.NEAREST).point(lambda value: 255 if value > 127 else 0)

@@ -1,0 +1,113 @@
+"""The report of a capture: what was placed, what was left out and why, and a picture of cameras and points."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from bitymi_ns.files import write_file
+
+MOST_POINTS = 20_000
+"""Points drawn; more are a blot."""
+
+
+def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
+    """Write report.json, report.md and cameras.png.
+
+    Args:
+        folder: an existing folder.
+        values: see `poses._values`.
+        model: cameras and points, z up.
+    """
+    write_file(folder / "report.json", (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())
+    write_file(folder / "report.md", _page(values).encode())
+    _draw(folder / "cameras.png", model, values.get("metres_per_unit") is not None)
+
+
+def _page(values: Mapping[str, object]) -> str:
+    lines = [
+        "# Camera poses",
+        "",
+        f"Source: {values['source']}",
+        "",
+        "| | |",
+        "|---|---|",
+        f"| photographs with a pose | {values['registered']} of {values['given']} |",
+        f"| mean reprojection error | {values['reprojection_error']:.3f} pixels |",
+        f"| mean track length | {values['track_length']:.2f} photographs per point |",
+        f"| points | {values['points']} |",
+        f"| median parallax | {values['parallax_degrees']:.1f} degrees |",
+        f"| up, scale | {_frame_text(values)} |",
+        "",
+        "![cameras and points, from above and from the side](cameras.png)",
+        "",
+    ]
+    for title, entries in (("Left out", values["left_out"]), ("Notes", values["notes"])):
+        if entries:
+            lines += [
+                f"## {title}",
+                "",
+                "| photograph | why |" if title == "Left out" else "| photograph | |",
+                "|---|---|",
+            ]
+            lines += [f"| {_cell(name)} | {_cell(why)} |" for name, why in entries.items()] + [""]
+    lines += ["## Cameras", "", "| model | parameters | focal length known from EXIF |", "|---|---|---|"]
+    lines += [
+        f"| {c['model']} | {', '.join(f'{p:.5g}' for p in c['params'])} | {c['prior']} |" for c in values["cameras"]
+    ]
+    lines += ["", "## Seconds", "", "| stage | seconds |", "|---|---|"]
+    lines += [f"| {stage} | {seconds:.1f} |" for stage, seconds in values["seconds"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: object) -> str:
+    return str(text).replace("|", "\\|").replace("\n", " ")
+
+
+def _frame_text(values: Mapping[str, object]) -> str:
+    if values["metres_per_unit"] is None:
+        return "up by the cameras, scale not known"
+    return f"by GPS (median error {values['gps_error']:.1f} m): z up, metres"
+
+
+def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:
+    """Draw cameras and points from above (x, y) and from the side (x, z)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    colours = np.array([point.color for point in model.points3D.values()], float).reshape(-1, 3) / 255
+    placed = [image for image in model.images.values() if image.has_pose]
+    centers = np.array([image.projection_center() for image in placed])
+    views = np.array([image.viewing_direction() for image in placed])
+    if len(points) > MOST_POINTS:
+        some = np.random.default_rng(0).choice(len(points), MOST_POINTS, replace=False)
+        points, colours = points[some], colours[some]
+    middle, reach = np.median(np.vstack([points, centers]), axis=0), _reach(points, centers)
+    figure = Figure(figsize=(12, 6), dpi=100)
+    FigureCanvasAgg(figure)
+    for place, (up, title) in enumerate(((1, "from above"), (2, "from the side"))):
+        axes = figure.add_subplot(1, 2, place + 1)
+        axes.scatter(points[:, 0], points[:, up], s=1, c=colours, linewidths=0)
+        axes.quiver(centers[:, 0], centers[:, up], views[:, 0], views[:, up], color="crimson", angles="xy", width=0.002)
+        axes.scatter(centers[:, 0], centers[:, up], s=8, c="crimson")
+        axes.set(aspect="equal", title=title, xlim=(middle[0] - reach, middle[0] + reach))
+        axes.set(ylim=(middle[up] - reach, middle[up] + reach), xlabel="x (m)" if metres else "x", ylabel="yz"[up - 1])
+    figure.tight_layout()
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    write_file(path, data.getvalue())
+
+
+def _reach(points: np.ndarray, centers: np.ndarray) -> float:
+    """Half the side of a square that holds the cameras and nine of ten points."""
+    middle = np.median(np.vstack([points, centers]), axis=0)
+    far = [np.abs(centers - middle).max()] + (
+        [np.quantile(np.abs(points - middle).max(axis=1), 0.9)] if len(points) else []
+    )
+    return 1.1 * float(max(far)) or 1.0

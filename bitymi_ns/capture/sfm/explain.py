@@ -1,0 +1,184 @@
+"""Why photographs have no pose, and what to photograph differently."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from bitymi_ns.capture.sfm.job import Job, NoPoses
+
+FEW_FEATURES = 60
+"""A photograph with fewer features shows hardly any detail."""
+PARALLAX = 1.0
+"""Degrees; if the rays to the points differ by less, the photographs were taken from one spot."""
+ROTATED = 2.0
+"""Pixels of the features' images within which a turn alone explains a match."""
+MOST = 0.9
+"""Share of a pair's matches, and of the pairs, that a turn alone has to explain. Fewer are a far background, or
+neighbours that are almost at one place."""
+PAIRS_TRIED = 60
+GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
+"""Focal lengths, in units of the longer side, that are tried where it is not known."""
+
+SHOOT = (
+    "Walk round the scene and photograph it from many places, each photograph sharing at least two thirds of what it "
+    "shows with the one before"
+)
+
+
+@dataclass(frozen=True)
+class ViewGraph:
+    """Which photographs were found to show the same."""
+
+    features: dict[str, int]
+    """Per photograph."""
+    inliers: dict[tuple[str, str], int]
+    """Matches per pair that fit a common geometry; pairs without are missing."""
+
+    def components(self) -> list[set[str]]:
+        """Sets of photographs that hang together, the largest first; those alone are not among them."""
+        beside = defaultdict(set)
+        for first, second in self.inliers:
+            beside[first].add(second)
+            beside[second].add(first)
+        left = set(beside)
+        found = []
+        while left:
+            part, edge = set(), {next(iter(left))}
+            while edge:
+                part |= edge
+                edge = {other for name in edge for other in beside[name]} - part
+            left -= part
+            found.append(part)
+        return sorted(found, key=len, reverse=True)
+
+
+def view_graph(database: Path) -> ViewGraph:
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {name: opened.num_keypoints_for_image(i) for i, name in names.items()}
+        pairs, counts = opened.read_two_view_geometry_num_inliers()
+    inliers = {}
+    for pair, count in zip(pairs, counts, strict=True):
+        if count > 0:
+            first, second = pycolmap.pair_id_to_image_pair(pair)
+            inliers[names[first], names[second]] = int(count)
+    return ViewGraph(features, inliers)
+
+
+def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[str, str]:
+    """Why the photographs that were not placed were not, by name.
+
+    Args:
+        graph: of all photographs.
+        placed: those that have a pose.
+        title: what each is called for people.
+    """
+    best: Counter[str] = Counter()
+    with_placed: Counter[str] = Counter()
+    for (first, second), count in graph.inliers.items():
+        for name, other in ((first, second), (second, first)):
+            best[name] = max(best[name], count)
+            if other in placed:
+                with_placed[name] = max(with_placed[name], count)
+    reasons = {}
+    for name, count in graph.features.items():
+        if name in placed:
+            continue
+        if count < FEW_FEATURES:
+            why = f"hardly any detail in it: {count} features (blurred, dark, or a bare surface)"
+        elif not best[name]:
+            why = "no other photograph shows the same: take some between it and the others"
+        elif not with_placed[name]:
+            why = "it overlaps only with photographs that were left out as well: take some between them and the others"
+        else:
+            why = f"too little in common with the others: {with_placed[name]} matches with the most similar one"
+        reasons[title[name]] = why
+    return reasons
+
+
+def why_none(job: Job, graph: ViewGraph) -> NoPoses:
+    """Why there is no model at all."""
+    count = len(job.order)
+    bare = sum(features < FEW_FEATURES for features in graph.features.values())
+    if bare > count / 2:
+        return NoPoses(
+            f"{bare} of {count} photographs show hardly any detail (fewer than {FEW_FEATURES} features): they are "
+            "blurred, dark, or show bare surfaces. Use more light, hold still, and take in surroundings with texture"
+        )
+    parts = graph.components()
+    if not parts or len(parts[0]) < max(3, 0.2 * count):
+        together = f"at most {len(parts[0])} of {count} hang together" if parts else "no two of them show the same"
+        return NoPoses(f"the photographs do not overlap: {together}. {SHOOT}")
+    return NoPoses(
+        f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have "
+        f"moved between them, or the camera hardly did. {SHOOT}"
+    )
+
+
+def from_one_spot() -> NoPoses:
+    return NoPoses(
+        "the photographs were taken from one spot: the camera only turned, which tells nothing of depth. Step sideways "
+        f"between photographs, as if the scene were on a turntable. {SHOOT}"
+    )
+
+
+def parallax(model: pycolmap.Reconstruction) -> float:
+    """Median over the points of the widest angle between two rays to them, in degrees."""
+    centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
+    ids = list(model.point3D_ids())
+    angles = []
+    for point_id in ids[:: max(1, len(ids) // 1000)]:
+        point = model.point3D(point_id)
+        rays = np.array([point.xyz - centers[e.image_id] for e in point.track.elements])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def only_turned(job: Job, database: Path) -> bool:
+    """Whether a turn of the camera alone explains most pairs: the matches fit K R K^-1 for some focal length."""
+    groups = {name: group for group in job.cameras for name in group.names}
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image for image in opened.read_all_images()}
+        points = {i: opened.read_keypoints(i)[:, :2] for i in images}
+        pairs, geometries = opened.read_two_view_geometries()
+    counted = sorted(zip(pairs, geometries, strict=True), key=lambda item: -len(item[1].inlier_matches))
+    counted = [item for item in counted if len(item[1].inlier_matches) >= 15]
+    tried = counted[:: max(1, len(counted) // PAIRS_TRIED)]  # wide pairs too: neighbours alone show little parallax
+    turned = 0
+    for pair, geometry in tried:
+        matches = np.asarray(geometry.inlier_matches)
+        first, second = pycolmap.pair_id_to_image_pair(pair)
+        group = groups[images[first].name]
+        long = max(group.width, group.height)
+        center = np.array([group.width, group.height]) / 2
+        rays = (points[first][matches[:, 0]] - center, points[second][matches[:, 1]] - center)
+        limit = ROTATED * max(1.0, long / job.max_image_size)
+        focals = [group.params[0]] if group.prior else [long * f for f in GUESSES]
+        turned += any(np.mean(_turn_errors(*rays, focal) < limit) > MOST for focal in focals)
+    return len(tried) > 0 and turned > MOST * len(tried)
+
+
+def _turn_errors(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
+    """Distances [n] in pixels between points and those that the best turn takes to them.
+
+    Args:
+        first, second: [n,2] pixels from the principal point.
+        focal: pixels.
+    """
+    a = np.column_stack([first / focal, np.ones(len(first))])
+    b = np.column_stack([second / focal, np.ones(len(second))])
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    keep = np.ones(len(a), bool)
+    for _ in range(3):  # least squares, then without the worst half, in which the wrong matches are
+        u, _, vt = np.linalg.svd(b[keep].T @ a[keep])
+        turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        distances = np.linalg.norm(a @ turn.T - b, axis=1) * focal
+        keep = distances <= np.median(distances)
+    return distances

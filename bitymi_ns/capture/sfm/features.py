@@ -1,0 +1,61 @@
+"""SIFT features of all photographs, in COLMAP's database."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pycolmap
+
+from bitymi_ns.capture.sfm.job import CameraGroup, Job, Tell
+
+SMALL = 1000
+"""Photographs whose longer side has fewer pixels are doubled before features are found; larger ones have enough."""
+
+
+def extract(job: Job, database: Path, tell: Tell) -> None:
+    """Find the features of the photographs that have none yet."""
+    total = len(job.order)
+    tell("finding features", 0, total, counts="keypoints")
+    for group, camera_id in zip(job.cameras, camera_ids(job, database), strict=True):
+        pycolmap.extract_features(
+            database,
+            job.images,
+            image_names=group.names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=_reader(job, group, camera_id),
+            extraction_options=_extraction(job, group),
+            device=pycolmap.Device.cpu,
+        )
+    tell("finding features", total, total)
+
+
+def camera_ids(job: Job, database: Path) -> list[int]:
+    """The groups' cameras in the database, written there by the first run."""
+    with pycolmap.Database.open(database) as opened:
+        if opened.num_cameras() == 0:
+            for group in job.cameras:
+                opened.write_camera(camera_of(group))
+        return [camera.camera_id for camera in opened.read_all_cameras()]
+
+
+def camera_of(group: CameraGroup) -> pycolmap.Camera:
+    camera = pycolmap.Camera(model=group.model, width=group.width, height=group.height, params=group.params)
+    camera.has_prior_focal_length = group.prior
+    return camera
+
+
+def _reader(job: Job, group: CameraGroup, camera_id: int) -> pycolmap.ImageReaderOptions:
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = group.model
+    options.existing_camera_id = camera_id
+    if job.masks is not None:
+        options.mask_path = job.masks
+    return options
+
+
+def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptions:
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = job.max_image_size
+    options.sift.max_num_features = job.max_features
+    options.sift.first_octave = -1 if min(max(group.width, group.height), job.max_image_size) < SMALL else 0
+    return options

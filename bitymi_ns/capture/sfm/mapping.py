@@ -1,0 +1,116 @@
+"""Camera poses from compared photographs: all at once first, one after the other where that falls short."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+from bitymi_ns.capture.sfm.job import Job, Tell
+from bitymi_ns.capture.sfm.refine import refined
+
+ENOUGH = 0.9
+"""The global mapper's poses are taken as they are if they are of this share of the photographs that hang together."""
+GOOD_ERROR = 1.0
+"""... and their reprojection error is below so many pixels of the photographs as features were found on them."""
+
+
+def reconstruct(job: Job, database: Path, connected: int, tell: Tell) -> pycolmap.Reconstruction | None:
+    """The best model of the photographs, or None where there is none.
+
+    Args:
+        job: what is to be done.
+        database: features and verified matches.
+        connected: size of the largest set of photographs that hang together by verified pairs.
+        tell: told the stage.
+    """
+    found = None
+    if job.mapper in ("auto", "global"):
+        found = _best(
+            _in_folder(job, "global", lambda folder: _global(job, database, folder, tell)), job, database, tell
+        )
+        if job.mapper == "global" or (found is not None and _satisfies(found, job, connected)):
+            return found
+    other = _best(
+        _in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell
+    )
+    return better(found, other)
+
+
+def better(*models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
+    """The model with most cameras, of equals that with the smallest error; None if there is none."""
+    found = [model for model in models if model is not None]
+    return max(found, key=lambda m: (m.num_reg_images(), -m.compute_mean_reprojection_error()), default=None)
+
+
+def pixel(job: Job) -> float:
+    """Side of a pixel of the images on which features were found, in pixels of the photographs."""
+    return max(1.0, max(max(group.width, group.height) for group in job.cameras) / job.max_image_size)
+
+
+def _satisfies(model: pycolmap.Reconstruction, job: Job, connected: int) -> bool:
+    error = model.compute_mean_reprojection_error()
+    return model.num_reg_images() >= ENOUGH * connected and error <= GOOD_ERROR * pixel(job)
+
+
+def _in_folder(
+    job: Job, name: str, make: Callable[[Path], dict[int, pycolmap.Reconstruction]]
+) -> dict[int, pycolmap.Reconstruction]:
+    folder = Path(job.work) / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        return make(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _best(
+    models: dict[int, pycolmap.Reconstruction], job: Job, database: Path, tell: Tell
+) -> pycolmap.Reconstruction | None:
+    """The largest component, refined."""
+    largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    if largest is None or largest.num_points3D() == 0:
+        return None
+    tell("refining cameras and points", 0, 1)
+    model = refined(largest, job, pixel(job))
+    tell("refining cameras and points", 1, 1)
+    return model
+
+
+def _global(job: Job, database: Path, folder: Path, tell: Tell) -> dict[int, pycolmap.Reconstruction]:
+    stage = "placing all cameras at once"
+    tell(stage, 0, 1)
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = 0
+    copy = folder / "database.db"  # its focal lengths are changed, which the other mapper starts from
+    shutil.copyfile(database, copy)
+    calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and finds out wrong ones from EXIF
+    calibration.random_seed = 0
+    pycolmap.calibrate_view_graph(copy, calibration)
+    models = pycolmap.global_mapping(copy, job.images, folder, options)
+    tell(stage, 1, 1)
+    return models
+
+
+def _incremental(job: Job, database: Path, folder: Path, tell: Tell) -> dict[int, pycolmap.Reconstruction]:
+    stage = "placing one camera after the other"
+    placed = 0
+    total = len(job.order)
+
+    def one_more() -> None:
+        nonlocal placed
+        placed += 1
+        tell(stage, min(placed, total), total)
+
+    tell(stage, 0, total)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    options.min_model_size = min(10, max(3, total // 2))
+    models = pycolmap.incremental_mapping(
+        database, job.images, folder, options, next_image_callback=one_more, initial_image_pair_callback=one_more
+    )
+    tell(stage, total, total)
+    return models

@@ -1,0 +1,137 @@
+"""Which photographs are compared, and comparing them."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from bitymi_ns.capture.sfm.job import PAIRS, Job, Tell
+from bitymi_ns.files import write_file
+
+FEW = 30
+"""Up to so many photographs are all compared with all."""
+WORTH_ALL = 150
+"""Up to so many are compared with all where too few get a pose without."""
+NEIGHBOURS = 20
+"""Photographs that each is compared with, by how alike they look, or by GPS."""
+COARSE_FEATURES = (256, 128)
+"""Features per photograph that decide how alike two look: the largest, because they are seen from afar and close by.
+The second number is for more than MANY photographs."""
+MANY = 400
+COARSE_COSINE = 0.85
+"""Two features are alike if the cosine between their descriptors is above this, and each is the other's nearest."""
+SEQUENCE_NEIGHBOURS = 6
+SEQUENCE_SHARE = 0.8
+"""Photographs are a sequence if so many neighbours in their order are among the most alike."""
+
+
+def match(job: Job, database: Path, tell: Tell) -> None:
+    """Choose pairs, and compare those that have not been compared yet."""
+    listed = Path(job.work) / PAIRS
+    if not listed.exists():
+        names = job.order
+        pairs = choose(job, database, tell)
+        write_file(listed, "".join(f"{names[i]} {names[j]}\n" for i, j in pairs).encode())
+    compare(listed, database, tell)
+
+
+def match_rest(job: Job, database: Path, tell: Tell) -> None:
+    """Compare all with all."""
+    listed = Path(job.work) / PAIRS
+    write_file(listed, "".join(f"{first} {second}\n" for first, second in combinations(job.order, 2)).encode())
+    compare(listed, database, tell)
+
+
+def compare(listed: Path, database: Path, tell: Tell) -> None:
+    """Compare the pairs of a list; those in the database are passed over."""
+    options = pycolmap.ImportedPairingOptions()
+    options.match_list_path = listed
+    total = len(listed.read_text("utf8").splitlines())
+    tell("comparing photographs", 0, total, counts="two_view_geometries")
+    pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+    tell("comparing photographs", total, total)
+
+
+def choose(job: Job, database: Path, tell: Tell) -> list[tuple[int, int]]:
+    """Pairs of indices into `job.order`, the first index the smaller one."""
+    count = len(job.order)
+    if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
+        return list(combinations(range(count), 2))
+    alike = likeness(job, database, tell)
+    pairs = nearest(alike, NEIGHBOURS)
+    if job.sequence or job.matching == "sequential" or is_sequence(alike):
+        pairs |= sequence(count)
+    placed = [i for i, name in enumerate(job.order) if name in job.positions]
+    if len(placed) > NEIGHBOURS:
+        places = np.array([job.positions[job.order[i]] for i in placed])
+        close = -np.linalg.norm(places[:, None] - places[None], axis=-1)
+        pairs |= {(placed[i], placed[j]) for i, j in nearest(close - close.min() + 1.0, NEIGHBOURS)}
+    return sorted(pairs)
+
+
+def likeness(job: Job, database: Path, tell: Tell) -> np.ndarray:
+    """How many of their largest features two photographs share.
+
+    Returns:
+        [n,n] counts; 0 on the diagonal.
+    """
+    count = len(job.order)
+    size = COARSE_FEATURES[count > MANY]
+    descriptors = np.zeros((count, size, 128), np.float32)
+    with pycolmap.Database.open(database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        for i, name in enumerate(job.order):
+            points = opened.read_keypoints(ids[name])
+            if len(points) == 0:
+                continue
+            scale = np.linalg.norm(points[:, 2:4], axis=1)
+            largest = np.argsort(-scale, kind="stable")[:size]
+            values = opened.read_descriptors(ids[name]).data[largest].astype(np.float32)
+            descriptors[i, : len(largest)] = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
+    alike = np.zeros((count, count), np.float32)
+    step = max(1, 2**25 // size**2)
+    for i in range(count - 1):
+        tell("looking for overlap", i, count)
+        for first in range(i + 1, count, step):
+            others = descriptors[first : first + step]
+            cosine = (descriptors[i] @ others.reshape(-1, 128).T).reshape(size, len(others), size)
+            there = cosine.argmax(axis=2)  # [size, others]
+            back = cosine.argmax(axis=0)  # [others, size]
+            best = np.take_along_axis(cosine, there[..., None], axis=2)[..., 0]
+            mutual = np.take_along_axis(back, there.T, axis=1).T == np.arange(size)[:, None]
+            alike[i, first : first + step] = (mutual & (best > COARSE_COSINE)).sum(axis=0)
+    tell("looking for overlap", count, count)
+    return alike + alike.T
+
+
+def nearest(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
+    """For each photograph those most alike, and a tree of the best pairs, so that no part stands alone.
+
+    Args:
+        alike: [n,n] symmetric, 0 or more; 0 = nothing shared.
+    """
+    pairs = set()
+    for i, row in enumerate(alike):
+        best = np.argsort(-row, kind="stable")[:neighbours]
+        pairs |= {(min(i, j), max(i, j)) for j in best.tolist() if j != i and row[j] > 0}
+    most = float(alike.max()) + 1.0
+    tree = minimum_spanning_tree(csr_matrix(np.triu(most - alike, 1)))
+    return pairs | {(min(i, j), max(i, j)) for i, j in np.argwhere(tree.toarray() > 0).tolist()}
+
+
+def sequence(count: int) -> set[tuple[int, int]]:
+    """Each photograph with those that follow it, and with some farther ones at distances of powers of two."""
+    steps = sorted({*range(1, SEQUENCE_NEIGHBOURS + 1), 8, 16})
+    return {(i, i + step) for i in range(count) for step in steps if i + step < count}
+
+
+def is_sequence(alike: np.ndarray) -> bool:
+    """Whether neighbours in the order look as alike as any."""
+    count = len(alike)
+    rank = [(alike[i] > alike[i, i + 1]).sum() for i in range(count - 1) if alike[i, i + 1] > 0]
+    return sum(r < NEIGHBOURS / 2 for r in rank) >= SEQUENCE_SHARE * (count - 1)

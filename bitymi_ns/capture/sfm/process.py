@@ -1,0 +1,145 @@
+"""COLMAP in a process of its own: Ctrl-C ends it at once, and where it aborts, which its library does, only it does."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.files import size_text
+from bitymi_ns.progress import Progress
+
+LOG = "colmap.log"
+LITTLE_SPACE = 50_000_000
+"""Bytes; where less is left, the disk is what stopped COLMAP."""
+
+
+def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
+    """Run a job to its end.
+
+    Args:
+        job: what is to be done.
+        source: the photographs or the video, for messages.
+        progress: told the stage and how far it is.
+
+    Returns:
+        what the worker found.
+
+    Raises:
+        CaptureError: there are no poses, or COLMAP ended otherwise.
+    """
+    work = Path(job.work)
+    watch = _Watch(work / DATABASE, progress)
+    with open(work / LOG, "wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "bitymi_ns.capture.sfm.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            encoding="utf8",
+            start_new_session=True,  # Ctrl-C comes to us, and we end it
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+        try:
+            assert process.stdin is not None and process.stdout is not None
+            process.stdin.write(job.text() + "\n")
+            process.stdin.flush()
+            for text in process.stdout:
+                line = json.loads(text)
+                if "failure" in line:
+                    raise CaptureError(f"no camera poses can be found in {source}: {line['failure']}")
+                if "result" in line:
+                    return line["result"]
+                watch.end()
+                progress(line["stage"], line["done"], line["total"])
+                if line["counts"]:
+                    watch.begin(line["counts"], line["stage"], line["total"])
+        except BrokenPipeError:
+            pass
+        finally:
+            watch.end()
+            process.kill()
+            process.wait()
+    raise CaptureError(_why_ended(work, source, process.returncode))
+
+
+class _Watch:
+    """Tells how many rows a table of COLMAP's database has while COLMAP fills it.
+
+    From this process, because two copies of SQLite in one, COLMAP's and Python's, undo each other's locks on a file.
+    """
+
+    def __init__(self, database: Path, progress: Progress) -> None:
+        self._database, self._progress = database, progress
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, table: str, stage: str, total: int) -> None:
+        self._ended.clear()
+        self._thread = threading.Thread(target=self._run, args=(table, stage, total), daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        if self._thread is not None:
+            self._ended.set()
+            self._thread.join()
+            self._thread = None
+
+    def _run(self, table: str, stage: str, total: int) -> None:
+        while not self._ended.wait(0.5):
+            self._progress(stage, min(rows(self._database, table), total), total)
+
+
+def rows(database: Path, table: str) -> int:
+    """How many rows a table of a database has; 0 while it cannot be read. Not for a process that has opened it by
+    COLMAP."""
+    try:
+        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
+        try:
+            return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+        finally:
+            connection.close()
+    except sqlite3.Error:
+        return 0
+
+
+def forget(work: Path) -> None:
+    """Remove what features and matches are kept in."""
+    for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", PAIRS):
+        with suppress(OSError):
+            (work / name).unlink()
+
+
+def _why_ended(work: Path, source: Path, code: int) -> str:
+    log = (work / LOG).read_text("utf8", errors="replace")
+    said = [line for line in log.splitlines() if line.strip() and not re.match(r"\*\*\* |PC: @| +@ ", line)]
+    last = said[-1].split("] ", 1)[-1].strip() if said else ""
+    free = shutil.disk_usage(work).free
+    full = any(
+        word in log
+        for word in ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
+    )
+    if full or free < LITTLE_SPACE:
+        return (
+            f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). Free some "
+            "space, and start again: what is done is kept"
+        )
+    if "database disk image is malformed" in log:
+        forget(work)
+        return f"what was kept of an earlier run in {work} was damaged and has been removed: start again"
+    if code in (-9, 137):
+        return (
+            f"the finding of poses of {source} was killed: the machine may have run out of memory. Start it again, it "
+            "goes on where it stopped; a smaller max_image_size needs less"
+        )
+    return f"COLMAP failed on {source}: {last or f'it ended with status {code}'}. All it said is in {work / LOG}"

@@ -1,0 +1,123 @@
+"""The process that runs COLMAP: `python -m bitymi_ns.capture.sfm.worker`, a Job on stdin, lines of JSON on stdout.
+
+A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends when its stdin
+does, so that nothing goes on after whoever started it was killed. What COLMAP has to say goes to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from bitymi_ns.capture.sfm import explain, features, mapping, pairs, triangulation
+from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
+from bitymi_ns.files import complete_folder
+
+LEAST = 3
+"""Fewer placed photographs are no capture."""
+
+
+class Stages:
+    """Sends progress, and measures the seconds of every stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._since = time.monotonic()
+        self._stage = "starting"
+        self._lock = threading.Lock()
+
+    def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None:
+        with self._lock:
+            now = time.monotonic()
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+            self._stage, self._since = stage, now
+            send(stage=stage, done=done, total=total, counts=counts)
+
+
+def send(**line: object) -> None:
+    print(json.dumps(line), file=sys.__stdout__, flush=True)
+
+
+def find(job: Job, stages: Stages) -> dict[str, object]:
+    """Find the poses of a job's photographs, and write the model.
+
+    Raises:
+        NoPoses: there are none.
+    """
+    database = Path(job.work) / DATABASE
+    features.extract(job, database, stages)
+    pairs.match(job, database, stages)
+    graph, model = _mapped(job, database, stages)
+    registered = model.num_reg_images() if model is not None else 0
+    chosen = pairs.FEW < len(job.order) <= pairs.WORTH_ALL and job.matching == "auto"
+    if chosen and registered < mapping.ENOUGH * len(job.order):
+        pairs.match_rest(job, database, stages)
+        graph, again = _mapped(job, database, stages)
+        model = mapping.better(model, again)
+    if model is None or model.num_reg_images() < LEAST:
+        raise explain.why_none(job, graph)
+    angle = explain.parallax(model)
+    if angle < explain.PARALLAX:
+        raise explain.from_one_spot()
+    placed = {image.name for image in model.images.values() if image.has_pose}
+    model.extract_colors_for_all_images(job.images)
+    return {
+        "registered": len(placed),
+        "reprojection_error": model.compute_mean_reprojection_error(),
+        "track_length": model.compute_mean_track_length(),
+        "points": model.num_points3D(),
+        "parallax_degrees": angle,
+        "pairs": len(graph.inliers),
+        "left_out": explain.left_out(graph, placed, job.names),
+        **write(model, job),
+    }
+
+
+def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph, pycolmap.Reconstruction | None]:
+    graph = explain.view_graph(database)
+    parts = graph.components()
+    if explain.only_turned(job, database):
+        raise explain.from_one_spot()
+    if not parts or len(parts[0]) < LEAST:
+        return graph, None
+    return graph, mapping.reconstruct(job, database, len(parts[0]), stages)
+
+
+def write(model: pycolmap.Reconstruction, job: Job) -> dict[str, object]:
+    """Write a model under the names that people gave the photographs; those without a pose are left out of it."""
+    for image in model.images.values():
+        image.name = job.names[image.name]
+    with complete_folder(Path(job.work) / MODEL) as folder:
+        model.write_binary(folder)
+    return {"cameras": {str(i): [c.model_name, *c.params.tolist()] for i, c in model.cameras.items()}}
+
+
+def main() -> None:
+    """Run one job."""
+    job = Job.parse(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    pycolmap.logging.minloglevel = 1  # warnings and errors
+    np.seterr(all="ignore")
+    stages = Stages()
+    try:
+        result = triangulation.triangulate(job, stages) if job.poses else find(job, stages)
+        stages("writing", 1, 1)
+        send(result={**result, "seconds": {k: v for k, v in stages.seconds.items() if k != "starting"}})
+    except NoPoses as failure:
+        send(failure=str(failure))
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

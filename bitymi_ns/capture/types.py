@@ -1,0 +1,68 @@
+"""What the finding of poses takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+class CaptureError(ValueError):
+    """Photographs or a video of which no poses can be found: what is wrong, in which file, and what to do."""
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How poses are found. All of it decides the result, and so is part of the key under which that is kept."""
+
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Which photographs are compared: all with all, each with those that come after it and with what looks alike, or
+    what suits their number, order and GPS positions."""
+    mapper: Literal["auto", "global", "incremental"] = "auto"
+    """All cameras at once, one after the other, or the first and, where it falls short, the second."""
+    camera_model: Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = "auto"
+    """Camera model of COLMAP; auto = SIMPLE_RADIAL, and OPENCV where that lowers the reprojection error."""
+    focal_length: float | None = None
+    """Focal length of all photographs in their pixels, where it is known; None = from EXIF or the photographs."""
+    max_image_size: int = 1600
+    """Features are found on photographs reduced to this many pixels along their longer side. Cameras stay in pixels of
+    the photographs."""
+    max_features: int = 8192
+    """Most features per photograph."""
+    masks: Path | None = None
+    """Folder of masks; features are found where they are not black. None = the folder `masks` beside the photographs,
+    if there is one."""
+    frames: int | None = None
+    """Number of frames to take of a video; None = by how much the camera moves."""
+
+    def __post_init__(self) -> None:
+        least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}
+        for name, limit in least.items():
+            value = getattr(self, name)
+            if value is not None and not limit <= value < 1e6:
+                raise CaptureError(f"{name} is {value}: give a number of at least {limit}")
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Camera poses of a capture."""
+
+    model: Path
+    """Folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in full-size pixels of `images`; cameras may be
+    distorted. Its world is that of `report`'s frame.json: up and metres, as far as they are known."""
+    images: Path
+    """Folder that the model's image names are relative to: that of the photographs, or of upright copies, or frames."""
+    report: Path
+    """Folder with report.json, report.md, cameras.png and frame.json."""
+    left_out: dict[str, str]
+    """Photographs that have no pose, by name, and why."""
+    registered: int
+    """Number of photographs that have a pose."""
+    given: int
+    """Number of photographs, or of frames taken of a video."""
+    reprojection_error: float
+    """Mean over all observations, in pixels of the photographs."""
+    track_length: float
+    """Mean number of photographs that see a point."""
+    seconds: dict[str, float]
+    """Wall time per stage of the run that found the poses."""

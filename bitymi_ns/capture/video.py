@@ -1,0 +1,188 @@
+"""Frames of a video: as many as the camera's motion asks for, the sharpest of each stretch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from PIL import Image
+
+from bitymi_ns.capture.photos import sharpness
+from bitymi_ns.capture.prepare import JPEG_QUALITY
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.files import complete_folder
+from bitymi_ns.progress import Progress
+
+SMALL = 160
+"""Longer side in pixels of the frames by which motion is measured."""
+FINE = 640
+"""... and sharpness."""
+STRIDE = 0.08
+"""Motion between neighbouring frames that are taken, in units of the longer side: they share about nine tenths."""
+FEWEST, MOST = 20, 300
+"""Frames that are taken of a video whose camera moves at all."""
+STILL = 0.02
+"""Motion over the whole video, in units of the longer side, below which the camera stood still."""
+PER_SECOND = 15
+"""Frames looked at per second; of faster videos every second or third."""
+
+
+def extract_frames(video: Path, work: Path, count: int | None, progress: Progress) -> Path:
+    """Write frames of a video as JPEGs.
+
+    Args:
+        video: the file.
+        work: gets the folder `images`.
+        count: how many frames; None = one per STRIDE of motion.
+        progress: told how far it is.
+
+    Returns:
+        the folder, which is whole or not there.
+
+    Raises:
+        CaptureError: it cannot be read, or nothing moves in it.
+    """
+    target = work / "images"
+    if target.is_dir():
+        return target
+    seen, motion, sharp = _survey(video, progress)
+    if len(seen) < 3:
+        raise CaptureError(
+            f"{video} holds {len(seen)} frames: film for at least ten seconds while you walk round the scene"
+        )
+    if motion[-1] < STILL:
+        raise CaptureError(
+            f"{video} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
+            "the camera to keep it in view"
+        )
+    wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
+    chosen = choose(np.array(motion), np.array(sharp), wanted)
+    numbers = {seen[i] for i in chosen}
+    with complete_folder(target) as folder:
+        written = 0
+        for number, frame, turn in _frames(video):
+            if number in numbers:
+                _upright(frame, turn).save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
+                written += 1
+                progress("writing frames", written, len(numbers))
+                if written == len(numbers):
+                    break
+    return target
+
+
+def choose(motion: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
+    """The sharpest frame of each of so many stretches of equal motion.
+
+    Args:
+        motion: [n] motion from the start to each frame, not decreasing.
+        sharp: [n] sharpness.
+        count: stretches; those without a frame give none.
+    """
+    stretch = np.minimum((motion / motion[-1] * count).astype(int), count - 1)
+    return [int(i) for s in np.unique(stretch) for i in [np.flatnonzero(stretch == s)[sharp[stretch == s].argmax()]]]
+
+
+def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], list[float]]:
+    """Numbers of the frames looked at, the motion up to each in units of the longer side, and their sharpness."""
+    seen: list[int] = []
+    motion: list[float] = []
+    sharp: list[float] = []
+    before: np.ndarray | None = None
+    step, total = _step(video)
+    for number, frame, _ in _frames(video):
+        if number % step:
+            continue
+        small = frame.reformat(*_size(frame, FINE), format="gray8").to_ndarray().astype(np.float32)
+        sharp.append(sharpness(small) * float(np.sqrt(np.mean(np.diff(small, axis=1) ** 2))))
+        factor = max(1, round(max(small.shape) / SMALL))
+        rows, columns = (side // factor * factor for side in small.shape)
+        tiny = small[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor).mean(axis=(1, 3))
+        motion.append((motion[-1] if motion else 0.0) + (displacement(before, tiny) if before is not None else 0.0))
+        before = tiny
+        seen.append(number)
+        progress("watching the video", min(number, total), total)
+    progress("watching the video", total, total)
+    return seen, motion, sharp
+
+
+def displacement(first: np.ndarray, second: np.ndarray) -> float:
+    """How far blocks of an image move to the next one: the mean over those with texture, in units of the longer side.
+
+    Each block's shift is the peak of its phase correlation.
+    """
+    size = max(16, min(first.shape) // 3)
+    window = np.outer(np.hanning(size), np.hanning(size))
+    lengths = []
+    for top in np.linspace(0, first.shape[0] - size, 3).astype(int):
+        for left in np.linspace(0, first.shape[1] - size, 3).astype(int):
+            a, b = (image[top : top + size, left : left + size] for image in (first, second))
+            if a.std() < 2.0 or np.abs(a - b).mean() < 0.02 * a.std():  # bare, or without motion beyond noise
+                lengths.append(0.0)
+                continue
+            product = np.fft.rfft2((a - a.mean()) * window) * np.conj(np.fft.rfft2((b - b.mean()) * window))
+            peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=(size, size))
+            # A parabola through the peak and its neighbours finds shifts of less than a pixel.
+            at = np.array(np.unravel_index(peak.argmax(), peak.shape))
+            shift = [_between(peak[:, at[1]], at[0]), _between(peak[at[0]], at[1])]
+            shift = [s - size if s > size / 2 else s for s in shift]
+            lengths.append(float(np.hypot(*shift)))
+    return float(np.mean(lengths)) / max(first.shape)
+
+
+def _between(line: np.ndarray, at: int) -> float:
+    """Place of the peak of a parabola through three values of a line that closes on itself."""
+    low, mid, high = line[at - 1], line[at], line[(at + 1) % len(line)]
+    curve = low - 2 * mid + high
+    return float(at + (0.5 * (low - high) / curve if curve < 0 else 0.0))
+
+
+def _step(video: Path) -> tuple[int, int]:
+    """Every how many frames one is looked at, and how many frames there are, roughly."""
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        rate = float(stream.average_rate or 30)
+        length = float(container.duration or 0) / 1e6
+        return max(1, round(rate / PER_SECOND)), max(1, stream.frames or round(rate * length))
+
+
+def _opened(video: Path) -> av.container.InputContainer:
+    try:
+        container = av.open(str(video))
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise CaptureError(
+            f"{video} cannot be read as a video ({error.strerror or error}): record or export it again"
+        ) from error
+    if not container.streams.video:
+        container.close()
+        raise CaptureError(f"{video} holds no pictures, only sound: name another file")
+    return container
+
+
+def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
+    """Number, frame, and the degrees by which it is turned to be seen; a broken end is passed over."""
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        number = 0
+        try:
+            for frame in container.decode(stream):
+                yield number, frame, int(frame.rotation)
+                number += 1
+        except av.FFmpegError as error:
+            if number == 0:
+                raise CaptureError(
+                    f"{video} cannot be decoded ({error.strerror}): record or export it again"
+                ) from error
+
+
+def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:
+    scale = min(1.0, longer / max(frame.width, frame.height))
+    return max(16, round(frame.width * scale)), max(16, round(frame.height * scale))
+
+
+def _upright(frame: av.VideoFrame, turn: int) -> Image.Image:
+    """The frame as it is seen: `turn` is counter-clockwise, as ffmpeg's display matrix has it."""
+    image = frame.to_image()
+    return image.rotate(turn, expand=True) if turn % 360 else image

@@ -1,0 +1,50 @@
+"""A few photographs of the sample room, taken along an arc, so that neighbours overlap well."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bitymi_ns.sample.capture import View, camera_path, render
+from bitymi_ns.sample.room import Room
+
+SIZE = (288, 216)
+COUNT = 8
+
+
+@pytest.fixture(scope="session")
+def views() -> list[View]:
+    return camera_path(60, *SIZE, seed=0)[:COUNT]
+
+
+@pytest.fixture(scope="session")
+def pictures(views: list[View]) -> list[np.ndarray]:
+    room = Room(0)
+    return [render(room, view, supersample=2) for view in views]
+
+
+@pytest.fixture(scope="session")
+def arc(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -> Path:
+    """A folder with the photographs, to be left as it is."""
+    folder = tmp_path_factory.mktemp("arc")
+    for i, picture in enumerate(pictures):
+        Image.fromarray(picture).save(folder / f"photo_{i + 1}.png")
+    return folder
+
+
+@pytest.fixture
+def copied(arc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Makes a folder with copies of the photographs."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def copy(name: str) -> Path:
+        folder = tmp_path / name
+        shutil.copytree(arc, folder, ignore=shutil.ignore_patterns(".*"))
+        return folder
+
+    return copy

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+
+from bitymi_ns.capture.frame import local_positions, settle
+
+
+def synthetic(seed: int = 0) -> pycolmap.Reconstruction:
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 12, 50
+    return pycolmap.synthesize_dataset(options)
+
+
+def centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    return {image.name: image.projection_center() for image in model.images.values()}
+
+
+def to_degrees(place: np.ndarray) -> tuple[float, float, float]:
+    """East, north and up in metres at 48 degrees north, by the lengths of a degree there."""
+    return 48.0 + place[1] / 111_199.5, 11.0 + place[0] / 74_628.4, 500.0 + place[2]
+
+
+def test_a_degree_is_as_long_as_it_is() -> None:
+    local, origin = local_positions({"a": (47.999, 11.0, 0.0), "b": (48.0, 11.0, 0.0), "c": (48.001, 11.001, 7.0)})
+    assert origin == (48.0, 11.0, 0.0)
+    assert local["c"] == pytest.approx([74.63, 111.20, 7.0], abs=0.02)
+
+
+def test_gps_gives_metres_and_up() -> None:
+    model = synthetic()
+    turned = pycolmap.Sim3d(0.05, pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])), np.array([4.0, 5.0, 6.0]))
+    scale = 40 / np.std(list(centers(model).values()))
+    true = {name: scale * place for name, place in centers(model).items()}
+    model.transform(turned)
+    rng = np.random.default_rng(0)
+    places = {name: to_degrees(place + rng.normal(0, 2, 3)) for name, place in true.items()}
+    frame = settle(model, places)
+    assert frame.up == "gps" and frame.metres_per_unit == 1 and frame.gps_error < 5
+    found = centers(model)
+    names = list(true)
+    spans = [
+        np.linalg.norm(found[a] - found[b]) / np.linalg.norm(true[a] - true[b]) for a in names for b in names if a < b
+    ]
+    assert np.median(spans) == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("size", [0.0, 3.0])
+def test_positions_too_close_together_say_nothing(size: float) -> None:
+    model = synthetic()
+    places = {name: to_degrees(size * np.random.default_rng(i).normal(size=3)) for i, name in enumerate(centers(model))}
+    frame = settle(model, places)
+    assert frame.up == "cameras" and frame.metres_per_unit is None and frame.gps_positions == 12
+
+
+def test_positions_of_another_shape_are_not_believed() -> None:
+    model = synthetic()
+    rng = np.random.default_rng(0)
+    frame = settle(model, {name: to_degrees(rng.normal(0, 200, 3)) for name in centers(model)})
+    assert frame.metres_per_unit is None
+
+
+def test_without_gps_up_is_that_of_the_cameras() -> None:
+    model = synthetic()
+    frame = settle(model, {})
+    ups = [-image.cam_from_world().rotation.matrix()[1] for image in model.images.values()]
+    mean = np.mean(ups, axis=0)
+    assert frame.up == "cameras" and mean @ [0, 0, 1] == pytest.approx(np.linalg.norm(mean), rel=1e-6)
+    places = np.array(list(centers(model).values()))
+    np.testing.assert_allclose(places.mean(axis=0), 0, atol=1e-9)
+    assert np.linalg.norm(places, axis=1).mean() == pytest.approx(1)

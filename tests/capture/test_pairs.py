@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bitymi_ns.capture.sfm.explain import ViewGraph, left_out
+from bitymi_ns.capture.sfm.pairs import NEIGHBOURS, is_sequence, nearest, sequence
+
+
+def connected(count: int, pairs: set[tuple[int, int]]) -> bool:
+    graph = ViewGraph({str(i): 100 for i in range(count)}, {(str(i), str(j)): 20 for i, j in pairs})
+    return count < 2 or len(graph.components()[0]) == count
+
+
+@given(st.integers(2, 40), st.integers(0, 5), st.integers(0, 2**32 - 1))
+def test_chosen_pairs_leave_no_part_alone(count: int, most: int, seed: int) -> None:
+    alike = np.random.default_rng(seed).integers(0, most + 1, (count, count)).astype(np.float32)
+    alike = np.triu(alike, 1) + np.triu(alike, 1).T
+    pairs = nearest(alike, 3)
+    assert connected(count, pairs)
+    assert all(0 <= i < j < count for i, j in pairs)
+    for i in range(count):  # the best neighbour is among them
+        if alike[i].max() > 0:
+            assert any(alike[i, j] == alike[i].max() for pair in pairs if i in pair for j in pair if j != i)
+
+
+def test_a_sequence_is_compared_with_what_follows() -> None:
+    pairs = sequence(30)
+    assert (0, 1) in pairs and (0, 6) in pairs and (0, 16) in pairs and (0, 7) not in pairs
+    assert connected(30, pairs)
+
+
+def test_a_sequence_is_told_by_its_neighbours() -> None:
+    place = np.arange(60)
+    alike = np.exp(-np.abs(place[:, None] - place) / 5.0) * (1 - np.eye(60))
+    assert is_sequence(alike)
+    mixed = np.random.default_rng(0).permutation(60)
+    assert not is_sequence(alike[mixed][:, mixed])
+    assert NEIGHBOURS < 60
+
+
+def test_reasons_name_what_is_missing() -> None:
+    graph = ViewGraph(
+        {"a": 500, "b": 500, "bare": 7, "alone": 400, "c": 300, "d": 300, "weak": 200},
+        {("a", "b"): 90, ("c", "d"): 50, ("weak", "a"): 16},
+    )
+    reasons = left_out(graph, {"a", "b"}, {name: f"{name}.jpg" for name in graph.features})
+    assert set(reasons) == {"bare.jpg", "alone.jpg", "c.jpg", "d.jpg", "weak.jpg"}
+    assert "hardly any detail in it: 7 features" in reasons["bare.jpg"]
+    assert "no other photograph" in reasons["alone.jpg"]
+    assert "left out as well" in reasons["c.jpg"]
+    assert "16 matches" in reasons["weak.jpg"]

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from bitymi_ns.capture.photos import find_photos, natural, photo_folder, read_photo, read_photos, upright
+from bitymi_ns.capture.selection import blurred, duplicates
+from bitymi_ns.capture.types import CaptureError
+
+
+def silent(step: str, done: int, total: int) -> None: ...
+
+
+def test_names_are_sorted_by_the_numbers_in_them(tmp_path: Path) -> None:
+    for name in ("b_10.jpg", "b_9.jpg", "B_1.JPG", "x/2.png", "masks/2.png", ".hidden/3.png", "._4.jpg", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_photos(tmp_path) == ["B_1.JPG", "b_9.jpg", "b_10.jpg", "x/2.png"]
+    assert natural("a2") < natural("a10")
+
+
+def test_photographs_may_stand_in_images(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    assert photo_folder(tmp_path) == tmp_path / "images"
+    (tmp_path / "1.jpg").touch()
+    assert photo_folder(tmp_path) == tmp_path
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".bmp", ".heic"])
+def test_every_format_is_read(tmp_path: Path, pictures: list[np.ndarray], suffix: str) -> None:
+    Image.fromarray(pictures[0]).save(tmp_path / f"a{suffix}")
+    photo = read_photo(tmp_path, f"a{suffix}")
+    assert (photo.width, photo.height) == pictures[0].shape[1::-1]
+    assert photo.plain == (suffix not in (".webp", ".heic"))
+    assert np.abs(np.asarray(upright(photo), float) - pictures[0]).mean() < 8
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_rotation_in_exif_is_applied(tmp_path: Path, pictures: list[np.ndarray], orientation: int) -> None:
+    turns = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # what Pillow calls the transposition that stores it so
+    image = Image.fromarray(pictures[0])
+    exif = image.getexif()
+    exif[0x0112] = orientation
+    stored = image if orientation == 1 else image.transpose(turns[orientation])
+    stored.save(tmp_path / "a.png", exif=exif)
+    photo = read_photo(tmp_path, "a.png")
+    assert (photo.width, photo.height) == image.size and photo.plain == (orientation == 1)
+    np.testing.assert_array_equal(np.asarray(upright(photo)), pictures[0])
+
+
+def test_a_damaged_file_among_good_ones_is_named(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    for i in range(3):
+        Image.fromarray(pictures[i]).save(tmp_path / f"{i}.jpg")
+    whole = (tmp_path / "1.jpg").read_bytes()
+    (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "2.jpg").write_bytes(b"")
+    photos, broken = read_photos(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], silent)
+    assert [photo.name for photo in photos] == ["0.jpg"]
+    assert "truncated" in broken["1.jpg"] and "damaged or not an image" in broken["2.jpg"]
+
+
+def test_an_icon_is_no_photograph(tmp_path: Path) -> None:
+    Image.new("RGB", (16, 16)).save(tmp_path / "a.png")
+    with pytest.raises(CaptureError, match="16 x 16"):
+        read_photo(tmp_path, "a.png")
+
+
+def test_a_blurred_photograph_is_found(arc: Path, tmp_path: Path) -> None:
+    for i in range(1, 6):
+        image = Image.open(arc / f"photo_{i}.png")
+        (image.filter(ImageFilter.GaussianBlur(3)) if i == 2 else image).save(tmp_path / f"{i}.png")
+    photos, _ = read_photos(tmp_path, find_photos(tmp_path), silent)
+    assert blurred(photos) == ["2.png"]
+
+
+def test_duplicates_are_found_and_neighbours_are_none(arc: Path, tmp_path: Path) -> None:
+    for i in range(1, 5):
+        Image.open(arc / f"photo_{i}.png").save(tmp_path / f"{i}.png")
+    noise = np.random.default_rng(0).normal(0, 2, (216, 288, 3))
+    burst = np.clip(np.asarray(Image.open(arc / "photo_2.png")) + noise, 0, 255).astype(np.uint8)
+    Image.fromarray(burst).save(tmp_path / "burst.png")
+    Image.open(arc / "photo_3.png").save(tmp_path / "again.png")
+    photos, _ = read_photos(tmp_path, find_photos(tmp_path), silent)
+    found = {frozenset(pair) for pair in duplicates(photos).items()}
+    assert found == {frozenset(("burst.png", "2.png")), frozenset(("again.png", "3.png"))}

@@ -1,0 +1,232 @@
+"""The whole way, on a few small photographs, and what users see when it cannot be gone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
+from bitymi_ns.capture.exif import Exif
+from bitymi_ns.capture.photos import Photo
+from bitymi_ns.capture.poses import by_camera, camera_group
+from bitymi_ns.cli import main
+from bitymi_ns.sample.capture import View, render
+from bitymi_ns.sample.room import Room
+
+Copy = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def capture(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with spaces and other letters in its names, a damaged photograph, a duplicate and one of elsewhere."""
+    folder = tmp_path_factory.mktemp("with spaces") / "Fotos für später"
+    folder.mkdir()
+    for path in arc.glob("*.png"):
+        shutil.copy(path, folder / f"Bild {path.name}")
+    (folder / "kaputt.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photograph")
+    shutil.copy(arc / "photo_3.png", folder / "wieder.png")
+    noise = np.random.default_rng(1).integers(0, 256, (54, 72, 3)).astype(np.uint8)
+    Image.fromarray(noise).resize((288, 216), Image.BICUBIC).save(folder / "woanders.png")
+    find_poses(folder)
+    return folder
+
+
+def known_centers(views: list[View]) -> np.ndarray:
+    return np.array([view.camera_to_world[:3, 3] for view in views])
+
+
+def test_the_poses_are_those_the_photographs_were_taken_from(capture: Path, views: list[View]) -> None:
+    poses = find_poses(capture)
+    assert poses.given == 11 and poses.registered == 8
+    assert poses.reprojection_error < 1.0 and poses.track_length > 2
+    model = pycolmap.Reconstruction(poses.model)
+    names = [f"Bild photo_{i + 1}.png" for i in range(8)]
+    assert sorted(image.name for image in model.images.values()) == names
+    assert all((poses.images / name).is_file() for name in names)
+    found = np.array([model.find_image_with_name(name).projection_center() for name in names])
+    theirs = known_centers(views)
+    similarity = pycolmap.estimate_sim3d(found, theirs)
+    extent = np.linalg.norm(theirs - theirs.mean(axis=0), axis=1).max()
+    assert np.linalg.norm(similarity * found - theirs, axis=1).max() < 0.05 * extent
+    up = similarity.rotation.matrix() @ [0, 0, 1]
+    assert up[2] > 0.98, "z is up, as the cameras were held"
+
+
+def test_every_photograph_without_a_pose_is_named_with_the_reason(capture: Path) -> None:
+    left_out = find_poses(capture).left_out
+    assert set(left_out) == {"kaputt.jpg", "wieder.png", "woanders.png"} or set(left_out) == {
+        "kaputt.jpg",
+        "Bild photo_3.png",
+        "woanders.png",
+    }
+    assert "damaged or not an image" in left_out["kaputt.jpg"]
+    assert "no other photograph shows the same" in left_out["woanders.png"]
+    assert any(why.startswith("the same as") for why in left_out.values())
+
+
+def test_the_report_says_what_was_found(capture: Path) -> None:
+    poses = find_poses(capture)
+    values = json.loads((poses.report / "report.json").read_text("utf8"))
+    page = (poses.report / "report.md").read_text("utf8")
+    assert values["registered"] == 8 and values["seconds"]["finding features"] > 0
+    assert "8 of 11" in page and "kaputt.jpg" in page and "cameras.png" in page
+    assert Image.open(poses.report / "cameras.png").size == (1200, 600)
+    assert json.loads((poses.report / "frame.json").read_text("utf8"))["metres_per_unit"] is None
+
+
+def test_it_runs_once(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: pytest.fail("found anew"))
+    assert find_poses(capture).registered == 8
+    assert not list(capture.glob(".bitymi/*/database.db"))
+
+
+def test_a_capture_of_nerfstudio_is_written(
+    capture: Path, tmp_path: Path, views: list[View], capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["sfm", str(capture), "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "8 of 11 photographs have a pose" in printed and "left out: kaputt.jpg" in printed
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text("utf8"))
+    assert len(written["frames"]) == 8 and written["camera_model"] == "OPENCV" and written["w"] == 288
+    assert abs(written["fl_x"] / views[0].focal - 1) < 0.05
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    for frame in written["frames"]:
+        assert (tmp_path / "out" / frame["file_path"]).is_file()
+        center = model.find_image_with_name(Path(frame["file_path"]).name).projection_center()
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], center, atol=1e-9)
+    assert (tmp_path / "out" / written["ply_file_path"]).read_bytes().startswith(b"ply")
+    assert main(["sfm", str(capture), "--output", str(tmp_path / "out")]) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_points_are_triangulated_for_known_poses(arc: Path, views: list[View], copied: Copy) -> None:
+    folder = copied("known")
+    known = []
+    for i, view in enumerate(views):
+        pose = np.vstack([view.camera_to_world[:3], [0, 0, 0, 1]]).astype(float)
+        pose[:3, 1:3] *= -1
+        inverse = np.linalg.inv(pose)[:3]
+        known.append(KnownView(f"photo_{i + 1}.png", 288, 216, view.focal, view.focal, 144, 108, inverse))
+    model = pycolmap.Reconstruction(triangulate(folder, known))
+    points = np.array([point.xyz for point in model.points3D.values()])
+    assert len(points) > 50
+    inside = (points > [-3.1, -2.6, -0.1]) & (points < [3.1, 2.6, 2.7])
+    assert inside.all(axis=1).mean() > 0.8  # the rest is the landscape outside the window
+    for view in known:
+        found = model.find_image_with_name(view.name).cam_from_world().matrix()
+        np.testing.assert_allclose(found, view.world_to_camera, atol=1e-9)
+
+
+@pytest.mark.parametrize(("count", "said"), [(0, "no photographs"), (1, "one photograph"), (2, "2 photographs")])
+def test_too_few_photographs(arc: Path, tmp_path: Path, count: int, said: str) -> None:
+    for i in range(count):
+        shutil.copy(arc / f"photo_{i + 1}.png", tmp_path)
+    with pytest.raises(CaptureError, match=f"holds {said}: camera poses need at least 3"):
+        find_poses(tmp_path)
+
+
+def test_too_few_that_can_be_read(arc: Path, tmp_path: Path) -> None:
+    shutil.copy(arc / "photo_1.png", tmp_path)
+    for name in "abc":
+        (tmp_path / f"{name}.jpg").write_bytes(b"nothing")
+    with pytest.raises(CaptureError, match=r"only 1 can be used \(a.jpg: it cannot be read"):
+        find_poses(tmp_path)
+
+
+def test_copies_of_one_photograph(arc: Path, tmp_path: Path) -> None:
+    for name in "abcd":
+        shutil.copy(arc / "photo_1.png", tmp_path / f"{name}.png")
+    with pytest.raises(CaptureError, match="only 1 differ"):
+        find_poses(tmp_path)
+
+
+def test_no_such_folder(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="does not exist: name a folder of photographs, or a video"):
+        find_poses(tmp_path / "none")
+
+
+def test_photographs_of_different_things(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        noise = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
+        Image.fromarray(noise).resize((300, 240), Image.BICUBIC).save(tmp_path / f"{i}.png")
+    with pytest.raises(CaptureError, match="do not overlap: no two of them show the same"):
+        find_poses(tmp_path)
+
+
+def test_photographs_of_nothing(tmp_path: Path) -> None:
+    for i in range(4):
+        Image.new("L", (300, 240), 60 * i).save(tmp_path / f"{i}.png")
+    with pytest.raises(CaptureError, match="4 of 4 photographs show hardly any detail"):
+        find_poses(tmp_path)
+
+
+def test_photographs_from_one_spot(tmp_path: Path, views: list[View]) -> None:
+    room = Room(0)
+    for i, angle in enumerate(np.radians([-20, -12, -4, 4, 12, 20])):
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose = views[0].camera_to_world.copy()
+        pose[:3, :3] = turn @ pose[:3, :3]
+        view = View(pose, views[0].focal, views[0].width, views[0].height)
+        Image.fromarray(render(room, view, supersample=2)).save(tmp_path / f"{i}.png")
+    with pytest.raises(CaptureError, match="were taken from one spot"):
+        find_poses(tmp_path)
+
+
+def test_masks_keep_features_off(arc: Path, copied: Copy) -> None:
+    folder = copied("masked")
+    (folder / "masks").mkdir()
+    for i in range(8):
+        mask = np.zeros((108, 144), np.uint8)  # at half the size
+        mask[:, :16] = 255
+        Image.fromarray(mask).save(folder / "masks" / f"photo_{i + 1}.png")
+    with pytest.raises(CaptureError, match="hardly any detail|do not overlap"):  # what is left is too little
+        find_poses(folder)
+
+
+def test_masks_that_fit_no_photograph_are_refused(copied: Copy) -> None:
+    folder = copied("masked")
+    (folder / "masks").mkdir()
+    Image.new("L", (288, 216)).save(folder / "masks" / "other.png")
+    with pytest.raises(CaptureError, match="no mask in .* belongs to a photograph"):
+        find_poses(folder)
+    Image.new("L", (216, 288)).save(folder / "masks" / "photo_1.png")
+    with pytest.raises(CaptureError, match="216 x 288 pixels, its photograph photo_1.png"):
+        find_poses(folder)
+
+
+def photo(name: str, size: tuple[int, int] = (400, 300), **exif: object) -> Photo:
+    return Photo(name, Path(name), *size, Exif(**exif), True, np.zeros((1, 1), np.float32), 1.0)  # type: ignore[arg-type]
+
+
+def test_photographs_share_a_camera_by_size_and_exif() -> None:
+    photos = [
+        photo("a", camera="x"),
+        photo("b", camera="x"),
+        photo("c", camera="y"),
+        photo("d", (300, 400), camera="x"),
+    ]
+    assert [[p.name for p in group] for group in by_camera(photos)] == [["a", "b"], ["c"], ["d"]]
+
+
+def test_a_focal_length_is_known_only_if_all_photographs_state_it() -> None:
+    both = [photo("a", focal_length=350.0), photo("b", focal_length=352.0)]
+    assert camera_group(both, [], SfmOptions()).params[0] == 351 and camera_group(both, [], SfmOptions()).prior
+    one = [photo("a", focal_length=350.0), photo("b")]
+    assert camera_group(one, [], SfmOptions()).params[0] == 480 and not camera_group(one, [], SfmOptions()).prior
+    assert camera_group(one, [], SfmOptions(focal_length=300.0)).params[0] == 300
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("max_image_size", 0), ("max_features", -1), ("frames", 2), ("focal_length", float("nan"))]
+)
+def test_options_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(CaptureError, match=f"{name} is .*: give a number of at least"):
+        SfmOptions(**{name: value})

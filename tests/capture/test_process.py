@@ -1,0 +1,124 @@
+"""Runs that are ended, or cannot write."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.capture import find_poses
+from bitymi_ns.capture.sfm.process import rows
+
+Copy = Callable[[str], Path]
+COMMAND = [sys.executable, "-m", "bitymi_ns.cli", "sfm"]
+
+
+def database(folder: Path) -> Path | None:
+    return next(iter(folder.glob(".bitymi/*/database.db")), None)
+
+
+def started(folder: Path, **options: object) -> subprocess.Popen:
+    return subprocess.Popen(
+        [*COMMAND, str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
+    )
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
+
+
+def workers(folder: Path) -> list[str]:
+    """Processes that have a file of the folder open."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdecimal():
+            try:
+                found += [process.name for link in (process / "fd").iterdir() if str(folder) in os.readlink(link)]
+            except OSError:
+                continue
+    return found
+
+
+def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(copied: Copy) -> None:
+    folder = copied("killed")
+    run = started(folder)
+    wait_for(lambda: (db := database(folder)) is not None and rows(db, "keypoints") >= 3)
+    run.kill()
+    run.communicate()
+    wait_for(lambda: not workers(folder))
+    done = rows(database(folder), "keypoints")
+    assert done >= 3
+
+    told: list[tuple[str, int]] = []
+    poses = find_poses(folder, progress=lambda step, done, total: told.append((step, done)))
+    assert poses.registered == 8
+    counted = [count for step, count in told if step == "finding features"]
+    assert counted[0] == 0 and min(counted[1:]) >= done, "what the first run found was kept"
+    assert not list(folder.glob(".bitymi/*/.*.new"))
+
+
+def test_ctrl_c_ends_it_without_a_traceback(copied: Copy) -> None:
+    folder = copied("interrupted")
+    run = started(folder)
+    wait_for(lambda: (db := database(folder)) is not None and rows(db, "keypoints") >= 1)
+    run.send_signal(signal.SIGINT)
+    _, said = run.communicate(timeout=60)
+    assert run.returncode == 130 and "interrupted" in said and "Traceback" not in said
+    wait_for(lambda: not workers(folder))
+
+
+def test_a_full_disk_is_named(copied: Copy) -> None:
+    folder = copied("full")
+    limit = 300_000  # no file may grow larger, as on a disk with as little space left
+
+    def little_space() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    run = started(folder, preexec_fn=little_space)
+    _, said = run.communicate(timeout=120)
+    assert run.returncode == 1 and "Traceback" not in said
+    assert "cannot be written" in said and "Free some space" in said
+    assert find_poses(folder).registered == 8
+
+
+def test_a_second_run_at_the_same_time_is_told(copied: Copy) -> None:
+    folder = copied("busy")
+    run = started(folder)
+    try:
+        wait_for(lambda: database(folder) is not None)
+        run.send_signal(signal.SIGSTOP)  # so that it is not done before the other has begun
+        second = subprocess.run([*COMMAND, str(folder)], capture_output=True, text=True)
+        assert second.returncode == 1 and f"process {run.pid} is at work there" in second.stderr
+    finally:
+        run.kill()
+        run.communicate()
+
+
+def test_a_read_only_folder_is_no_hindrance(copied: Copy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = copied("read only")
+    real = Path.mkdir
+
+    def refuse(path: Path, *arguments: object, **options: object) -> None:
+        if folder in path.parents:
+            raise OSError(30, os.strerror(30), str(path))
+        real(path, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    poses = find_poses(folder)
+    assert poses.registered == 8 and tmp_path / "cache" in poses.model.parents
+    assert not (folder / ".bitymi").exists()

@@ -175,7 +175,7 @@ class TrainConfig:
     """Opacity of the first surfels."""
     random_points: int = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
-    exposure: ExposureKind = "auto"
+    exposure: ExposureKind = "off"
     """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
     matrix, off = all photographs are taken as they are, auto = gain where the photographs disagree by gains."""
     background: Literal["black", "white", "random"] = "black"

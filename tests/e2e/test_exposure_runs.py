@@ -17,7 +17,7 @@ from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.export import ExportAtlas
 from bitymi_ns.sample import generate
-from tests.e2e.test_training import checkpoint, different
+from tests.e2e.runs import checkpoint, different
 
 Start = Callable[..., BitymiTrainerConfig]
 

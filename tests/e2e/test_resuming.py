@@ -19,22 +19,7 @@ from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.trainer import BitymiTrainer
-from tests.e2e.runs import Start, a_run_of, checkpoint
-
-
-def different(a: Any, b: Any, path: str = "") -> list[str]:
-    """Where two checkpoints differ, clocks left out."""
-    if path.endswith("seconds"):
-        return []
-    if isinstance(a, torch.Tensor):
-        return [] if torch.equal(a, b) else [path]
-    if isinstance(a, dict):
-        if a.keys() != b.keys():
-            return [path]
-        return [d for key in a for d in different(a[key], b[key], f"{path}/{key}")]
-    if isinstance(a, (list, tuple)):
-        return [d for i, pair in enumerate(zip(a, b, strict=True)) for d in different(*pair, f"{path}/{i}")]
-    return [] if a == b else [path]
+from tests.e2e.runs import Start, a_run_of, checkpoint, different
 
 
 @pytest.mark.parametrize("by", ["load_checkpoint", "load_dir"])

@@ -21,6 +21,8 @@ MOST = 0.9
 """Share of a pair's matches, and of the pairs, that a turn alone has to explain. Fewer are a far background, or
 neighbours that are almost at one place."""
 PAIRS_TRIED = 60
+TELLING = 30
+"""Matches of a pair that are enough to tell a turn from a step."""
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
 """Focal lengths, in units of the longer side, that are tried where it is not known."""
 
@@ -148,7 +150,7 @@ def only_turned(job: Job, database: Path) -> bool:
         points = {i: opened.read_keypoints(i)[:, :2] for i in images}
         pairs, geometries = opened.read_two_view_geometries()
     counted = sorted(zip(pairs, geometries, strict=True), key=lambda item: -len(item[1].inlier_matches))
-    counted = [item for item in counted if len(item[1].inlier_matches) >= 15]
+    counted = [item for item in counted if len(item[1].inlier_matches) >= TELLING]
     tried = counted[:: max(1, len(counted) // PAIRS_TRIED)]  # wide pairs too: neighbours alone show little parallax
     turned = 0
     for pair, geometry in tried:

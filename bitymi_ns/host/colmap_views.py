@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -20,16 +19,14 @@ from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 from PIL import Image
 
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
-from bitymi_ns.host.colmap_model import Model, ModelCamera, read_model
+from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS
-from bitymi_ns.host.lens import Lens, Pinhole, lens
+from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.poses import check_spread
 
 USUAL_PLACES = ("images", "input", "image", "photos", "photographs", "rgb", "color")
 """Folders of photographs beside a COLMAP model, the most usual first."""
-LARGE = 1600
-"""Pixels along the longer side from which smaller copies of photographs are pointed out."""
 
 
 @dataclass(frozen=True)
@@ -296,7 +293,7 @@ def _lenses(source: Source, model: Model, files: Sequence[Path], look: bool, ann
         key = (image.camera_id, used)
         if key not in made:
             stored = used if source.reduced is not None else full
-            params = _scaled(camera, used)
+            params = rescaled(camera.model, camera.params, full, used)
             whose = f"camera {image.camera_id} of {source.folder}"
             made[key], sentences = lens(camera.model, params, *used, stored, whose)
             told += sentences
@@ -306,17 +303,7 @@ def _lenses(source: Source, model: Model, files: Sequence[Path], look: bool, ann
             say(f"{sentence[0].upper()}{sentence[1:]}")
         if len(told) > 3:
             say(f"So are those of {len(told) - 3} more cameras.")
-        _point_out_smaller(source, result)
     return result
-
-
-def _scaled(camera: ModelCamera, size: tuple[int, int]) -> tuple[float, ...]:
-    """The parameters of a camera for pictures of another size."""
-    if size == (camera.width, camera.height):
-        return camera.params
-    rescaled = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
-    rescaled.rescale(*size)
-    return tuple(rescaled.params)
 
 
 def _size(path: Path) -> tuple[int, int] | None:
@@ -326,16 +313,3 @@ def _size(path: Path) -> tuple[int, int] | None:
             return image.size
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None  # what is wrong is said where it is read
-
-
-def _point_out_smaller(source: Source, lenses: Sequence[Lens]) -> None:
-    longest = max(max(each.stored) for each in lenses)
-    if source.reduction > 1 or longest <= LARGE:
-        return
-    there = [n for n in (2, 4, 8) if source.photographs.with_name(f"{source.photographs.name}_{n}").is_dir()]
-    ways = (
-        f": `bitymi-data --downscale-factor {there[-1]}` reads {source.photographs.name}_{there[-1]}"
-        if there
-        else (", as they are with `bitymi-data --downscale-factor 4`")
-    )
-    say(f"The photographs have up to {longest:,} pixels along a side. Smaller ones train faster{ways}.")

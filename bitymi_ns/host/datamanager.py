@@ -30,6 +30,7 @@ from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES, Photographs
 from bitymi_ns.host.ply import colours
 from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.host.poses import check_cloud, check_places, warn_of_mirrored
+from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import OnDemand, Room
 from bitymi_ns.train.views import View, training_order
@@ -63,6 +64,9 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     """How the capture is read."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type that is kept in memory; uint8 takes a quarter of the space."""
+    longest_side: int = LONGEST_SIDE
+    """Photographs with more pixels along a side are reduced to this as they are read, and their cameras with them; 0 =
+    all are used as they are."""
     train_cameras_sampling_seed: int = 42
     """Decides the order of the training views."""
     # options of nerfstudio's other data managers, which nothing reads here, are left out of the help
@@ -184,12 +188,15 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         )
 
     def create_train_dataset(self) -> BitymiDataset:
+        outputs = reduce_views(self.train_dataparser_outputs, self.config.longest_side, self.test_mode == "val")
         if self.test_mode != "inference":
-            self.train_dataparser_outputs = without_blank_views(self.train_dataparser_outputs, "training")
+            outputs = without_blank_views(outputs, "training")
+        self.train_dataparser_outputs = outputs
         return super().create_train_dataset()
 
     def create_eval_dataset(self) -> BitymiDataset:
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        outputs = reduce_views(outputs, self.config.longest_side, announce=False)
         if self.test_mode != "inference":
             outputs = without_blank_views(outputs, "held-out")
         return BitymiDataset(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)

@@ -18,6 +18,7 @@ from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import Note, masks_without_pixels, note, read_image, read_mask, wrong_size
 from bitymi_ns.host.lens import Lens
 from bitymi_ns.host.poses import rotations
+from bitymi_ns.host.reduction import Reduction
 from bitymi_ns.train.views import over_background
 
 
@@ -38,9 +39,13 @@ class BitymiDataset(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         path = self._dataparser_outputs.image_filenames[image_idx]
-        image, lens = read_image(path), self._lens(image_idx)
+        lens, reduction = self._lens(image_idx), self._reduction(image_idx)
         if lens is not None:
-            image = lens.picture(image, path)
+            image = lens.picture(read_image(path, lens.stored, lens.size))
+        elif reduction is not None:
+            image = read_image(path, reduction.stored, reduction.size).resize(reduction.size, Image.Resampling.BOX)
+        else:
+            image = read_image(path)
         image = self._scaled(image, Image.Resampling.BILINEAR)
         camera = self.cameras[image_idx].reshape(())
         declared = (int(camera.width), int(camera.height))
@@ -77,9 +82,11 @@ class BitymiDataset(InputDataset):
         data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
         if masks is not None:
-            mask, lens = read_mask(masks[image_idx]), self._lens(image_idx)
+            mask, lens, reduction = read_mask(masks[image_idx]), self._lens(image_idx), self._reduction(image_idx)
             if lens is not None:
                 mask = lens.mask(mask, masks[image_idx])
+            elif reduction is not None and mask.size == reduction.stored:
+                mask = mask.resize(reduction.size, Image.Resampling.NEAREST)
             mask = self._scaled(mask, Image.Resampling.NEAREST)
             height, width = data["image"].shape[:2]
             if mask.size != (width, height):
@@ -97,6 +104,11 @@ class BitymiDataset(InputDataset):
         """Through which a photograph was taken; None = its camera is that of the file."""
         lenses = self._dataparser_outputs.metadata.get("lenses")
         return None if lenses is None else lenses[image_idx]
+
+    def _reduction(self, image_idx: int) -> Reduction | None:
+        """From which size a photograph is reduced; None = it is not, or its lens does it."""
+        reductions = self._dataparser_outputs.metadata.get("reductions")
+        return None if reductions is None else reductions[image_idx]
 
     def _scaled(self, image: Image.Image, resample: Image.Resampling) -> Image.Image:
         if self.scale_factor == 1.0:

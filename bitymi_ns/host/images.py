@@ -49,13 +49,26 @@ def _is_too_large(path: Path) -> bool:
         return False  # what else is wrong is said where it is read
 
 
-def read_image(path: Path) -> Image.Image:
+def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
     """The photograph with 8 bits per channel, RGB or, where it has transparency, RGBA.
 
     PIL's own conversion clips what has more bits: a grey picture of 16 bits would come out white.
+
+    Args:
+        path: of the file.
+        stored: width and height that it must have; None = any.
+        wanted: width and height to which it will be reduced: a JPEG file may then be decoded to a half, a quarter or an
+            eighth of its size, which is no smaller than that and takes a fraction of the time and memory.
+
+    Raises:
+        InputError: it is missing, cannot be read, or has another size.
     """
     try:
         with Image.open(path) as file:
+            if stored is not None and file.size != stored:
+                fail(wrong_size(path, file.size, stored))
+            if wanted is not None:
+                file.draft(None, wanted)
             return _eight_bits(file).convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)

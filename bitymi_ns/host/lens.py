@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -73,9 +73,9 @@ class Lens:
         """Whether pixels move."""
         return _distorts(_camera(self))
 
-    def picture(self, image: Image.Image, path: Path) -> Image.Image:
-        """The pinhole picture of a photograph, of any 8-bit mode."""
-        self._check(image, path)
+    def picture(self, image: Image.Image) -> Image.Image:
+        """The pinhole picture of a photograph, of any 8-bit mode; it may have been decoded to a smaller size than that
+        of its file, but not below `size`."""
         if image.size != self.size:
             image = image.resize(self.size, Image.Resampling.BOX)
         if not self.distorts:
@@ -85,15 +85,19 @@ class Lens:
 
     def mask(self, mask: Image.Image, path: Path) -> Image.Image:
         """The same for a mask: pixels count where the nearest of the photograph does."""
-        self._check(mask, path)
+        if mask.size != self.stored:
+            fail(wrong_size(path, mask.size, self.stored))
         pixels = np.asarray(mask.resize(self.size, Image.Resampling.NEAREST)).astype(np.uint8)
         if self.distorts:
             pixels = cv2.remap(pixels, *_maps(self), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return Image.fromarray(pixels.astype(bool))
 
-    def _check(self, image: Image.Image, path: Path) -> None:
-        if image.size != self.stored:
-            fail(wrong_size(path, image.size, self.stored))
+    def reduced(self, factor: float) -> Lens:
+        """The same lens for pictures that are smaller by a factor."""
+        width, height = (max(1, round(side * factor)) for side in self.size)
+        return lens(
+            self.model, rescaled(self.model, self.params, self.size, (width, height)), width, height, self.stored, ""
+        )[0]
 
 
 def lens(
@@ -146,6 +150,21 @@ def lens(
             f"({w} x {h} pixels); what they show beyond is not used."
         )
     return Lens(model, params, (width, height), stored, pinhole), told
+
+
+def rescaled(model: str, params: Sequence[float], size: tuple[int, int], new: tuple[int, int]) -> tuple[float, ...]:
+    """The parameters of a camera for pictures of another size.
+
+    Args:
+        model: camera model of COLMAP.
+        params: its parameters, for pictures of `size`, width and height.
+        new: width and height.
+    """
+    if new == size:
+        return tuple(params)
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    camera.rescale(*new)
+    return tuple(camera.params)
 
 
 def _camera(lens: Lens) -> pycolmap.Camera:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from bitymi_ns.host.images import read_image
 from bitymi_ns.host.lens import WIDEST, Lens, lens
 from tests.host.captures import expect, said
 
@@ -33,7 +34,7 @@ def picture(one: Lens) -> np.ndarray:
     width, height = one.stored
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     image = np.stack([x, y, 0 * x], -1) * 255.0
-    return np.asarray(one.picture(Image.fromarray(np.round(image).astype(np.uint8)), Path("a.png"))).astype(float)
+    return np.asarray(one.picture(Image.fromarray(np.round(image).astype(np.uint8)))).astype(float)
 
 
 @pytest.mark.parametrize("f", [30.0, 60.0, 120.0])
@@ -73,7 +74,7 @@ def test_a_pinhole_is_left_as_it_is() -> None:
         one, told = lens(model, camera_of(model, 80.0, first=0.0), *SIZE, SIZE, "camera 1")
         assert not one.distorts and told == [] and (one.pinhole.width, one.pinhole.height) == SIZE
         image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (72, 96, 4), np.uint8))
-        assert one.picture(image, Path("a.png")) is image
+        assert one.picture(image) is image
 
 
 def test_a_fisheye_needs_no_coefficients() -> None:
@@ -101,14 +102,17 @@ def test_masks_go_with_their_photographs() -> None:
 def test_larger_photographs_are_averaged_down() -> None:
     one, _ = lens("PINHOLE", (80.0, 80.0, 48.0, 36.0), *SIZE, (192, 144), "camera 1")
     stripes = np.tile(np.array([0, 255], np.uint8), (144, 96))[..., None].repeat(3, -1)
-    out = np.asarray(one.picture(Image.fromarray(stripes), Path("a.png")))
+    out = np.asarray(one.picture(Image.fromarray(stripes)))
     assert out.shape == (72, 96, 3) and np.abs(out.astype(int) - 127).max() <= 1
 
 
-def test_a_photograph_of_another_size_is_named() -> None:
+def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
     one, _ = lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, SIZE, "camera 1")
+    Image.new("RGB", (10, 20)).save(tmp_path / "b.png")
     with expect("b.png has 10 x 20 pixels, but its camera is for 96 x 72"):
-        one.picture(Image.new("RGB", (10, 20)), Path("b.png"))
+        read_image(tmp_path / "b.png", one.stored, one.size)
+    with expect("m.png has 10 x 20 pixels, but its camera is for 96 x 72"):
+        one.mask(Image.new("1", (10, 20)), Path("m.png"))
 
 
 @pytest.mark.parametrize(

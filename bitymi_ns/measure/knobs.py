@@ -102,8 +102,9 @@ class HeldOut:
         self.photos: list[Tensor] = []
         self.masks: list[Tensor | None] = []
         for index in evenly_spaced(count, views):
-            camera, _, mask = view = datamanager.eval_views[index]
-            self.cameras.append(camera)
+            view = datamanager.eval_views[index]
+            mask = view.mask
+            self.cameras.append(view.camera)
             self.photos.append(view.target(self.background, "cpu"))
             self.masks.append(None if mask is None else mask.cpu().bool().reshape(*mask.shape[:2], 1))
 

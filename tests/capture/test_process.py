@@ -24,14 +24,18 @@ def database(folder: Path) -> Path | None:
     return next(iter(folder.glob(".bitymi/*/database.db")), None)
 
 
-def started(folder: Path, **options: object) -> subprocess.Popen:
+def started(folder: Path, prepare: Callable[[], object] = lambda: None) -> subprocess.Popen:
+    def preexec() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs, and what they start, ignore it
+        prepare()
+
     return subprocess.Popen(
         [*COMMAND, str(folder)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        **options,
+        preexec_fn=preexec,
     )
 
 
@@ -89,7 +93,7 @@ def test_a_full_disk_is_named(copied: Copy) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    run = started(folder, preexec_fn=little_space)
+    run = started(folder, little_space)
     _, said = run.communicate(timeout=120)
     assert run.returncode == 1 and "Traceback" not in said
     assert "cannot be written" in said and "Free some space" in said

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 import bitymi_ns
 from bitymi_ns import ops
@@ -125,5 +126,6 @@ def test_a_base_of_one_shows_its_unit_and_whole_numbers_of_terms_are_taken(kind:
 
 
 def test_every_kind_has_a_preset() -> None:
-    texts = [preset_path(name).read_text("utf8") for name in preset_names()]
-    assert all(any(f"view_color: {kind}" in text for text in texts) for kind in VIEW_COLORS)
+    stated = [yaml.safe_load(preset_path(name).read_text("utf8")).get("scene", {}) for name in preset_names()]
+    kinds = {scene.get("view_color", SceneConfig().view_color) for scene in stated}
+    assert kinds == set(VIEW_COLORS)

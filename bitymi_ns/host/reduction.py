@@ -85,7 +85,8 @@ def reduce_views(outputs: DataparserOutputs, longest: int, announce: bool) -> Da
     if announce:
         width, height = max((sizes[i] for i in large), key=max)
         say(
-            f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to {width} x "
-            f"{height}): they are reduced to that as they are read. --pipeline.datamanager.longest-side 0 uses all."
+            f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
+            f"{width} x {height}): they are reduced to that as they are read. --pipeline.datamanager.longest-side 0 "
+            "uses them as they are."
         )
     return dataclasses.replace(outputs, cameras=cameras, metadata=metadata)

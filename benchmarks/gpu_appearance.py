@@ -37,7 +37,7 @@ from bitymi_ns.train.optimizers import make_optimizers
 LEVELS = 4
 LOOK_UP = 1550
 LEARN = 3850
-NEEDS = ("view_color_forward_f32", "shade_forward_f32", "shade_backward_f32", "ssim_f32", "bake_tiles_f32")
+NEEDS = ("view_color_forward_f32", "shade_forward_f32", "shade_backward_f32", "ssim_f32", "field_tiles_f32")
 
 
 @dataclass(frozen=True)

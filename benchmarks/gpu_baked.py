@@ -25,7 +25,7 @@ from gpu_common import Options, Section, milliseconds, trained_like
 
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.ops.baked import Stage
+from bitymi_ns.ops.baked_cuda import Stage
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera

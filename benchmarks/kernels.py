@@ -54,7 +54,7 @@ from common import number, page, publish, say, table
 
 from bitymi_ns import ops
 from bitymi_ns.bake.packing import pack
-from bitymi_ns.ops.trace_cpu import borrowed_tracer
+from bitymi_ns.ops.trace_cpu import tracers
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
@@ -202,11 +202,11 @@ def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:
     return statistics.median(wall), statistics.median(cpu)
 
 
-def pairs(projection: ops.Projection, camera: Camera) -> int:
+def pairs(projection: ops.Projection) -> int:
     """Pairs of surfel and tile that the tracer looks at."""
-    geom, size = projection.geom.detach(), (camera.width, camera.height)
-    with borrowed_tracer(geom) as tracer:
-        tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, fragments=False)
+    geom = projection.geom.detach()
+    with tracers(geom).borrow() as tracer:
+        tracer.run(**projection.view(geom), most=1)
         return tracer.pairs
 
 
@@ -240,7 +240,7 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
         p=camera.width * camera.height,
         f=len(fragments),
         t=int((fragments.weight >= bound).sum()),
-        b=pairs(projection, camera),
+        b=pairs(projection),
         r=int(torch.unique_consecutive(fragments.surfel).numel()),
     )
     baked = baked_scene(scene, camera)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -132,14 +132,21 @@ def require(operation: str, kind: str, device: torch.device, instead: str) -> No
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:
-    """The kernel function of that name; on a CUDA device it runs on torch's current stream of that device."""
-    compiled = getattr(module(device), name)
+    """The kernel function of that name, which takes its arguments by keyword (csrc/ops); on a CUDA device it runs on
+    torch's current stream of that device.
+
+    Raises:
+        RuntimeError: the kernels for that device are not built, or it has none of that name.
+    """
+    compiled = getattr(module(device), name, None)
+    if compiled is None:
+        raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")
     if device.type != "cuda":
         return compiled
 
-    def on_stream(*args: Any) -> Any:
+    def on_stream(**arguments: Any) -> Any:
         with torch.cuda.device(device):
-            return compiled(*args, stream=torch.cuda.current_stream(device).cuda_stream)
+            return compiled(**arguments, stream=torch.cuda.current_stream(device).cuda_stream)
 
     return on_stream
 
@@ -165,12 +172,17 @@ def kernel_class(name: str, like: Tensor) -> type:
     return getattr(module(like.device), _name(name, like))
 
 
-def workspace(name: str, like: Tensor, *sizes: int) -> Tensor:
+def workspace(name: str, like: Tensor, **sizes: int) -> Tensor:
     """Working memory for the CUDA kernel `name`: [bytes] uint8, as many as its function `name`_workspace asks for."""
     ask = getattr(module(like.device), _name(f"{name}_workspace", like))
-    with torch.cuda.device(like.device) if like.device.type == "cuda" else nullcontext():
-        size = ask(*sizes)
+    with on_device(like.device):
+        size = ask(**sizes)
     return torch.empty(size, dtype=torch.uint8, device=like.device)
+
+
+def on_device(device: torch.device) -> AbstractContextManager[Any]:
+    """A context in which that CUDA device is the current one, for calls that take no stream."""
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
 def on_same_device(like: Tensor, **tensors: Tensor) -> None:

@@ -1,18 +1,30 @@
-"""Drawing a baked scene with the CPU kernels: forward only, texels in place of the field, no fragment list."""
+"""Drawing a baked scene with the CPU kernels: no fragment list."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import module, require
-from .constants import BAKED_CHANNELS, MAP_CHANNELS, SUPPORT
-from .project import Projection
-from .trace_cpu import borrowed_tracer
+from .backend import kernel, module, require
+from .baked_scene import BakedScene, check_images, common_size, residual
+from .constants import BAKED_CHANNELS, MAP_CHANNELS
+from .pool import Pool
+from .project import GEOMETRY, Camera, project
+from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
+MAPS = {"beta": slice(4, 5), "depth": slice(5, 6), "normal": slice(6, 9)}
+"""Channels of an image with maps."""
+
+
+@functools.cache
+def _bins() -> Pool[Any]:
+    """Memory for the tile lists of frames, which stays."""
+    return Pool(module(torch.device("cpu")).Bins)
 
 
 def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
@@ -27,36 +39,17 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
         RuntimeError: the tiles are not on the CPU.
     """
     require("baked_cpu.gather", "cpu", tiles.device, ON_CUDA)
-    is_bytes = atlas is not None and atlas.dtype == torch.uint8
-    shape = (0, 0, 0) if atlas is None else tuple(atlas.shape[:3])
-    return module(tiles.device).Patches(
-        atlas if is_bytes else None, None if is_bytes else atlas, shape, tiles.contiguous()
-    )
+    layers, height, width = (0, 0, 0) if atlas is None else atlas.shape[:3]
+    texels = {} if atlas is None else {"bytes" if atlas.dtype == torch.uint8 else "floats": atlas}
+    return module(tiles.device).Patches(**texels, layers=layers, height=height, width=width, tiles=tiles.contiguous())
 
 
-def draw(
-    projection: Projection,
-    base: Tensor,
-    patches: Any,
-    offset: float,
-    scale: float,
-    extent: Tensor | None,
-    mean_residual: Tensor | None,
-    weight_bound: float,
-    transmittance_min: float,
-    maps: bool,
-) -> tuple[Tensor, Tensor | None]:
+def frame(scene: BakedScene, camera: Camera, maps: bool) -> tuple[Tensor, Tensor | None]:
     """Draws a view.
 
     Args:
-        projection: of N surfels into an H x W view.
-        base: [N, 3] f_view of every surfel.
-        patches: of `gather`.
-        offset, scale: residual = offset + scale * texel, a byte as 0 to 255.
-        extent: [N] half side of the tile in scale units; None = the kernel's support.
-        mean_residual: [N, 3] residual of surfels without a tile; None = 0.
-        weight_bound: fragments of smaller weight get no residual.
-        transmittance_min: a surfel that would leave a pixel less is not blended and ends the pixel; 0 = all are.
+        scene: of N surfels, on the CPU.
+        camera: of an H x W view.
         maps: also beta, depth, normal and overdraw.
 
     Returns:
@@ -64,31 +57,50 @@ def draw(
         surfels per pixel, [H, W, 1] int32. The background is not included.
 
     Raises:
-        RuntimeError: the projection is not on the CPU.
+        ValueError: the atlas is only there as BC7 blocks.
+        RuntimeError: the scene is not on the CPU.
     """
-    geom, camera, n = projection.geom, projection.camera, len(projection.geom)
-    require("baked_cpu.draw", "cpu", geom.device, ON_CUDA)
-    size = (camera.width, camera.height)
+    require("baked_cpu.frame", "cpu", scene.tiles.device, ON_CUDA)
+    atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
+    if atlas is None and scene.blocks is not None:
+        raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
+    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, scene.through_pixel)
+    geom = projection.geom
+    look = residual(scene)
+    if atlas is not None and atlas.dtype == torch.uint8:
+        look["scale"] /= 255  # the kernel reads bytes as 0 to 255
     image = geom.new_empty(camera.height, camera.width, MAP_CHANNELS if maps else BAKED_CHANNELS)
     overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
-    with borrowed_tracer(geom) as tracer:
-        tracer.run(geom, projection.radii, *size, projection.near, projection.through_pixel, fragments=False)
-        tracer.baked(
-            geom,
-            projection.radii,
-            *size,
-            projection.near,
-            projection.through_pixel,
-            weight_bound,
-            transmittance_min,
-            maps,
-            base,
-            patches,
-            offset,
-            scale,
-            torch.full((n,), SUPPORT) if extent is None else extent,
-            torch.zeros(n, 3) if mean_residual is None else mean_residual,
-            image,
-            overdraw,
+    with _bins().borrow() as bins:
+        kernel("baked_forward", geom)(
+            **projection.view(geom),
+            **look,
+            base=view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible),
+            patches=scene.kept.atlas(lambda: gather(atlas, tiles), atlas, tiles),
+            bins=bins,
+            maps=maps,
+            image=image,
+            overdraw=overdraw,
         )
     return image, overdraw
+
+
+def draw(
+    scene: BakedScene, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
+) -> dict[str, Tensor]:
+    """As `baked.draw`, one view after the other."""
+    require("baked_cpu.draw", "cpu", scene.tiles.device, ON_CUDA)
+    check_images(images)
+    if "packed" in images:
+        raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
+    common_size(cameras)
+    drawn: dict[str, list[Tensor]] = {name: [] for name in images}
+    for camera in cameras:
+        image, overdraw = frame(scene, camera, any(name in MAPS or name == "overdraw" for name in images))
+        found = {name: image[..., channels] for name, channels in MAPS.items()}
+        found |= {"rgb": image[..., :3], "alpha": image[..., 3:4], "overdraw": overdraw}
+        if background is not None:
+            found["rgb"] = found["rgb"] + (1 - found["alpha"]) * background
+        for name, views in drawn.items():
+            views.append(found[name])
+    return {name: views[0][None] if len(views) == 1 else torch.stack(views) for name, views in drawn.items()}

@@ -10,7 +10,7 @@ from torch import Tensor
 from .backend import cuda_backend, dense, kernel, on_same_device
 from .constants import BETA_MAX, IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
-from .trace import Fragments
+from .trace import Fragments, by_name
 
 
 class _CompositeImage(torch.autograd.Function):
@@ -19,22 +19,24 @@ class _CompositeImage(torch.autograd.Function):
         arrays = fragments.arrays
         g, c = dense(geom, geom), dense(colors, geom)
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
-        kernel("composite_forward", geom)(maps, g, fragments.layout, *arrays, c, image)
+        ctx.view = {"maps": maps, "width": fragments.width, "height": fragments.height, "layout": fragments.layout}
+        kernel("composite_forward", geom)(**ctx.view, **by_name(arrays), geom=g, colors=c, image=image)
         ctx.save_for_backward(g, c, *arrays)
-        ctx.layout, ctx.maps = fragments.layout, maps
         return image
 
     @staticmethod
     def backward(ctx, dimage):
-        geom, colors, *arrays = ctx.saved_tensors
-        dweight, dcolors, dgeom = torch.empty_like(arrays[2]), torch.empty_like(colors), torch.empty_like(geom)
-        ddepth = torch.empty_like(arrays[4]) if ctx.maps else None
-        # the CUDA kernel puts what a pair of surfel and tile adds to its surfel there
-        partial = (geom.new_empty(ctx.layout.pairs, 4 if ctx.maps else 1),) if cuda_backend(geom.device) else ()
-        kernel("composite_backward", geom)(
-            ctx.maps, geom, ctx.layout, *arrays, colors, dense(dimage, geom), *partial, dweight, dcolors, ddepth, dgeom
-        )
-        return dweight, ddepth, dgeom, dcolors, None, None
+        geom, colors, *rest = ctx.saved_tensors
+        arrays, maps = by_name(rest), ctx.view["maps"]
+        out = {"dweight": torch.empty_like(arrays["weight"])}
+        out |= {"dcolors": torch.empty_like(colors), "dgeom": torch.empty_like(geom)}
+        ddepth = torch.empty_like(arrays["depth"]) if maps else None
+        work = {}
+        if cuda_backend(geom.device):  # what a pair of surfel and tile adds to its surfel
+            work["partial"] = geom.new_empty(ctx.view["layout"].pairs, 4 if maps else 1)
+        inputs = {"geom": geom, "colors": colors, "dimage": dense(dimage, geom)}
+        kernel("composite_backward", geom)(**ctx.view, **arrays, **inputs, **work, **out, ddepth=ddepth)
+        return out["dweight"], ddepth, out["dgeom"], out["dcolors"], None, None
 
 
 def composite_image(fragments: Fragments, projection: Projection, colors: Tensor, maps: bool = False) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +10,9 @@ from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, kernel_class, module, on_same_device
 from .constants import FEATURES, WIDTH
+
+WEIGHTS = ("table", "w1", "w2", "w3")
+"""The kernels' names of the field's parameters."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +47,21 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
     for name, weight, shape in zip(("field_w1", "field_w2", "field_w3"), (w1, w2, w3), expected, strict=True):
         if tuple(weight.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(weight.shape)}")
-    weights = [dense(t, table) for t in (table, w1, w2, w3)]
-    g = geometry
-    return kernel_class("Field", table)(*weights, levels, log2_size, g.min_resolution, g.contract, tuple(g.mid), g.half)
+    weights = {name: dense(t, table) for name, t in zip(WEIGHTS, (table, w1, w2, w3), strict=True)}
+    where = {"min_resolution": geometry.min_resolution, "contract": geometry.contract}
+    where |= {"mid": tuple(geometry.mid), "half": geometry.half}
+    return kernel_class("Field", table)(**weights, **where, levels=levels, log2_size=log2_size)
+
+
+def gradients(params: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Memory for the gradients of the field's parameters, by the kernels' names."""
+    return {f"d{name}": torch.empty_like(p) for name, p in zip(WEIGHTS, params, strict=True)}
 
 
 def backward_memory(
     like: Tensor, table: Tensor | None, surfels: int = 0, frames: bool = False
-) -> tuple[Tensor | None, ...]:
-    """Working memory that the backward kernels of field and shading take as their last arguments: none on the CPU.
+) -> dict[str, Tensor | None]:
+    """Working memory of the backward kernels of field and shading, by name: none on the CPU.
 
     On CUDA: sums of the MLP's gradients per block; and, where torch is asked for deterministic algorithms
     (torch.use_deterministic_algorithms), int64 sums of what blocks add up together: a sum of integers does not depend
@@ -64,13 +74,13 @@ def backward_memory(
         frames: whether their frames get some, too.
     """
     if not cuda_backend(like.device):
-        return ()
+        return {}
     kernels = module(like.device)
     mlp = None if table is None else like.new_empty(kernels.MLP_WORK)
     if not torch.are_deterministic_algorithms_enabled():
-        return mlp, None
+        return {"mlp_work": mlp}
     numbers = kernels.exact_size(0 if table is None else table.numel(), surfels, frames)
-    return mlp, torch.empty(numbers, dtype=torch.int64, device=like.device)
+    return {"mlp_work": mlp, "exact_work": torch.empty(numbers, dtype=torch.int64, device=like.device)}
 
 
 class _Field(torch.autograd.Function):
@@ -78,7 +88,7 @@ class _Field(torch.autograd.Function):
     def forward(ctx, x, geometry, *params):
         points = dense(x, params[0])
         rho = torch.empty_like(points)
-        kernel("field_forward", points)(kernel_field(geometry, *params), points, rho)
+        kernel("field_forward", points)(field=kernel_field(geometry, *params), x=points, rho=rho)
         ctx.save_for_backward(points, *params)
         ctx.geometry = geometry
         return rho
@@ -86,13 +96,11 @@ class _Field(torch.autograd.Function):
     @staticmethod
     def backward(ctx, drho):
         points, *params = ctx.saved_tensors
-        grads = [torch.empty_like(p) for p in params]
+        grads = gradients(params)
         dx = torch.empty_like(points) if ctx.needs_input_grad[0] else None
-        memory = backward_memory(points, params[0])
-        kernel("field_backward", points)(
-            kernel_field(ctx.geometry, *params), points, dense(drho, points), *grads, dx, *memory
-        )
-        return dx, None, *grads
+        handle, memory = kernel_field(ctx.geometry, *params), backward_memory(points, params[0])
+        kernel("field_backward", points)(field=handle, x=points, drho=dense(drho, points), dx=dx, **grads, **memory)
+        return dx, None, *grads.values()
 
 
 def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:

@@ -52,16 +52,16 @@ def field_tiles(
     warps = -(-(where[:, 3].long() * where[:, 4].long()) // WARP)
     first = torch.cat([warps.new_zeros(1), warps.cumsum(0)])
     texels, bad = frames.new_zeros(*pages, 3), torch.zeros(1, dtype=torch.int32, device=frames.device)
-    kernel("bake_tiles", frames)(
-        kernel_field(geometry, table, w1, w2, w3),
-        dense(frames, frames),
-        dense(extent, frames),
-        where,
-        first,
-        int(first[-1]),
-        pages[2],
-        pages[1],
-        texels,
-        bad,
+    kernel("field_tiles", frames)(
+        field=kernel_field(geometry, table, w1, w2, w3),
+        frames=dense(frames, frames),
+        extent=dense(extent, frames),
+        tiles=where,
+        first=first,
+        warps=int(first[-1]),
+        height=pages[1],
+        width=pages[2],
+        pages=texels,
+        bad=bad,
     )
     return texels, bad

@@ -9,11 +9,11 @@ from .errors import TooManyFragments
 from .project import Projection
 
 
-def empty_list(geom: Tensor, count: int) -> tuple[Tensor, ...]:
-    """surfel, pixel, weight, uv, depth, sigma as in `Fragments`, for the kernels to fill."""
-    surfel, pixel = (geom.new_empty(count, dtype=torch.int32) for _ in range(2))
-    weight, depth, sigma = (geom.new_empty(count) for _ in range(3))
-    return surfel, pixel, weight, geom.new_empty(2, count), depth, sigma
+def empty_list(geom: Tensor, count: int) -> dict[str, Tensor]:
+    """The arrays of `Fragments` by name, for the kernels to fill."""
+    found = {name: geom.new_empty(count, dtype=torch.int32) for name in ("surfel", "pixel")}
+    found |= {name: geom.new_empty(count) for name in ("weight", "depth", "sigma")}
+    return found | {"uv": geom.new_empty(2, count)}
 
 
 def too_many(geom: Tensor, projection: Projection, count: int, most: int) -> TooManyFragments:

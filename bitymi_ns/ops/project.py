@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -72,6 +72,15 @@ class Projection:
             self.whole.mean2d_grad += grad
             self.whole.mean2d_absgrad += absgrad
 
+    def view(self, geom: Tensor) -> dict[str, Any]:
+        """What the kernels take of a view (`View` of csrc/ops/visibility.h).
+
+        Args:
+            geom: `self.geom` without its graph.
+        """
+        size = {"width": self.camera.width, "height": self.camera.height}
+        return dict(geom=geom, radii=self.radii, **size, near=self.near, through_pixel=self.through_pixel)
+
     @property
     def not_finite(self) -> int:
         """`broken` as a number; waits for the device."""
@@ -83,17 +92,22 @@ class Projection:
         return self.radii[:, 0] > 0
 
 
+GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
+"""Names of the parameters that say where surfels are."""
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, width, height, near, through_pixel
-    ):
-        n = means.shape[0]
-        inputs = [dense(t, means) for t in (means, quats, log_scales, opacity_logits, beta_raw, viewmat, K)]
-        geom, frames, radii = (means.new_empty(n, k) for k in (GEOM, FRAME, 2))
+    def forward(ctx, camera, near, through_pixel, *geometry):
+        means = geometry[0]
+        inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
+        inputs |= {"viewmat": dense(camera.viewmat, means), "K": dense(camera.K, means)}
+        geom, frames, radii = (means.new_empty(len(means), k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
-        kernel("project_forward", means)(*inputs, width, height, near, through_pixel, geom, frames, radii, broken)
-        ctx.save_for_backward(*inputs, geom)
+        view = {"width": camera.width, "height": camera.height, "near": near, "through_pixel": through_pixel}
+        kernel("project_forward", means)(**inputs, **view, geom=geom, frames=frames, radii=radii, broken=broken)
+        ctx.names = tuple(inputs)
+        ctx.save_for_backward(*inputs.values(), geom)
         ctx.mark_non_differentiable(radii, broken)
         ctx.set_materialize_grads(False)
         return geom, frames, radii, broken
@@ -103,9 +117,15 @@ class _Project(torch.autograd.Function):
         *inputs, geom = ctx.saved_tensors
         dgeom = torch.zeros_like(geom) if dgeom is None else dense(dgeom, geom)
         dframes = None if dframes is None else dense(dframes, geom)
-        out = [torch.empty_like(t) for t in inputs[:5]]
-        kernel("project_backward", geom)(*inputs, geom, dgeom, dframes, *out)
-        return *out, None, None, None, None, None, None
+        out = [torch.empty_like(t) for t in inputs[: len(GEOMETRY)]]
+        kernel("project_backward", geom)(
+            **dict(zip(ctx.names, inputs, strict=True)),
+            geom=geom,
+            dgeom=dgeom,
+            dframes=dframes,
+            **{f"d{name}": gradient for name, gradient in zip(GEOMETRY, out, strict=True)},
+        )
+        return None, None, None, *out
 
 
 def project(
@@ -143,8 +163,6 @@ def project(
     on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
-    view = (camera.viewmat, camera.K, camera.width, camera.height)
-    geom, frames, radii, broken = _Project.apply(
-        means, quats, log_scales, opacity_logits, beta_raw, *view, near, prefilter
-    )
+    geometry = (means, quats, log_scales, opacity_logits, beta_raw)
+    geom, frames, radii, broken = _Project.apply(camera, near, prefilter, *geometry)
     return Projection(geom, frames, radii, camera, near, prefilter, broken)

@@ -7,49 +7,47 @@ from torch import Tensor
 
 from .backend import dense, kernel, on_same_device
 from .constants import COLOR_BIAS, FRAME
-from .field import FieldGeometry, backward_memory, kernel_field
-from .trace import Fragments
+from .field import FieldGeometry, backward_memory, gradients, kernel_field
+from .trace import FRAGMENT, Fragments, by_name
 
 
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, base, frames, uv, fragments, geometry, bound, move, *params):
-        inputs = [dense(base, base), dense(frames, base)]
-        arrays = fragments.arrays
+        b, f, arrays = dense(base, base), dense(frames, base), fragments.arrays
         colors = base.new_empty(len(fragments), 3)
         handle = kernel_field(geometry, *params) if params else None
-        kernel("shade_forward", base)(*arrays, bound, *inputs, handle, colors)
-        ctx.save_for_backward(*inputs, fragments.tile_start, colors, *arrays, *params)
+        inputs = {"bound": bound, "base": b, "frames": f, "field": handle}
+        kernel("shade_forward", base)(**by_name(arrays), **inputs, colors=colors)
+        ctx.save_for_backward(b, f, colors, *arrays, *params)
         ctx.geometry, ctx.bound, ctx.move = geometry, bound, move
         return colors
 
     @staticmethod
     def backward(ctx, dcolors):
-        base, frames, tile_start, colors, *rest = ctx.saved_tensors
-        arrays, params = rest[:6], rest[6:]
+        base, frames, colors, *rest = ctx.saved_tensors
+        arrays, params = by_name(rest[: len(FRAGMENT)]), rest[len(FRAGMENT) :]
         learn = bool(params) and any(ctx.needs_input_grad[7:])
-        dbase = torch.empty_like(base)
-        grads = [torch.empty_like(p) for p in params] if learn else [None] * 4
+        dbase, grads = torch.empty_like(base), gradients(params) if learn else {}
         duv = dframes = None
         if learn and ctx.move:
-            duv, dframes = torch.empty_like(arrays[3]), torch.empty_like(frames)
-        handle = kernel_field(ctx.geometry, *params) if learn else None
+            duv, dframes = torch.empty_like(arrays["uv"]), torch.empty_like(frames)
         kernel("shade_backward", base)(
-            tile_start,
-            *arrays,
-            ctx.bound,
-            base,
-            frames,
-            handle,
-            colors,
-            dense(dcolors, base),
-            dbase,
-            *grads,
-            duv,
-            dframes,
-            *backward_memory(base, params[0] if learn else None, len(base), dframes is not None),
+            **arrays,
+            **grads,
+            **backward_memory(base, params[0] if learn else None, len(base), dframes is not None),
+            bound=ctx.bound,
+            base=base,
+            frames=frames,
+            field=kernel_field(ctx.geometry, *params) if learn else None,
+            colors=colors,
+            dcolors=dense(dcolors, base),
+            dbase=dbase,
+            duv=duv,
+            dframes=dframes,
         )
-        return dbase, dframes, duv, None, None, None, None, *(grads if params else ())
+        given = tuple(grads.values()) if learn else (None,) * len(params)
+        return dbase, dframes, duv, None, None, None, None, *given
 
 
 def view_base(f_view: Tensor) -> Tensor:

@@ -15,11 +15,12 @@ class _Ssim(torch.autograd.Function):
         x, y = dense(a, a), dense(b, a)
         grad = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         ctx.grad = grad
-        if not cuda_backend(x.device):
-            return x.new_tensor(kernel("ssim", x)(x, y, height, width, channels, grad))
         value = x.new_empty(())  # the host does not wait for it
-        space = workspace("ssim", x, height, width, channels, grad is not None)
-        kernel("ssim", x)(x, y, height, width, channels, grad, value, space)
+        size = {"height": height, "width": width, "channels": channels}
+        work = {}
+        if cuda_backend(x.device):
+            work["workspace"] = workspace("ssim", x, **size, gradient=grad is not None)
+        kernel("ssim", x)(a=x, b=y, **size, value=value, da=grad, **work)
         return value
 
     @staticmethod

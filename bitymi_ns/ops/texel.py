@@ -40,6 +40,11 @@ class TexelTiles:
         return cls(area.cumsum(0) - area, size.to(torch.int32).contiguous(), extent.contiguous())
 
     @property
+    def arrays(self) -> dict[str, Tensor]:
+        """What the kernels take of each tile."""
+        return {"first": self.first, "size": self.size, "extent": self.extent}
+
+    @property
     def count(self) -> int:
         """T: texels of all tiles."""
         return int(self.size.long().prod(dim=1).sum())
@@ -112,9 +117,9 @@ class TexelFragments:
         return sum(array.numel() * array.element_size() for array in arrays)
 
     @property
-    def arrays(self) -> tuple[Tensor, ...]:
-        """What the kernels take: surfel, pixel, weight, uv."""
-        return self.surfel, self.pixel, self.weight, self.uv
+    def arrays(self) -> dict[str, Tensor]:
+        """What the kernels take of each fragment."""
+        return {"surfel": self.surfel, "pixel": self.pixel, "weight": self.weight, "uv": self.uv}
 
 
 class _TexelImage(torch.autograd.Function):
@@ -122,8 +127,9 @@ class _TexelImage(torch.autograd.Function):
     def forward(ctx, base, texels, fragments, tiles, bound):
         b, t, f = dense(base, texels), dense(texels, texels), fragments
         image = t.new_empty(f.width * f.height, 3)
-        table = (tiles.first, tiles.size, tiles.extent)
-        kernel("texel_image_forward", t)(f.tile_start, *f.arrays, bound, b, *table, t, image)
+        kernel("texel_image_forward", t)(
+            **f.arrays, **tiles.arrays, tile_start=f.tile_start, bound=bound, base=b, texels=t, image=image
+        )
         ctx.save_for_backward(b, t)
         ctx.fragments, ctx.tiles, ctx.bound = fragments, tiles, bound
         return image
@@ -190,6 +196,8 @@ def add_texel_gradient(
         RuntimeError: the tensors are not on the CPU.
     """
     _on_the_cpu("add_texel_gradient", texels)
-    f, table = fragments, (tiles.first, tiles.size, tiles.extent)
-    gradients = (dense(dimage, texels), dtexels, dbase)
-    kernel("texel_image_backward", texels)(f.run_start, f.order, *f.arrays, bound, base, *table, texels, *gradients)
+    runs = {"run_start": fragments.run_start, "order": fragments.order}
+    inputs = {"bound": bound, "base": base, "texels": texels, "dimage": dense(dimage, texels)}
+    kernel("texel_image_backward", texels)(
+        **fragments.arrays, **tiles.arrays, **runs, **inputs, dtexels=dtexels, dbase=dbase
+    )

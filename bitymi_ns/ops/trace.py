@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +10,21 @@ import torch
 from torch import Tensor
 
 from . import trace_cpu, trace_cuda
-from .backend import cuda_backend, dense, function, on_same_device
+from .backend import cuda_backend, dense, function, kernel, on_same_device
 from .constants import GEOM
 from .errors import TooManyFragments
 from .project import Projection
 
 __all__ = ["Fragments", "TooManyFragments", "masked_counts", "trace"]
+
+
+FRAGMENT = ("surfel", "pixel", "weight", "uv", "depth", "sigma")
+"""The kernels' names of the arrays of a fragment list (`FragmentArrays` of csrc/ops/arguments.h)."""
+
+
+def by_name(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
+    """The arrays of a fragment list as the kernels take them."""
+    return dict(zip(FRAGMENT, arrays, strict=True))
 
 
 @dataclass
@@ -53,7 +62,7 @@ class Fragments:
 
     @property
     def arrays(self) -> tuple[Tensor, ...]:
-        """What the kernels take: surfel, pixel, weight, uv, depth, sigma, without their graph."""
+        """What the kernels take, without the graph, in the order of `FRAGMENT`."""
         return self.surfel, self.pixel, self.weight.detach(), self.uv.detach(), self.depth.detach(), self.sigma
 
     def lists(self) -> Iterator[Fragments]:
@@ -74,8 +83,8 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, projection, rim, most):
         find = trace_cuda.find if cuda_backend(geom.device) else trace_cpu.find
-        layout, tile_start, *arrays = find(geom.detach(), projection, most)
-        surfel, pixel, weight, uv, depth, sigma = arrays
+        layout, tile_start, found = find(geom.detach(), projection, most)
+        surfel, pixel, weight, uv, depth, sigma = arrays = [found[name] for name in FRAGMENT]
         ctx.save_for_backward(geom, *arrays)
         ctx.projection, ctx.rim, ctx.layout = projection, rim, layout
         ctx.mark_non_differentiable(surfel, pixel, sigma, tile_start)
@@ -85,11 +94,21 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def backward(ctx, dweight, duv, ddepth, *_):
         geom, *arrays = ctx.saved_tensors
-        projection = ctx.projection
-        grads = [None if g is None else dense(g, geom) for g in (dweight, duv, ddepth)]
+        projection, geom = ctx.projection, geom.detach()
+        grads = {"dweight": dweight, "duv": duv, "ddepth": ddepth}
+        grads = {name: None if g is None else dense(g, geom) for name, g in grads.items()}
         dgeom, absgrad = torch.empty_like(geom), geom.new_empty(geom.shape[0], 2)
-        back = trace_cuda.backward if cuda_backend(geom.device) else trace_cpu.backward
-        back(geom.detach(), projection, ctx.rim, ctx.layout, arrays, grads, dgeom, absgrad)
+        work = trace_cuda.backward_memory(geom, ctx.layout) if cuda_backend(geom.device) else {}
+        kernel("trace_backward", geom)(
+            **projection.view(geom),
+            **by_name(arrays),
+            **grads,
+            **work,
+            rim=ctx.rim,
+            layout=ctx.layout,
+            dgeom=dgeom,
+            absgrad=absgrad,
+        )
         projection.take_mean2d(dgeom[:, :2], absgrad)
         return dgeom, None, None, None
 
@@ -138,6 +157,7 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
     counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    where = (fragments.layout,) if cuda_backend(counts.device) else (fragments.surfel, fragments.pixel)
-    function("masked_counts", counts.device)(*where, flat, counts)
+    f = fragments
+    where = {"layout": f.layout, "width": f.width, "height": f.height, "surfel": f.surfel, "pixel": f.pixel}
+    function("masked_counts", counts.device)(**where, mask=flat, counts=counts)
     return counts

@@ -6,14 +6,13 @@ of surfel and tile, and for the number of fragments. Nothing else in a training 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import kernel, module, workspace
+from .backend import kernel, module, require, workspace
 from .constants import TILE
 from .fragment_list import empty_list, too_many
 from .project import Projection
@@ -57,49 +56,40 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     Raises:
         RuntimeError: 2^31 pairs or more.
     """
-    camera, n = projection.camera, geom.shape[0]
-    size = (camera.width, camera.height)
+    require("trace_cuda.tile_lists", "cuda", geom.device, "call `trace`")
+    camera, n, view = projection.camera, geom.shape[0], projection.view(geom)
     tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-    order, slot_start = _ints(geom, n), _longs(geom, n + 1)
-    space = workspace("bin_count", geom, n)
-    kernel("bin_count", geom)(geom, projection.radii, *size, projection.through_pixel, order, slot_start, space)
-    pairs = int(slot_start[-1])
+    ranks = {"order": _ints(geom, n), "slot_start": _longs(geom, n + 1)}
+    kernel("bin_count", geom)(**view, **ranks, workspace=workspace("bin_count", geom, n=n))
+    pairs = int(ranks["slot_start"][-1])
     if pairs >= 2**31:
         raise RuntimeError(
             f"the view has {pairs:,} pairs of surfel and tile, not below 2^31: the surfels are far too large for an "
             f"image of {camera.width} x {camera.height} pixels"
         )
-    slot, surfel, tile_pairs = _ints(geom, pairs), _ints(geom, pairs), _longs(geom, tiles + 1)
-    space = workspace("bin_fill", geom, pairs, *size)
-    kernel("bin_fill", geom)(geom, *size, projection.through_pixel, order, slot_start, slot, surfel, tile_pairs, space)
-    return Bins(order, slot_start, slot, surfel, tile_pairs)
+    lists = {"slot": _ints(geom, pairs), "surfel": _ints(geom, pairs), "tile_pairs": _longs(geom, tiles + 1)}
+    space = workspace("bin_fill", geom, pairs=pairs, width=camera.width, height=camera.height)
+    kernel("bin_fill", geom)(**view, **ranks, **lists, workspace=space)
+    return Bins(**ranks, **lists)
 
 
 def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tensor]:
     """Which pixels blend which pairs: the layout of the fragment list and tile_start [tiles + 1] int64; waits once for
     the number of fragments."""
+    require("trace_cuda.blended", "cuda", geom.device, "call `trace`")
     camera, pairs = projection.camera, bins.surfel.shape[0]
-    size = (camera.width, camera.height)
-    masks, offsets = _ints(geom, module(geom.device).TILE_WARPS, pairs), _longs(geom, pairs + 1)
+    marks = {"masks": _ints(geom, module(geom.device).TILE_WARPS, pairs), "offsets": _longs(geom, pairs + 1)}
     tile_start = torch.empty_like(bins.tile_pairs)
-    space = workspace("trace_mark", geom, pairs)
     kernel("trace_mark", geom)(
-        geom,
-        projection.radii,
-        projection.near,
-        projection.through_pixel,
-        *size,
-        bins.surfel,
-        bins.tile_pairs,
-        masks,
-        offsets,
-        tile_start,
-        space,
+        **projection.view(geom),
+        **marks,
+        surfel=bins.surfel,
+        tile_pairs=bins.tile_pairs,
+        tile_start=tile_start,
+        workspace=workspace("trace_mark", geom, pairs=pairs),
     )
-    count = int(offsets[-1])
-    layout = module(geom.device).Pairs(
-        *size, count, bins.surfel, bins.slot, masks, offsets, bins.tile_pairs, bins.order, bins.slot_start
-    )
+    count = int(marks["offsets"][-1])
+    layout = module(geom.device).Pairs(**marks, **vars(bins), width=camera.width, height=camera.height, fragments=count)
     return layout, tile_start
 
 
@@ -118,18 +108,18 @@ def check_room(geom: Tensor, projection: Projection, count: int, most: int | Non
         raise too_many(geom, projection, count, most)
 
 
-def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[Tensor, ...]:
-    """surfel, pixel, weight, uv, depth, sigma as in `Fragments`; raises TooManyFragments where they find no room."""
+def fill(geom: Tensor, projection: Projection, layout: Any) -> dict[str, Tensor]:
+    """The arrays of `Fragments` by name; raises TooManyFragments where they find no room."""
     count = layout.fragments
     try:
-        arrays = empty_list(geom, count)
+        found = empty_list(geom, count)
     except torch.cuda.OutOfMemoryError as error:
         raise too_many(geom, projection, count, room(geom)) from error
-    kernel("trace_fill", geom)(geom, projection.near, projection.through_pixel, layout, *arrays)
-    return arrays
+    kernel("trace_fill", geom)(**projection.view(geom), **found, layout=layout)
+    return found
 
 
-def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Any, ...]:
+def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Any, Tensor, dict[str, Tensor]]:
     """The fragments of a view.
 
     Args:
@@ -138,7 +128,7 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
         most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
 
     Returns:
-        layout, tile_start, surfel, pixel, weight, uv, depth, sigma as in `Fragments`.
+        layout, tile_start, and the arrays of `Fragments` by name.
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more.
@@ -146,21 +136,10 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
     """
     layout, tile_start = blended(geom, projection, tile_lists(geom, projection))
     check_room(geom, projection, layout.fragments, most)
-    return layout, tile_start, *fill(geom, projection, layout)
+    return layout, tile_start, fill(geom, projection, layout)
 
 
-def backward(
-    geom: Tensor,
-    projection: Projection,
-    rim: float,
-    layout: Any,
-    arrays: Sequence[Tensor],
-    grads: Sequence[Tensor | None],
-    dgeom: Tensor,
-    absgrad: Tensor,
-) -> None:
-    """Writes dgeom [N, 16] and absgrad [N, 2] from the gradients of weight, uv and depth (None = zero)."""
-    dsigma = geom.new_empty(layout.fragments)
+def backward_memory(geom: Tensor, layout: Any) -> dict[str, Tensor]:
+    """Working memory of the backward kernel, by name."""
     partial = geom.new_empty(layout.pairs, module(geom.device).TRACE_SUMS)
-    near, through = projection.near, projection.through_pixel
-    kernel("trace_backward", geom)(geom, near, through, rim, layout, *arrays, *grads, dsigma, partial, dgeom, absgrad)
+    return {"dsigma": geom.new_empty(layout.fragments), "partial": partial}

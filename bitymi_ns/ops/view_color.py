@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -15,27 +15,37 @@ LEAN = ("view_base", "view_span", "view_terms")
 """Names of the parameters of lean view colours, of which every surfel has as many terms as it needs."""
 
 
+def _directions(means: Tensor, center: Tensor, active: Tensor) -> dict[str, Tensor]:
+    origin = dense(center, center.double()).to(means.device)
+    return {"means": dense(means, means), "center": origin, "active": active}
+
+
+def lettered(parameters: Sequence[Tensor], prefix: str = "") -> dict[str, Tensor]:
+    """Parameters by the kernels' names: a, b and, where there is a third, c."""
+    return {prefix + letter: p for letter, p in zip("abc", parameters, strict=False)}
+
+
 class _ViewColor(torch.autograd.Function):
     @staticmethod
     def forward(ctx, kind, terms, active, center, means, *params):
         inputs = [dense(p, means) for p in params]
-        a, b, c = (*inputs, None) if len(inputs) == 2 else inputs
-        x, o = dense(means, means), dense(center, center.double()).to(means.device)
+        to = _directions(means, center, active)
         out = means.new_empty(means.shape[0], 3)
-        kernel("view_color_forward", means)(kind, terms, a, b, c, x, o, active, out)
-        ctx.save_for_backward(x, o, active, *inputs)
+        kernel("view_color_forward", means)(kind=kind, terms=terms, **lettered(inputs), **to, out=out)
+        ctx.save_for_backward(*to.values(), *inputs)
         ctx.kind, ctx.terms = kind, terms
         return out
 
     @staticmethod
     def backward(ctx, dout):
-        x, o, active, *inputs = ctx.saved_tensors
-        a, b, c = (*inputs, None) if len(inputs) == 2 else inputs
-        da, db = torch.empty_like(a), torch.empty_like(b)
-        dc = None if c is None else torch.empty_like(c)
-        dx = torch.empty_like(x)
-        kernel("view_color_backward", x)(ctx.kind, ctx.terms, a, b, c, x, o, active, dense(dout, x), da, db, dc, dx)
-        return None, None, None, None, dx, *((da, db) if dc is None else (da, db, dc))
+        means, center, active, *inputs = ctx.saved_tensors
+        to = {"means": means, "center": center, "active": active}
+        dmeans, grads = torch.empty_like(means), [torch.empty_like(p) for p in inputs]
+        parameters = {**lettered(inputs), **lettered(grads, "d")}
+        kernel("view_color_backward", means)(
+            kind=ctx.kind, terms=ctx.terms, **parameters, **to, dout=dense(dout, means), dmeans=dmeans
+        )
+        return None, None, None, None, dmeans, *grads
 
 
 def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
@@ -100,11 +110,9 @@ def view_color(
     flags = means.new_ones(n, dtype=torch.uint8) if active is None else active.to(means.device, torch.uint8)
     if "view_terms" in params:
         base, span, terms = (params[name] for name in LEAN)
-        x, out = dense(means, means), means.new_empty(n, 3)
-        origin = dense(center, center.double()).to(means.device)
-        kernel("lean_color", means)(
-            kind, dense(base, means), span.contiguous(), dense(terms, means), x, origin, flags, out
-        )
+        out, to = means.new_empty(n, 3), _directions(means, center, flags)
+        colors = {"base": dense(base, means), "span": span.contiguous(), "lean": dense(terms, means)}
+        kernel("lean_color", means)(kind=kind, **colors, **to, out=out)
         return out
     terms = check_view_color(kind, params, n)
     entry = entry_of(kind)

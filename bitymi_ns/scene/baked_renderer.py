@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.baked import Stage, Workspace, draw, empty_images
+from bitymi_ns.ops.baked_cuda import Stage, Workspace, compiled, empty_images, frame, stack_cameras
 
-from .baked import BakedScene, stack_cameras
+from .baked import BakedScene
 from .camera import Camera
 
 
@@ -45,9 +45,9 @@ class BakedRenderer:
             raise RuntimeError("the scene is on the CPU: move it to a CUDA device, or use BakedScene.render")
         if graph and device.type != "cuda":
             raise ValueError("CUDA graphs need a card")
-        self.arrays = scene.arrays()
-        self.images = empty_images(tuple(images), views, width, height, device)
-        self.workspace = Workspace()
+        self._scene, self._surfels = compiled(scene), len(scene)
+        self.images = empty_images(images, views, width, height, device)
+        self.workspace = Workspace(device)
         self._viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
         self._Ks = torch.eye(3, device=device).repeat(views, 1, 1)
         self._background = None if background is None else background.to(device, torch.float32).contiguous()
@@ -94,12 +94,12 @@ class BakedRenderer:
 
     def complete(self) -> bool:
         """Whether the working memory was large enough for the latest frame; waits for it."""
-        return len(self.arrays.tiles) == 0 or self.workspace.pairs <= self.workspace.capacity
+        return self._surfels == 0 or self.workspace.pairs <= self.workspace.capacity
 
     def _draw(self, stages: Stage) -> None:
-        draw(self.arrays, self._viewmats, self._Ks, self._background, self.images, self.workspace, stages)
+        frame(self._scene, self._viewmats, self._Ks, self._background, self.images, self.workspace, stages)
 
     def _fit(self, capacity: int) -> None:
         views, width, height = self._size
-        self.workspace.fit(self.arrays, views, width, height, "normal" in self.images, capacity)
+        self.workspace.fit(self._surfels, views, width, height, "normal" in self.images, capacity)
         self._graph = None  # it points at the old memory

@@ -1,17 +1,23 @@
-// bitymi_ns._cpu, or a module of another name for another CPU: arrays in, arrays out. The caller allocates; shapes and
-// dtypes are checked here, values in Python.
-#include "bindings/cpu.h"
+// bitymi_ns._cpu, or a module of another name for another CPU. Every operation takes its struct's arguments by keyword
+// (csrc/ops); the caller allocates; shapes and dtypes are checked on the way (reader.h), values in Python.
+#include <nanobind/stl/optional.h>
 
-#include <nanobind/stl/tuple.h>
+#include "bindings/reader.h"
 
 #if defined(__GLIBC__) || __has_include(<malloc.h>)
 #include <malloc.h>
 #endif
 
 #include "core/shading.h"
+#include "cpu/kernels.h"
 #include "cpu/threads.h"
 
+namespace bt {
 namespace {
+using namespace nb::literals;
+
+const Device kHost = {nb::device::cpu::value, "the CPU", false};
+
 // Settings of the whole process that the kernels are fast with. Not made on import: who only reads a constant keeps his
 // threads and his memory as they are.
 void set_up_process() {
@@ -22,39 +28,105 @@ void set_up_process() {
   mallopt(M_TRIM_THRESHOLD, 1 << 30);
   mallopt(M_TOP_PAD, 64 << 20);
 #endif
-  bt::wait_without_spinning();
+  wait_without_spinning();
+}
+
+template <class Arguments>
+void bind_operation(nb::module_& m, const std::string& name, void (*run)(const Arguments&)) {
+  m.def(name.c_str(), [name, run](const nb::kwargs& given) {
+    Reader r(name, given, kHost);
+    const Arguments a = read<Arguments>(r);
+    nb::gil_scoped_release release;
+    run(a);
+  });
+}
+
+// The pages of an atlas, until gathered.
+struct Pages {
+  const uint8_t* bytes;
+  const float* floats;
+  std::tuple<int, int, int> shape;
+  int64_t n;
+  const int32_t* tiles;
+
+  template <class R>
+  void fields(R& r) {
+    r.number("layers", std::get<0>(shape));
+    r.number("height", std::get<1>(shape));
+    r.number("width", std::get<2>(shape));
+    const int64_t texels = int64_t(std::get<0>(shape)) * std::get<1>(shape) * std::get<2>(shape) * 4;
+    r.maybe("bytes", bytes, texels);
+    r.maybe("floats", floats, texels);
+    r.rows("tiles", tiles, n, 5);
+  }
+};
+
+template <class S>
+void bind_tracer(nb::module_& m) {
+  const std::string name = std::string("Trace") + kSuffix<S>;
+  nb::class_<Trace<S>>(m, name.c_str())
+      .def(nb::init<>())
+      .def("run",
+           [](Trace<S>& t, const nb::kwargs& given) {
+             Reader r("Trace.run", given, kHost);
+             const TraceForward<S> a = read<TraceForward<S>>(r);
+             nb::gil_scoped_release release;
+             trace_forward(a, t);
+             return t.list.total;
+           })
+      .def_prop_ro("tiles", [](const Trace<S>& t) { return int64_t(t.bins.tiles_x) * t.bins.tiles_y; })
+      .def_prop_ro("pairs", [](const Trace<S>& t) { return int64_t(t.bins.surfels.size()); })
+      .def("copy", [](Trace<S>& t, const nb::kwargs& given) {
+        Reader r("Trace.copy", given, kHost);
+        const TraceCopy<S> a = read<TraceCopy<S>>(r);
+        nb::gil_scoped_release release;
+        trace_copy(a, t);
+      });
+}
+
+template <class S>
+void bind_operations(nb::module_& m) {
+  const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
+  bind_class<FieldArrays<S>>(m, name("Field"), kHost, "The parameters of a residual field.");
+  bind_tracer<S>(m);
+  bind_operation(m, name("project_forward"), &project_forward<S>);
+  bind_operation(m, name("project_backward"), &project_backward<S>);
+  bind_operation(m, name("trace_backward"), &trace_backward<S>);
+  bind_operation(m, name("composite_forward"), &composite_forward<S>);
+  bind_operation(m, name("composite_backward"), &composite_backward<S>);
+  bind_operation(m, name("view_color_forward"), &view_color_forward<S>);
+  bind_operation(m, name("view_color_backward"), &view_color_backward<S>);
+  bind_operation(m, name("lean_color"), &lean_color<S>);
+  bind_operation(m, name("field_forward"), &field_forward<S>);
+  bind_operation(m, name("field_backward"), &field_backward<S>);
+  bind_operation(m, name("shade_forward"), &shade_forward<S>);
+  bind_operation(m, name("shade_backward"), &shade_backward<S>);
+  bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
+  bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
+  bind_operation(m, name("ssim"), &ssim<S>);
+  bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }
 }  // namespace
+}  // namespace bt
 
 NB_MODULE(BITYMI_MODULE, m) {
   using namespace bt;
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
   m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // what of a CPU this needs, as in bitymi_ns._cpu_features
+  nb::class_<Bins>(m, "Bins", "Memory for a view's tile lists, kept from frame to frame.").def(nb::init<>());
   nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
-      .def(
-          "__init__",
-          [](Patches* self, Maybe<const uint8_t> bytes, Maybe<const float> floats, std::tuple<int, int, int> shape,
-             Array<const int32_t> tiles) {
-            const auto [layers, rows, columns] = shape;
-            const int64_t texels = int64_t(layers) * rows * columns * 4, n = int64_t(tiles.size()) / 5;
-            const uint8_t* b = data_or_null(bytes, texels, "atlas bytes");
-            const float* f = data_or_null(floats, texels, "atlas floats");
-            data(tiles, 5 * n, "tiles");
-            new (self) Patches();
-            nb::gil_scoped_release release;
-            gather_patches(layers, rows, columns, b, f, n, tiles.data(), *self);
-          },
-          "bytes"_a.noconvert().none(), "floats"_a.noconvert().none(), "shape"_a, "tiles"_a.noconvert());
-  bind_visibility(m);
-  bind_appearance(m);
-  m.def(
-      "masked_counts",
-      [](Array<const int32_t> surfel, Array<const int32_t> pixel, Array<const uint8_t> mask, Array<int32_t> counts) {
-        const int64_t n = int64_t(surfel.size());
-        masked_counts(n, surfel.data(), data(pixel, n, "pixel"), mask.data(), counts.data());
-      },
-      "surfel"_a.noconvert(), "pixel"_a.noconvert(), "mask"_a.noconvert(), "counts"_a.noconvert());
+      .def("__init__", [](Patches* self, const nb::kwargs& given) {
+        Reader r("Patches", given, kHost);
+        const Pages p = read<Pages>(r);
+        new (self) Patches();
+        nb::gil_scoped_release release;
+        const auto [layers, height, width] = p.shape;
+        gather_patches(layers, height, width, p.bytes, p.floats, p.n, p.tiles, *self);
+      });
+  bind_operations<float>(m);
+  bind_operations<double>(m);
+  bind_operation(m, "masked_counts", &masked_counts);
   m.attr("SUPPORT") = kSupport, m.attr("ALPHA_MAX") = kAlphaMax, m.attr("ALPHA_MIN") = kAlphaMin;
   m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin, m.attr("BETA_MAX") = kBetaMax, m.attr("TILE") = kTile;
   m.attr("GEOM") = int(kGeom), m.attr("FRAME") = kFrame;

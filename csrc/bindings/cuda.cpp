@@ -1,26 +1,137 @@
-// bitymi_ns._cuda: the functions of bitymi_ns._cpu for arrays on a CUDA device, each with the stream that it runs on.
+// bitymi_ns._cuda: the operations of bitymi_ns._cpu for arrays on a CUDA device, each with the stream that it runs on.
 // The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
-#include "bindings/cuda.h"
+#include <nanobind/stl/vector.h>
 
-#include <nanobind/stl/string.h>
-
+#include "bindings/reader.h"
+#include "cuda/atlas_texture.h"
+#include "cuda/baked.h"
 #include "cuda/device_check.h"
+#include "cuda/kernels.h"
 
-using namespace nanobind::literals;
+namespace bt::cuda {
+namespace {
+using namespace nb::literals;
+
+#if defined(BITYMI_EMULATED)
+const Device kCard = {nb::device::cpu::value, "the CPU", true};
+#else
+const Device kCard = {nb::device::cuda::value, "a CUDA device", true};
+#endif
+
+// Its arguments and the stream, which torch gives as a number.
+template <class Arguments>
+struct OnStream {
+  Arguments arguments;
+  uint64_t stream;
+
+  template <class R>
+  void fields(R& r) {
+    arguments.fields(r);
+    if (r.given("stream")) r.number("stream", stream);
+  }
+};
+template <class Arguments>
+void bind_operation(nb::module_& m, const std::string& name, void (*run)(const Arguments&, Stream)) {
+  m.def(name.c_str(), [name, run](const nb::kwargs& given) {
+    Reader r(name, given, kCard);
+    const auto a = read<OnStream<Arguments>>(r);
+    run(a.arguments, reinterpret_cast<Stream>(uintptr_t(a.stream)));
+  });
+}
+
+template <class S>
+void bind_operations(nb::module_& m) {
+  const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
+  bind_class<FieldArrays<S>>(m, name("Field"), kCard, "The parameters of a residual field.");
+  bind_operation(m, name("project_forward"), &project_forward<S>);
+  bind_operation(m, name("project_backward"), &project_backward<S>);
+  bind_operation(m, name("bin_count"), &bin_count<S>);
+  bind_operation(m, name("bin_fill"), &bin_fill<S>);
+  bind_operation(m, name("trace_mark"), &trace_mark<S>);
+  bind_operation(m, name("trace_fill"), &trace_fill<S>);
+  bind_operation(m, name("trace_backward"), &trace_backward<S>);
+  bind_operation(m, name("composite_forward"), &composite_forward<S>);
+  bind_operation(m, name("composite_backward"), &composite_backward<S>);
+  bind_operation(m, name("view_color_forward"), &view_color_forward<S>);
+  bind_operation(m, name("view_color_backward"), &view_color_backward<S>);
+  bind_operation(m, name("lean_color"), &lean_color<S>);
+  bind_operation(m, name("field_forward"), &field_forward<S>);
+  bind_operation(m, name("field_backward"), &field_backward<S>);
+  bind_operation(m, name("field_tiles"), &field_tiles<S>);
+  bind_operation(m, name("shade_forward"), &shade_forward<S>);
+  bind_operation(m, name("shade_backward"), &shade_backward<S>);
+  bind_operation(m, name("ssim"), &ssim<S>);
+  // bytes of working memory
+  m.def(name("bin_count_workspace").c_str(), &bin_count_workspace<S>, "n"_a);
+  m.def(name("bin_fill_workspace").c_str(), &bin_fill_workspace, "pairs"_a, "width"_a, "height"_a);
+  m.def(name("trace_mark_workspace").c_str(), &trace_mark_workspace, "pairs"_a);
+  m.def(name("ssim_workspace").c_str(), &ssim_workspace<S>, "height"_a, "width"_a, "channels"_a, "gradient"_a);
+}
+
+constexpr const char* kFormats[] = {"bc7", "uint8", "half"};
+struct Texels {
+  int format, layers, height, width;
+  const uint8_t* texels;
+
+  template <class R>
+  void fields(R& r) {
+    r.choice("format", format, kFormats);
+    r.number("layers", layers);
+    r.number("height", height);
+    r.number("width", width);
+    const int bytes[] = {1, 4, 8};  // per texel
+    r.array("texels", texels, bytes[format] * layers * int64_t(height) * width);
+  }
+};
+
+void bind_baked(nb::module_& m) {
+  nb::class_<AtlasTexture>(m, "AtlasTexture")
+      .def("__init__",
+           [](AtlasTexture* to, const nb::kwargs& given) {
+             const Device host = {nb::device::cpu::value, "the CPU", false};
+             Reader r("AtlasTexture", given, host);
+             const Texels t = read<Texels>(r);
+             new (to) AtlasTexture(TexelFormat(t.format), t.layers, t.height, t.width, t.texels);
+           })
+      .def_prop_ro("handles", &AtlasTexture::handles);
+  bind_class<BakedScene>(m, "BakedScene", kCard, "A baked scene as the kernels read it.");
+  bind_operation(m, "baked_frame", &baked_frame);
+  m.def(
+      "baked_memory",
+      [](int64_t surfels, int views, int width, int height, int64_t capacity, bool normals) {
+        return baked_memory(surfels, {views, width, height, nullptr, nullptr}, capacity, normals);
+      },
+      "surfels"_a, "views"_a, "width"_a, "height"_a, "capacity"_a, "normals"_a, "Bytes of working memory of a frame.");
+  m.attr("MOST_ROWS") = kMostRows;
+  m.attr("MOST_PAIRS") = kMostPairs;
+}
+
+void bind_all(nb::module_& m) {
+  m.def("device_problem", &device_problem, "device"_a,
+        "Why the kernels cannot run on a CUDA device and what to do about it; empty when they can.");
+  bind_class<Pairs>(m, "Pairs", kCard, "How kernels find their way in a fragment list (csrc/cuda/pairs.h).")
+      .def_prop_ro("pairs", [](const Held<Pairs>& p) { return p.pairs; })
+      .def_prop_ro("fragments", [](const Held<Pairs>& p) { return p.fragments; });
+  bind_operations<float>(m);
+  bind_operations<double>(m);
+  bind_operation(m, "masked_counts", &masked_counts);
+  bind_baked(m);
+  m.attr("TILE_WARPS") = kTileWarps;
+  m.attr("TRACE_SUMS") = kTraceSums;
+  m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
+  m.def("exact_size", &exact_size, "entries"_a, "surfels"_a, "frames"_a, "Numbers of exact_work, int64.");
+}
+}  // namespace
+}  // namespace bt::cuda
 
 #if defined(BITYMI_EMULATED)
 NB_MODULE(_emulated, m) {
   m.doc() = "The CUDA kernels, thread by thread on the host: for tests.";
-  m.def("set_seed", &bt::emulator::set_seed, "seed"_a, "Seed of the order in which a block's threads take turns.");
+  m.def("set_seed", &bt::emulator::set_seed, nanobind::arg("seed"),
+        "Seed of the order in which a block's threads take turns.");
 #else
 NB_MODULE(_cuda, m) {
   m.doc() = "CUDA kernels: see bitymi_ns.ops for their meaning.";
 #endif
-  m.def("device_problem", &bt::cuda::device_problem, "device"_a,
-        "Why the kernels cannot run on a CUDA device and what to do about it; empty when they can.");
-  bt::cuda::bind_project(m);
-  bt::cuda::bind_trace(m);
-  bt::cuda::bind_baked(m);
-  bt::cuda::bind_field(m);
-  bt::cuda::bind_appearance(m);
+  bt::cuda::bind_all(m);
 }

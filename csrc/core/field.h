@@ -23,10 +23,34 @@ struct FieldArrays {
   BT_HD int64_t table_size() const { return first_entry(levels) * kFeatures; }
   BT_HD uint32_t hash_mask() const { return (1u << log2_size) - 1u; }
   BT_HD S resolution(int level) const { return S(min_resolution << level); }  // cells along an edge
+  // as in ops/arguments.h
+  template <class R>
+  void fields(R& r) {
+    r.number("levels", levels);
+    r.number("log2_size", log2_size);
+    r.number("min_resolution", min_resolution);
+    r.number("contract", contract);
+    r.number("mid", mid);
+    r.number("half", half);
+    if (levels < 1 || levels > kMaxLevels || log2_size < 1 || log2_size > 28)
+      r.refuse("a field has 1 to 4 levels and 2 to 2^28 entries per level");
+    r.wide("table", table, table_size());
+    r.array("w1", w1, levels * kFeatures * kWidth);
+    r.array("w2", w2, kWidth * kWidth);
+    r.array("w3", w3, kWidth * 3);
+  }
 };
 template <class S>
 struct FieldGradients {
   S *table, *w1, *w2, *w3;
+
+  template <class R>
+  void fields(R& r, const FieldArrays<S>& field) {
+    r.wide("dtable", table, field.table_size());
+    r.array("dw1", w1, field.levels * kFeatures * kWidth);
+    r.array("dw2", w2, kWidth * kWidth);
+    r.array("dw3", w3, kWidth * 3);
+  }
 };
 
 // Unsigned integers as wide as a real; hashing needs their low 32 bits only.

@@ -62,10 +62,28 @@ template <class S>
 struct Surfels {
   int64_t n;
   const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+
+  template <class R>  // as in ops/arguments.h
+  void fields(R& r) {
+    r.rows("opacity_logits", opacity_logits, n, 1);
+    r.array("means", means, 3 * n);
+    r.array("quats", quats, 4 * n);
+    r.array("log_scales", log_scales, 2 * n);
+    r.array("beta_raw", beta_raw, n);
+  }
 };
 template <class S>
 struct SurfelGradients {
   S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+
+  template <class R>
+  void fields(R& r, int64_t n) {
+    r.array("dmeans", means, 3 * n);
+    r.array("dquats", quats, 4 * n);
+    r.array("dlog_scales", log_scales, 2 * n);
+    r.array("dopacity_logits", opacity_logits, n);
+    r.array("dbeta_raw", beta_raw, n);
+  }
 };
 
 // Rotation matrix columns of a quaternion wxyz of any length.

@@ -256,15 +256,8 @@ BT_HD void sg_color_vjp(int K, const S* lobes, Vec3<S> d, Vec3<S> dc, S* dbase, 
   }
 }
 
-// The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes:
-// sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
-// sb, sg a = base [n,3], b = lobes [n,K,6 or 7].
 enum ViewColorKind { kSv, kSh, kSb, kSg };
-template <class S>
-struct ViewColorArrays {
-  int kind, terms;
-  S *a, *b, *c;
-};
+constexpr const char* kViewColorNames[] = {"sv", "sh", "sb", "sg"};
 // Numbers per surfel of a, b and c.
 struct ViewColorWidths {
   int64_t a, b, c;
@@ -278,6 +271,29 @@ BT_HD ViewColorWidths view_color_widths(int kind, int K) {
 }
 // Terms of the presets: kernels that unroll their loops are compiled for these.
 constexpr int preset_terms(int kind) { return kind == kSv ? 7 : kind == kSh ? 16 : 2; }
+// The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes:
+// sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
+// sb, sg a = base [n,3], b = lobes [n,K,6 or 7].
+template <class S>
+struct ViewColorArrays {
+  int kind, terms;
+  S *a, *b, *c;
+
+  template <class R>  // as in ops/arguments.h
+  void fields(R& r, int64_t n) {
+    r.choice("kind", kind, kViewColorNames);
+    r.number("terms", terms);
+    arrays(r, n, "a", "b", "c");
+  }
+  template <class R>
+  void arrays(R& r, int64_t n, const char* name_a, const char* name_b, const char* name_c) {
+    if (terms < (kind == kSv || kind == kSh) || terms > kMaxTerms) r.refuse("a view colour has 1 to 32 terms");
+    const ViewColorWidths w = view_color_widths(kind, terms);
+    r.array(name_a, a, w.a * n);
+    r.array(name_b, b, w.b * n);
+    if (w.c) r.array(name_c, c, w.c * n);
+  }
+};
 // Colour of surfel i. kind and K are those of p; a kernel that knows them when it is compiled unrolls its loops.
 template <class S>
 BT_HD Vec3<S> view_color(int kind, int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d) {
@@ -287,6 +303,7 @@ BT_HD Vec3<S> view_color(int kind, int K, const ViewColorArrays<const S>& p, int
   if (kind == kSh) return sh_color(K, a, b, d);
   return kind == kSb ? sb_color(K, a, b, d) : sg_color(K, a, b, d);
 }
+BT_HD int lean_width(int kind) { return kind == kSh ? 3 : kind == kSg ? 7 : 6; }
 // View colours of which only what a surfel needs is left: a base colour, and as many terms as its span says. Terms are
 // b, rgb (sv_relative_color), coefficients from the first degree on (sh), or lobes (sb, sg).
 template <class S>
@@ -294,8 +311,15 @@ struct LeanColors {
   int kind;
   const S *base, *terms;  // [n, 3], [all terms, lean_width(kind)]
   const int32_t* span;    // [n, 2]: first term, how many
+
+  template <class R>
+  void fields(R& r, int64_t n, int64_t& count) {
+    r.choice("kind", kind, kViewColorNames);
+    r.array("base", base, 3 * n);
+    r.array("span", span, 2 * n);
+    r.rows("lean", terms, count, lean_width(kind));
+  }
 };
-BT_HD int lean_width(int kind) { return kind == kSh ? 3 : kind == kSg ? 7 : 6; }
 template <class S>
 BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, Vec3<S> d) {
   const int K = p.span[2 * i + 1];

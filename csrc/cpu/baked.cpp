@@ -91,12 +91,19 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
 
 namespace {
 template <class Kernel, class S>
-void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, bool maps,
-                   const S* base, const Atlas& atlas, S* image, int32_t* overdraw) {
+void baked_forward(const BakedForward<S>& a) {
   using P = Pack<S>;
+  const S *geom = a.view.geom, *radii = a.view.radii, *base = a.base, near = a.view.near;
+  const int width = a.view.width, height = a.view.height;
+  const bool maps = a.maps;
+  const Bins& bins = *a.bins;
+  const BakedResidual& atlas = a.residual;
+  S* image = a.image;
+  int32_t* overdraw = a.overdraw;
+  constexpr float kNone[3] = {0, 0, 0};
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   const int channels = maps ? kMapChannels : kBakedChannels;
-  const Patches& patches = atlas.patches;
+  const Patches& patches = *a.patches;
 #pragma omp parallel for num_threads(num_threads()) schedule(dynamic, 2)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
@@ -110,10 +117,10 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
       const S* g = geom + id * kGeom;
       const int32_t* sides = patches.sides.data() + 2 * id;
       const bool tiled = sides[0] != 0;
-      const float* flat = atlas.mean_residual + 3 * id;
+      const float* flat = atlas.mean_residual ? atlas.mean_residual + 3 * id : kNone;
       const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
       const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
-      const S extent = S(atlas.extent[id]);
+      const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
       S view[3];
       store3(view, view_base(load3(base + 3 * id)));
       state.template blend<Kernel>(
@@ -161,16 +168,12 @@ void baked_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
 }  // namespace
 
 template <class S>
-void baked_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
-                   bool maps, const S* base, const Atlas& atlas, S* image, int32_t* overdraw) {
-  with_kernel(through_pixel, [&](auto kernel) {
-    baked_forward<decltype(kernel)>(geom, radii, near, bins, width, height, maps, base, atlas, image, overdraw);
-  });
+void baked_forward(const BakedForward<S>& a) {
+  bin(a.view, *a.bins);
+  with_kernel(a.view.through_pixel, [&](auto kernel) { baked_forward<decltype(kernel)>(a); });
 }
 
-template void baked_forward<float>(bool, const float*, const float*, float, const Bins&, int, int, bool, const float*,
-                                   const Atlas&, float*, int32_t*);
-template void baked_forward<double>(bool, const double*, const double*, double, const Bins&, int, int, bool,
-                                    const double*, const Atlas&, double*, int32_t*);
+template void baked_forward(const BakedForward<float>&);
+template void baked_forward(const BakedForward<double>&);
 
 }  // namespace bt

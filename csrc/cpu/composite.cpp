@@ -6,10 +6,13 @@ namespace bt {
 
 namespace {
 template <bool kMaps, class S>
-void composite_forward(int64_t pixels, const S* geom, const int64_t* tile_start, int64_t tiles,
-                       const FragmentArrays<S>& f, const S* colors, S* image) {
+void forward(const CompositeForward<S, TileStarts>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
-  std::fill(image, image + pixels * channels, S(0));
+  const S *geom = a.geom, *colors = a.colors;
+  const int64_t *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
+  const FragmentArrays<S>& f = a.fragments.f;
+  S* image = a.image;
+  std::fill(image, image + a.pixels() * channels, S(0));
   parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     for (int64_t i = tile_start[first]; i < tile_start[last]; ++i) {
       const S* g = geom + int64_t(f.surfel[i]) * kGeom;
@@ -20,9 +23,12 @@ void composite_forward(int64_t pixels, const S* geom, const int64_t* tile_start,
 }
 
 template <bool kMaps, class S>
-void composite_backward(int64_t n, const S* geom, const int64_t* tile_start, int64_t tiles, const FragmentArrays<S>& f,
-                        const S* colors, const S* dimage, S* dweight, S* dcolors, S* ddepth, S* dgeom) {
+void backward(const CompositeBackward<S, TileStarts>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
+  const S *geom = a.geom, *colors = a.colors, *dimage = a.dimage;
+  const int64_t n = a.n, *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
+  const FragmentArrays<S>& f = a.fragments.f;
+  S *dweight = a.dweight, *dcolors = a.dcolors, *ddepth = a.ddepth, *dgeom = a.dgeom;
   constexpr int kSums = 4;  // beta and the normal, per surfel
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   const int parts = parallel_tiles(tile_start, tiles, 64, [&](int part, int64_t first, int64_t last) {
@@ -53,24 +59,17 @@ void composite_backward(int64_t n, const S* geom, const int64_t* tile_start, int
 }  // namespace
 
 template <class S>
-void composite_forward(int64_t pixels, bool maps, const S* geom, const int64_t* tile_start, int64_t tiles,
-                       const FragmentArrays<S>& f, const S* colors, S* image) {
-  const auto run = maps ? composite_forward<true, S> : composite_forward<false, S>;
-  run(pixels, geom, tile_start, tiles, f, colors, image);
+void composite_forward(const CompositeForward<S, TileStarts>& a) {
+  a.maps ? forward<true>(a) : forward<false>(a);
 }
 template <class S>
-void composite_backward(int64_t n, bool maps, const S* geom, const int64_t* tile_start, int64_t tiles,
-                        const FragmentArrays<S>& f, const S* colors, const S* dimage, S* dweight, S* dcolors, S* ddepth,
-                        S* dgeom) {
-  const auto run = maps ? composite_backward<true, S> : composite_backward<false, S>;
-  run(n, geom, tile_start, tiles, f, colors, dimage, dweight, dcolors, ddepth, dgeom);
+void composite_backward(const CompositeBackward<S, TileStarts>& a) {
+  a.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                                                                                         \
-  template void composite_forward<S>(int64_t, bool, const S*, const int64_t*, int64_t, const FragmentArrays<S>&,  \
-                                     const S*, S*);                                                               \
-  template void composite_backward<S>(int64_t, bool, const S*, const int64_t*, int64_t, const FragmentArrays<S>&, \
-                                      const S*, const S*, S*, S*, S*, S*);
+#define BT_INSTANTIATE(S)                                                  \
+  template void composite_forward(const CompositeForward<S, TileStarts>&); \
+  template void composite_backward(const CompositeBackward<S, TileStarts>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -10,9 +10,12 @@ constexpr int64_t kBlock = 1 << 15;  // points whose table gradients are collect
 }
 
 template <class S>
-void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho) {
+void field_forward(const FieldForward<S>& a) {
+  const FieldArrays<S>& field = *a.field;
+  const S* x = a.x;
+  S* rho = a.rho;
   const auto m = load_mlp(field);
-  parallel_parts(n, 256, [&](int, int64_t begin, int64_t end) {
+  parallel_parts(a.n, 256, [&](int, int64_t begin, int64_t end) {
     Encoder<S> enc;
     MlpState<S, Pack<S>> state;
     for (int64_t i = begin; i < end; i += kBatch) {
@@ -25,8 +28,12 @@ void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho) {
 }
 
 template <class S>
-void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S* drho, const FieldGradients<S>& out,
-                    S* dx) {
+void field_backward(const FieldBackward<S>& a) {
+  const FieldArrays<S>& field = *a.field;
+  const FieldGradients<S>& out = a.dfield;
+  const S *x = a.x, *drho = a.drho;
+  const int64_t n = a.n;
+  S* dx = a.dx;
   const auto m = load_mlp(field);
   const int threads = std::max(num_threads(), 1);
   std::vector<Mlp<S, Pack<S>>> sums(threads);
@@ -65,8 +72,12 @@ void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S*
 }
 
 template <class S>
-void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const S* base, const S* frames,
-                   const FieldArrays<S>* field, S* colors) {
+void shade_forward(const ShadeForward<S>& a) {
+  const FragmentArrays<S>& f = a.f;
+  const FieldArrays<S>* field = a.field;
+  const S *base = a.base, *frames = a.frames, bound = a.bound;
+  const int64_t fragments = f.total;
+  S* colors = a.colors;
   Mlp<S, Pack<S>> m;
   if (field) m = load_mlp(*field);
   parallel_parts(fragments, 1024, [&](int, int64_t begin, int64_t end) {
@@ -93,10 +104,13 @@ void shade_forward(int64_t fragments, const FragmentArrays<S>& f, S bound, const
 }
 
 template <class S>
-void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const FragmentArrays<S>& f, S bound,
-                    const S* base, const S* frames, const FieldArrays<S>* field, const S* colors, const S* dcolors,
-                    S* dbase, const FieldGradients<S>* dfield, S* duv, S* dframes) {
-  const int64_t fragments = tile_start[tiles];
+void shade_backward(const ShadeBackward<S>& a) {
+  const FragmentArrays<S>& f = a.f;
+  const FieldArrays<S>* field = a.field;
+  const FieldGradients<S>* dfield = &a.dfield;
+  const S *base = a.base, *frames = a.frames, *colors = a.colors, *dcolors = a.dcolors, bound = a.bound;
+  S *dbase = a.dbase, *duv = a.duv, *dframes = a.dframes;
+  const int64_t n = a.n, fragments = f.total;
   const bool geometry = duv != nullptr;
   const int threads = std::max(1, std::min(num_threads(), 64));
   const int columns = geometry ? 3 + kFrame : 3;
@@ -105,7 +119,7 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
   Mlp<S, Pack<S>> m;
   std::vector<Mlp<S, Pack<S>>> sums;
   TableScatter<S> scatter;
-  const bool learn = field && dfield;
+  const bool learn = a.learns();
   if (learn) {
     m = load_mlp(*field);
     sums.resize(threads);
@@ -168,12 +182,11 @@ void shade_backward(int64_t n, const int64_t* tile_start, int64_t tiles, const F
   });
 }
 
-#define BT_INSTANTIATE(S)                                                                                              \
-  template void field_forward<S>(int64_t, const FieldArrays<S>&, const S*, S*);                                        \
-  template void field_backward<S>(int64_t, const FieldArrays<S>&, const S*, const S*, const FieldGradients<S>&, S*);   \
-  template void shade_forward<S>(int64_t, const FragmentArrays<S>&, S, const S*, const S*, const FieldArrays<S>*, S*); \
-  template void shade_backward<S>(int64_t, const int64_t*, int64_t, const FragmentArrays<S>&, S, const S*, const S*,   \
-                                  const FieldArrays<S>*, const S*, const S*, S*, const FieldGradients<S>*, S*, S*);
+#define BT_INSTANTIATE(S)                                \
+  template void field_forward(const FieldForward<S>&);   \
+  template void field_backward(const FieldBackward<S>&); \
+  template void shade_forward(const ShadeForward<S>&);   \
+  template void shade_backward(const ShadeBackward<S>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -22,30 +22,35 @@ int num_threads() {
 void set_num_threads(int n) { g_threads = n; }
 
 template <class S>
-int64_t project_forward(bool through_pixel, const Pinhole<S>& cam, int width, int height, S near, const Surfels<S>& in,
-                        S* geom, S* frames, S* radii) {
+void project_forward(const ProjectForward<S>& a) {
+  const Pinhole<S> cam = pinhole(a.viewmat, a.K);
   std::vector<int64_t> broken(num_threads(), 0);
-  with_kernel(through_pixel, [&](auto kernel) {
-    parallel_parts(in.n, 1024, [&](int thread, int64_t begin, int64_t end) {
+  with_kernel(a.through_pixel, [&](auto kernel) {
+    parallel_parts(a.surfels.n, 1024, [&](int thread, int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i)
-        broken[thread] += !project_visible<decltype(kernel)>(cam, width, height, in, i, near, geom, frames, radii);
+        broken[thread] +=
+            !project_visible<decltype(kernel)>(cam, a.width, a.height, a.surfels, i, a.near, a.geom, a.frames, a.radii);
     });
   });
-  return std::accumulate(broken.begin(), broken.end(), int64_t(0));
+  *a.broken += int32_t(std::accumulate(broken.begin(), broken.end(), int64_t(0)));
 }
 
 template <class S>
-void project_backward(const Pinhole<S>& cam, const Surfels<S>& in, const S* geom, const S* dgeom, const S* dframes,
-                      const SurfelGradients<S>& out) {
-  parallel_parts(in.n, 1024, [&](int, int64_t begin, int64_t end) {
+void project_backward(const ProjectBackward<S>& a) {
+  const Pinhole<S> cam = pinhole(a.viewmat, a.K);
+  parallel_parts(a.surfels.n, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)
-      project_vjp(cam, in, i, geom + i * kGeom, dgeom + i * kGeom, dframes ? dframes + i * kFrame : nullptr, out);
+      project_vjp(cam, a.surfels, i, a.geom + i * kGeom, a.dgeom + i * kGeom,
+                  a.dframes ? a.dframes + i * kFrame : nullptr, a.out);
   });
 }
 
 namespace {
 template <class Kernel, class S>
-void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
+void bin(const View<S>& view, Bins& bins) {
+  const S *geom = view.geom, *radii = view.radii;
+  const int64_t n = view.n;
+  const int width = view.width, height = view.height;
   bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   // front to back once for all tiles; equal depths keep their order
@@ -98,15 +103,14 @@ void bin(int64_t n, const S* geom, const S* radii, int width, int height, Bins& 
 }  // namespace
 
 template <class S>
-void bin(bool through_pixel, int64_t n, const S* geom, const S* radii, int width, int height, Bins& bins) {
-  with_kernel(through_pixel, [&](auto kernel) { bin<decltype(kernel)>(n, geom, radii, width, height, bins); });
+void bin(const View<S>& view, Bins& bins) {
+  with_kernel(view.through_pixel, [&](auto kernel) { bin<decltype(kernel)>(view, bins); });
 }
 
-#define BT_INSTANTIATE(S)                                                                                   \
-  template int64_t project_forward<S>(bool, const Pinhole<S>&, int, int, S, const Surfels<S>&, S*, S*, S*); \
-  template void project_backward<S>(const Pinhole<S>&, const Surfels<S>&, const S*, const S*, const S*,     \
-                                    const SurfelGradients<S>&);                                             \
-  template void bin<S>(bool, int64_t, const S*, const S*, int, int, Bins&);
+#define BT_INSTANTIATE(S)                                    \
+  template void project_forward(const ProjectForward<S>&);   \
+  template void project_backward(const ProjectBackward<S>&); \
+  template void bin(const View<S>&, Bins&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -20,10 +20,12 @@ void filter_row(const S* a, const S* b, int n, int stride, const S* k, S* const*
     for (int j = 0; j < 5; ++j) out[j][x] = m[j];
   }
 }
-}  // namespace
 
 template <class S>
-S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
+S mean_ssim(const Ssim<S>& images) {
+  const int height = images.height, width = images.width, channels = images.channels;
+  const S *a = images.a, *b = images.b;
+  S* da = images.da;
   static const SsimWindow<S> window;
   const S* k = window.k;
   const int rows = height - kTaps + 1, line = width * channels;
@@ -94,7 +96,14 @@ S ssim(int height, int width, int channels, const S* a, const S* b, S* da) {
   return S(total * double(share));
 }
 
-template float ssim<float>(int, int, int, const float*, const float*, float*);
-template double ssim<double>(int, int, int, const double*, const double*, double*);
+}  // namespace
+
+template <class S>
+void ssim(const Ssim<S>& a) {
+  *a.value = mean_ssim(a);
+}
+
+template void ssim(const Ssim<float>&);
+template void ssim(const Ssim<double>&);
 
 }  // namespace bt

@@ -16,24 +16,28 @@ struct Patch {
   S extent;
   Vec3<S> view;  // the colour without residual
 
-  Patch(const TexelTiles<S>& tiles, const S* base, int64_t id)
+  Patch(const TexelTiles<S>& tiles, int64_t id)
       : size(tiles.size + 2 * id),
         first(tiles.first[id]),
         extent(tiles.extent[id]),
-        view(view_base(load3(base + 3 * id))) {}
+        view(view_base(load3(tiles.base + 3 * id))) {}
   bool textured() const { return size[0] > 0; }
   TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
 };
 }  // namespace
 
 template <class S>
-void texel_image_forward(int64_t pixels, const int64_t* tile_start, int64_t tiles, const TexelFragments<S>& f, S bound,
-                         const S* base, const TexelTiles<S>& table, const S* texels, S* image) {
-  std::fill(image, image + 3 * pixels, S(0));
+void texel_image_forward(const TexelForward<S>& a) {
+  const TexelFragments<S>& f = a.f;
+  const TexelTiles<S>& table = a.table;
+  const int64_t *tile_start = a.layout.start, tiles = a.layout.tiles;
+  const S *texels = table.values, bound = a.bound;
+  S* image = a.image;
+  std::fill(image, image + 3 * a.pixels, S(0));
   parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     for (int64_t i = tile_start[first]; i < tile_start[last];) {
       const int32_t id = f.surfel[i];
-      const Patch<S> patch(table, base, id);
+      const Patch<S> patch(table, id);
       for (; i < tile_start[last] && f.surfel[i] == id; ++i) {
         Vec3<S> c = patch.view;
         if (patch.textured() && f.weight[i] >= bound) {
@@ -48,10 +52,13 @@ void texel_image_forward(int64_t pixels, const int64_t* tile_start, int64_t tile
 }
 
 template <class S>
-void texel_image_backward(int64_t n, const int64_t* run_start, const int64_t* order, int64_t runs,
-                          const TexelFragments<S>& f, S bound, const S* base, const TexelTiles<S>& table,
-                          const S* texels, const S* dimage, S* dtexels, S* dbase) {
-  if (dbase) std::fill(dbase, dbase + 3 * n, S(0));
+void texel_image_backward(const TexelBackward<S>& a) {
+  const TexelFragments<S>& f = a.f;
+  const TexelTiles<S>& table = a.table;
+  const int64_t *run_start = a.runs.start, *order = a.order, runs = a.runs.tiles;
+  const S *base = table.base, *texels = table.values, *dimage = a.dimage, bound = a.bound;
+  S *dtexels = a.dtexels, *dbase = a.dbase;
+  if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
   // `order` sorts the runs by surfel. A thread takes whole surfels: their tiles are its own, nothing is added twice.
   std::vector<int64_t> cost(runs + 1, 0);
   for (int64_t r = 0; r < runs; ++r) cost[r + 1] = cost[r] + run_start[order[r] + 1] - run_start[order[r]];
@@ -61,7 +68,7 @@ void texel_image_backward(int64_t n, const int64_t* run_start, const int64_t* or
     while (end < runs && surfel(end) == surfel(end - 1)) ++end;
     for (int64_t r = begin; r < end; ++r) {
       const int64_t id = surfel(r);
-      const Patch<S> patch(table, base, id);
+      const Patch<S> patch(table, id);
       Vec3<S> sum = {S(0), S(0), S(0)};
       for (int64_t i = run_start[order[r]]; i < run_start[order[r] + 1]; ++i) {
         Vec3<S> g = f.weight[i] * load3(dimage + 3 * int64_t(f.pixel[i]));
@@ -78,11 +85,9 @@ void texel_image_backward(int64_t n, const int64_t* run_start, const int64_t* or
   });
 }
 
-#define BT_INSTANTIATE(S)                                                                                              \
-  template void texel_image_forward<S>(int64_t, const int64_t*, int64_t, const TexelFragments<S>&, S, const S*,        \
-                                       const TexelTiles<S>&, const S*, S*);                                            \
-  template void texel_image_backward<S>(int64_t, const int64_t*, const int64_t*, int64_t, const TexelFragments<S>&, S, \
-                                        const S*, const TexelTiles<S>&, const S*, const S*, S*, S*);
+#define BT_INSTANTIATE(S)                                    \
+  template void texel_image_forward(const TexelForward<S>&); \
+  template void texel_image_backward(const TexelBackward<S>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -1,5 +1,7 @@
 // Fragments of a view and their backward pass; per-surfel counts.
 #include <atomic>
+#include <stdexcept>
+#include <string>
 
 #include "core/kernel.h"
 #include "cpu/kernels.h"
@@ -18,10 +20,13 @@ constexpr int64_t kKept = int64_t(1) << 22;  // lists up to this length keep the
 
 namespace {
 template <class Kernel, class S>
-void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int width, int height, int64_t most,
-                   FragmentList<S>& list) {
+void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
   using P = Pack<S>;
-  using Block = typename FragmentList<S>::Block;
+  using Block = typename FoundFragments<S>::Block;
+  const S *geom = view.geom, *radii = view.radii, near = view.near;
+  const int width = view.width, height = view.height;
+  const Bins& bins = to.bins;
+  FoundFragments<S>& list = to.list;
   static_assert(kTileMost < Block::kSize, "a tile fits a block");
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   const int threads = num_threads();
@@ -85,15 +90,20 @@ void trace_forward(const S* geom, const S* radii, S near, const Bins& bins, int 
 }  // namespace
 
 template <class S>
-void trace_forward(bool through_pixel, const S* geom, const S* radii, S near, const Bins& bins, int width, int height,
-                   int64_t most, FragmentList<S>& list) {
-  with_kernel(through_pixel, [&](auto kernel) {
-    trace_forward<decltype(kernel)>(geom, radii, near, bins, width, height, most, list);
-  });
+void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
+  bin(a.view, to.bins);
+  with_kernel(a.view.through_pixel, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.most, to); });
 }
 
 template <class S>
-void trace_copy(FragmentList<S>& list, const FragmentArrays<S>& out) {
+void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
+  FoundFragments<S>& list = from.list;
+  const FragmentArrays<S>& out = a.out;
+  if (list.total && list.blocks.empty()) throw std::logic_error("the fragments were counted only, or copied before");
+  if (out.total != list.total || a.starts != int64_t(list.tile_start.size()))
+    throw std::invalid_argument("the list has " + std::to_string(list.total) + " fragments in " +
+                                std::to_string(list.tile_start.size() - 1) + " tiles");
+  std::copy(list.tile_start.begin(), list.tile_start.end(), a.tile_start);
   const int64_t tiles = int64_t(list.pieces.size());
 #pragma omp parallel for num_threads(num_threads()) schedule(static)
   for (int64_t t = 0; t < tiles; ++t) {
@@ -114,10 +124,15 @@ void trace_copy(FragmentList<S>& list, const FragmentArrays<S>& out) {
 
 namespace {
 template <class Kernel, class S>
-void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start, int64_t tiles,
-                    const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth, S* dgeom, S* absgrad) {
+void trace_backward(const TraceBackward<S, TileStarts>& a) {
   using P = Pack<S>;
-  const int64_t total = tile_start[tiles];
+  const S *geom = a.view.geom, *dweight = a.dweight, *duv = a.duv, *ddepth = a.ddepth;
+  const S near = a.view.near, rim = a.rim;
+  const FragmentArrays<S>& f = a.fragments.f;
+  const int64_t *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
+  const int64_t n = a.view.n, total = f.total;
+  const int width = a.view.width;
+  S *dgeom = a.dgeom, *absgrad = a.absgrad;
   const int tiles_x = tiles_across(width);
   const int most =
       int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max<int64_t>(n, 1) / kGeom)));
@@ -186,25 +201,18 @@ void trace_backward(int64_t n, const S* geom, S near, S rim, int width, const in
 }  // namespace
 
 template <class S>
-void trace_backward(bool through_pixel, int64_t n, const S* geom, S near, S rim, int width, const int64_t* tile_start,
-                    int64_t tiles, const FragmentArrays<S>& f, const S* dweight, const S* duv, const S* ddepth,
-                    S* dgeom, S* absgrad) {
-  with_kernel(through_pixel, [&](auto kernel) {
-    trace_backward<decltype(kernel)>(n, geom, near, rim, width, tile_start, tiles, f, dweight, duv, ddepth, dgeom,
-                                     absgrad);
-  });
+void trace_backward(const TraceBackward<S, TileStarts>& a) {
+  with_kernel(a.view.through_pixel, [&](auto kernel) { trace_backward<decltype(kernel)>(a); });
 }
 
-void masked_counts(int64_t fragments, const int32_t* surfel, const int32_t* pixel, const uint8_t* mask,
-                   int32_t* counts) {
-  for (int64_t i = 0; i < fragments; ++i) counts[surfel[i]] += mask[pixel[i]] != 0;
+void masked_counts(const MaskedCounts<TileStarts>& a) {
+  for (int64_t i = 0; i < a.fragments; ++i) a.counts[a.surfel[i]] += a.mask[a.pixel[i]] != 0;
 }
 
-#define BT_INSTANTIATE(S)                                                                                        \
-  template void trace_forward<S>(bool, const S*, const S*, S, const Bins&, int, int, int64_t, FragmentList<S>&); \
-  template void trace_copy<S>(FragmentList<S>&, const FragmentArrays<S>&);                                       \
-  template void trace_backward<S>(bool, int64_t, const S*, S, S, int, const int64_t*, int64_t,                   \
-                                  const FragmentArrays<S>&, const S*, const S*, const S*, S*, S*);
+#define BT_INSTANTIATE(S)                                         \
+  template void trace_forward(const TraceForward<S>&, Trace<S>&); \
+  template void trace_copy(const TraceCopy<S>&, Trace<S>&);       \
+  template void trace_backward(const TraceBackward<S, TileStarts>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

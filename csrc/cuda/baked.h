@@ -17,24 +17,43 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "core/surfel.h"
 #include "core/view_color.h"
-#include "cuda/kernels.h"
+#include "cuda/device.h"
+#include "ops/baked.h"
 
 namespace bt::cuda {
 
-struct BakedSurfels {
+class AtlasTexture;
+
+// A baked scene as the kernels read it.
+struct BakedScene : BakedResidual {
   Surfels<float> geometry;
-  int kind, terms;  // as ViewColorArrays in cpu/kernels.h: 0 sv, 1 sh, 2 sb, 3 sg
-  const float *a, *b, *c;
-  LeanColors<float> lean;      // in place of a, b and c where lean.base is not null
-  const int32_t* tiles;        // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
-  const float* extent;         // [n], null: kSupport everywhere
-  const float* mean_residual;  // [n, 3], null: 0
-  const uint64_t* pages;       // a texture per page of the atlas, null: none
-  float offset, scale;         // residual = offset + scale * texel
-  float weight_bound, near;
-  bool through_pixel;       // chooses between the kernels of core/surfel.h
-  float transmittance_min;  // a surfel that would leave a pixel less is not blended and ends it; 0: all are
+  ViewColorArrays<const float> colors;
+  LeanColors<float> lean;  // in place of those where lean.base is not null
+  int64_t lean_terms;
+  const int32_t* tiles;   // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
+  const uint64_t* pages;  // [page_count] a texture per page of the atlas, null: none
+  int64_t page_count;
+  const AtlasTexture* texture;  // whose pages they are; Python keeps it
+  float near;
+  bool through_pixel;  // chooses between the kernels of core/surfel.h
+
+  template <class R>  // as in ops/arguments.h
+  void fields(R& r) {
+    geometry.fields(r);
+    const int64_t n = geometry.n;
+    if (r.given("lean"))
+      lean.fields(r, n, lean_terms);
+    else
+      colors.fields(r, n);
+    r.array("tiles", tiles, 5 * n);
+    if (r.given("pages")) r.rows("pages", pages, page_count, 1);
+    r.maybe_object("texture", texture);
+    BakedResidual::fields(r, n);
+    r.number("near", near);
+    r.number("through_pixel", through_pixel);
+  }
 };
 
 struct BakedViews {
@@ -49,6 +68,18 @@ struct BakedImages {
   float *beta, *depth, *normal;  // sums of w beta, w z and w n (1, 1 and 3 channels)
   int32_t* overdraw;             // blended surfels
   const float* background;       // [3], null: black
+
+  template <class R>
+  void fields(R& r, int64_t pixels) {
+    r.maybe("rgb", rgb, 3 * pixels);
+    r.maybe("alpha", alpha, pixels);
+    r.maybe("packed", packed, pixels);
+    r.maybe("beta", beta, pixels);
+    r.maybe("depth", depth, pixels);
+    r.maybe("normal", normal, 3 * pixels);
+    r.maybe("overdraw", overdraw, pixels);
+    r.maybe("background", background, 3);
+  }
 };
 
 enum BakedStage { kPrepare = 1, kBin = 2, kDraw = 4 };
@@ -59,8 +90,30 @@ constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 // Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64).
 size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals);
 
-// Runs the stages (sum of BakedStage) of a frame of all views; a stage needs what the ones before it left in `memory`.
-void baked_frame(const BakedSurfels& surfels, const BakedViews& views, const BakedImages& images, int stages,
-                 void* memory, size_t bytes, int64_t capacity, Stream stream);
+// A frame of all views: the stages (a sum of BakedStage); one needs what those before it left in `memory`.
+struct BakedDraw {
+  const BakedScene* scene;
+  BakedViews views;
+  BakedImages images;
+  int stages;
+  Workspace memory;
+  int64_t capacity;  // pairs that fit
+
+  template <class R>
+  void fields(R& r) {
+    r.object("scene", scene);
+    int64_t count;
+    r.rows("viewmats", views.viewmats, count, 16);
+    views.count = int(count);
+    r.array("Ks", views.Ks, 9 * count);
+    r.number("width", views.width);
+    r.number("height", views.height);
+    images.fields(r, count * views.width * views.height);
+    r.number("stages", stages);
+    r.memory("memory", memory);
+    r.number("capacity", capacity);
+  }
+};
+void baked_frame(const BakedDraw& a, Stream stream);
 
 }  // namespace bt::cuda

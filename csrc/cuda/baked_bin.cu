@@ -186,19 +186,18 @@ size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, 
   return lay_out(f, nullptr, normals);
 }
 
-void baked_frame(const BakedSurfels& surfels, const BakedViews& views, const BakedImages& images, int stages,
-                 void* memory, size_t bytes, int64_t capacity, Stream stream) {
-  BakedFrame f = frame_of(surfels.geometry.n, views, capacity);
-  f.through_pixel = surfels.through_pixel;
-  const int64_t needed = lay_out(f, memory, images.normal != nullptr);
-  if (int64_t(bytes) < needed)
-    throw std::invalid_argument("the working memory has " + std::to_string(bytes) + " bytes, the frame needs " +
-                                std::to_string(needed));
+void baked_frame(const BakedDraw& a, Stream stream) {
+  BakedFrame f = frame_of(a.scene->geometry.n, a.views, a.capacity);
+  f.through_pixel = a.scene->through_pixel;
+  const int64_t needed = lay_out(f, a.memory.at, a.images.normal != nullptr);
+  if (a.memory.bytes < needed)
+    throw std::invalid_argument("the working memory has " + std::to_string(a.memory.bytes) +
+                                " bytes, the frame needs " + std::to_string(needed));
   if (f.rows) {
-    if (stages & kPrepare) baked_prepare(surfels, views, f, stream);
-    if (stages & kBin) baked_bin(f, stream);
+    if (a.stages & kPrepare) baked_prepare(*a.scene, a.views, f, stream);
+    if (a.stages & kBin) baked_bin(f, stream);
   }
-  if (stages & kDraw) baked_draw(surfels, images, f, stream);
+  if (a.stages & kDraw) baked_draw(*a.scene, a.images, f, stream);
 }
 
 }  // namespace bt::cuda

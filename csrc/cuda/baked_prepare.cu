@@ -15,25 +15,23 @@ constexpr int kThreads = 128;
 constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
 
 // The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
-__device__ Vec3<float> view_color_of(const BakedSurfels& s, int64_t i, Vec3<float> d) {
+__device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
   if (s.lean.base) return view_color(s.lean, i, d);
-  const int K = s.terms;
-  const ViewColorWidths w = view_color_widths(s.kind, K);
-  const float *a = s.a + w.a * i, *b = s.b + w.b * i;
-  switch (s.kind) {
+  const ViewColorArrays<const float>& p = s.colors;
+  const int K = p.terms;
+  switch (p.kind) {
     case kSv:
-      return K == preset_terms(kSv) ? sv_color(preset_terms(kSv), a, b, s.c + w.c * i, d)
-                                    : sv_color(K, a, b, s.c + w.c * i, d);
+      return K == preset_terms(kSv) ? view_color(kSv, preset_terms(kSv), p, i, d) : view_color(kSv, K, p, i, d);
     case kSh:
-      return K == preset_terms(kSh) ? sh_color(preset_terms(kSh), a, b, d) : sh_color(K, a, b, d);
+      return K == preset_terms(kSh) ? view_color(kSh, preset_terms(kSh), p, i, d) : view_color(kSh, K, p, i, d);
     case kSb:
-      return K == preset_terms(kSb) ? sb_color(preset_terms(kSb), a, b, d) : sb_color(K, a, b, d);
+      return K == preset_terms(kSb) ? view_color(kSb, preset_terms(kSb), p, i, d) : view_color(kSb, K, p, i, d);
     default:
-      return K == preset_terms(kSg) ? sg_color(preset_terms(kSg), a, b, d) : sg_color(K, a, b, d);
+      return K == preset_terms(kSg) ? view_color(kSg, preset_terms(kSg), p, i, d) : view_color(kSg, K, p, i, d);
   }
 }
 
-__device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> color, float* row) {
+__device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color, float* row) {
   const int32_t* tile = s.tiles + 5 * i;
   float scale = 0, place[4] = {0, 0, 0, 0};
   uint64_t page = 0;
@@ -55,7 +53,7 @@ __device__ void write_texture(const BakedSurfels& s, int64_t i, Vec3<float> colo
 }
 
 template <class Kernel>
-__global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, BakedViews v, BakedFrame f) {
+__global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedViews v, BakedFrame f) {
   __shared__ int seen_count;
   __shared__ int seen_list[kThreads];
   const int64_t block = int64_t(blockIdx.x) * kThreads, i = block + threadIdx.x;
@@ -142,7 +140,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedSurfels s, Baked
 }
 }  // namespace
 
-void baked_prepare(const BakedSurfels& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
+void baked_prepare(const BakedScene& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
   if (!f.rows) return;
   const dim3 grid(unsigned(ceil_div(f.n, kThreads)), unsigned(v.count));
   with_kernel(f.through_pixel, [&](auto kernel) {

@@ -196,7 +196,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
 }
 }  // namespace
 
-void baked_draw(const BakedSurfels& s, const BakedImages& images, const BakedFrame& f, Stream stream) {
+void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame& f, Stream stream) {
   if (!f.tiles) return;
   const DrawArgs a = {f.memory.rows,
                       f.memory.normals,

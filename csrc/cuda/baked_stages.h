@@ -42,13 +42,13 @@ struct BakedFrame {
   int64_t tiles;       // of all views
   int key_bits;        // tile numbers and the key of unused room
   bool wide;           // keys of 32 bits
-  bool through_pixel;  // as in BakedSurfels
+  bool through_pixel;  // as in BakedScene
   BakedMemory memory;
 };
 
-void baked_prepare(const BakedSurfels& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
+void baked_prepare(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
 void baked_bin(const BakedFrame& frame, Stream stream);
-void baked_draw(const BakedSurfels& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
+void baked_draw(const BakedScene& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
 
 // The pixels that a surfel can touch, by tile.
 struct Footprint {

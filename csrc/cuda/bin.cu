@@ -4,8 +4,8 @@
 // the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
 // order. There are about six pairs per surfel: the large sort moves 8 bytes per pair through two passes (13 bits for
 // 4,000 tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
+#include "cuda/kernels.h"
 #include "cuda/primitives.h"
-#include "cuda/trace.h"
 #include "cuda/workspace.h"
 
 namespace bt::cuda {
@@ -137,50 +137,49 @@ int64_t bin_count_workspace(int64_t n) {
   const CountSpace<S> w(arena, n);
   return arena.used();
 }
-int64_t bin_fill_workspace(int64_t pairs, int64_t tiles) {
+int64_t bin_fill_workspace(int64_t pairs, int width, int height) {
   Arena arena(nullptr);
-  const FillSpace w(arena, pairs, tiles);
+  const FillSpace w(arena, pairs, tiles_of(width, height));
   return arena.used();
 }
 
 template <class S>
-void bin_count(bool through_pixel, int64_t n, const S* geom, const S* radii, int width, int height, int32_t* order,
-               int64_t* slot_start, void* workspace, Stream stream) {
-  Arena arena(workspace);
+void bin_count(const BinCount<S>& a, Stream stream) {
+  const View<S>& v = a.view;
+  const int64_t n = v.n;
+  Arena arena(a.workspace.of(bin_count_workspace<S>(n)));
   const CountSpace<S> w(arena, n);
   if (n)
-    with_kernel(through_pixel, [&](auto kernel) {
-      BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, n, geom, radii, width,
-                height, w);
+    with_kernel(v.through_pixel, [&](auto kernel) {
+      BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, n, v.geom, v.radii, v.width,
+                v.height, w);
     });
-  sort_pairs(w.keys, w.sorted, w.rows, order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
-  BT_LAUNCH(rank_kernel, blocks(n + 1), dim3(kThreads), 0, stream, n, order, w.counts, w.ranked);
-  exclusive_sum(w.ranked, slot_start, n + 1, w.temp, w.temp_size, stream);
+  sort_pairs(w.keys, w.sorted, w.rows, a.order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
+  BT_LAUNCH(rank_kernel, blocks(n + 1), dim3(kThreads), 0, stream, n, a.order, w.counts, w.ranked);
+  exclusive_sum(w.ranked, a.slot_start, n + 1, w.temp, w.temp_size, stream);
 }
 
 template <class S>
-void bin_fill(bool through_pixel, int64_t n, const S* geom, int width, int height, const int32_t* order,
-              const int64_t* slot_start, int64_t pairs, int32_t* slot, int32_t* surfel, int64_t* tile_pairs,
-              void* workspace, Stream stream) {
-  const int64_t tiles = int64_t(tiles_across(width)) * tiles_across(height);
-  Arena arena(workspace);
+void bin_fill(const BinFill<S>& a, Stream stream) {
+  const View<S>& v = a.view;
+  const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
+  Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
   const FillSpace w(arena, pairs, tiles);
   if (pairs) {
-    with_kernel(through_pixel, [&](auto kernel) {
-      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, n, geom, width, height, order,
-                slot_start, w);
+    with_kernel(v.through_pixel, [&](auto kernel) {
+      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v.n, v.geom, v.width,
+                v.height, a.order, a.slot_start, w);
     });
-    sort_pairs(w.tile, w.sorted, w.slots, slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
-    BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, slot, w.owner, surfel);
+    sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
+    BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, a.slot, w.owner, a.surfel);
   }
-  BT_LAUNCH(range_kernel, blocks(tiles + 1), dim3(kThreads), 0, stream, pairs, w.sorted, tiles, tile_pairs);
+  BT_LAUNCH(range_kernel, blocks(tiles + 1), dim3(kThreads), 0, stream, pairs, w.sorted, tiles, a.tile_pairs);
 }
 
-#define BT_INSTANTIATE(S)                                                                                         \
-  template int64_t bin_count_workspace<S>(int64_t);                                                               \
-  template void bin_count<S>(bool, int64_t, const S*, const S*, int, int, int32_t*, int64_t*, void*, Stream);     \
-  template void bin_fill<S>(bool, int64_t, const S*, int, int, const int32_t*, const int64_t*, int64_t, int32_t*, \
-                            int32_t*, int64_t*, void*, Stream);
+#define BT_INSTANTIATE(S)                              \
+  template int64_t bin_count_workspace<S>(int64_t);    \
+  template void bin_count(const BinCount<S>&, Stream); \
+  template void bin_fill(const BinFill<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

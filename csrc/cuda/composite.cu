@@ -1,6 +1,6 @@
 // Weighted sums of the fragments per pixel, and their backward pass. Both are bound by memory: 16 bytes per fragment
 // are read forward (20 with maps), about 36 read and written backward.
-#include "cuda/trace.h"
+#include "cuda/kernels.h"
 
 namespace bt::cuda {
 
@@ -73,38 +73,34 @@ struct PutGeometry {
 };
 
 template <class S, bool kMaps>
-void backward(const S* geom, const Pairs& p, const FragmentArrays<S>& f, const S* colors, const S* dimage, S* partial,
-              S* dweight, S* dcolors, S* ddepth, S* dgeom, Stream stream) {
+void backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
+  const Pairs& p = a.fragments.layout;
   if (p.pairs)
-    BT_LAUNCH((backward_kernel<S, kMaps>), run_blocks(p), dim3(kRunThreads), 0, stream, geom, p, f, colors, dimage,
-              partial, dweight, dcolors, ddepth);
-  fill_zero(dgeom, p.surfels * kGeom, stream);
-  sum_slots<kMaps ? 4 : 1>(p, static_cast<const S*>(partial), PutGeometry<S>{dgeom}, stream);
+    BT_LAUNCH((backward_kernel<S, kMaps>), run_blocks(p), dim3(kRunThreads), 0, stream, a.geom, p, a.fragments.f,
+              a.colors, a.dimage, a.partial, a.dweight, a.dcolors, a.ddepth);
+  fill_zero(a.dgeom, p.surfels * kGeom, stream);
+  sum_slots<kMaps ? 4 : 1>(p, static_cast<const S*>(a.partial), PutGeometry<S>{a.dgeom}, stream);
 }
 }  // namespace
 
 template <class S>
-void composite_forward(bool maps, const S* geom, const Pairs& p, const FragmentArrays<S>& f, const S* colors, S* image,
-                       Stream stream) {
+void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream) {
+  const Pairs& p = a.fragments.layout;
+  const FragmentArrays<S>& f = a.fragments.f;
   const dim3 tiles(unsigned(p.tiles())), threads(kTileThreads);
-  if (maps)
-    BT_LAUNCH((forward_kernel<S, true>), tiles, threads, 0, stream, geom, p, f, colors, image);
+  if (a.maps)
+    BT_LAUNCH((forward_kernel<S, true>), tiles, threads, 0, stream, a.geom, p, f, a.colors, a.image);
   else
-    BT_LAUNCH((forward_kernel<S, false>), tiles, threads, 0, stream, geom, p, f, colors, image);
+    BT_LAUNCH((forward_kernel<S, false>), tiles, threads, 0, stream, a.geom, p, f, a.colors, a.image);
 }
 template <class S>
-void composite_backward(bool maps, const S* geom, const Pairs& p, const FragmentArrays<S>& f, const S* colors,
-                        const S* dimage, S* partial, S* dweight, S* dcolors, S* ddepth, S* dgeom, Stream stream) {
-  if (maps)
-    backward<S, true>(geom, p, f, colors, dimage, partial, dweight, dcolors, ddepth, dgeom, stream);
-  else
-    backward<S, false>(geom, p, f, colors, dimage, partial, dweight, dcolors, ddepth, dgeom, stream);
+void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
+  a.maps ? backward<S, true>(a, stream) : backward<S, false>(a, stream);
 }
 
-#define BT_INSTANTIATE(S)                                                                                             \
-  template void composite_forward<S>(bool, const S*, const Pairs&, const FragmentArrays<S>&, const S*, S*, Stream);   \
-  template void composite_backward<S>(bool, const S*, const Pairs&, const FragmentArrays<S>&, const S*, const S*, S*, \
-                                      S*, S*, S*, S*, Stream);
+#define BT_INSTANTIATE(S)                                                     \
+  template void composite_forward(const CompositeForward<S, Pairs>&, Stream); \
+  template void composite_backward(const CompositeBackward<S, Pairs>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

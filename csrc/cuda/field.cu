@@ -75,48 +75,46 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class S>
-void field_forward(int64_t n, const FieldArrays<S>& field, const S* x, S* rho, Stream stream) {
-  if (!n) return;
-  BT_LAUNCH(field_forward_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, field, x,
-            rho);
+void field_forward(const FieldForward<S>& a, Stream stream) {
+  if (!a.n) return;
+  BT_LAUNCH(field_forward_kernel<S>, dim3(unsigned(ceil_div(a.n, kThreads))), dim3(kThreads), 0, stream, a.n, *a.field,
+            a.x, a.rho);
 }
 
 template <class S>
-void field_backward(int64_t n, const FieldArrays<S>& field, const S* x, const S* drho, const FieldGradients<S>& out,
-                    S* dx, const FieldWork<S>& work, Stream stream) {
-  const int blocks = backward_blocks<S>(n);
+void field_backward(const FieldBackward<S>& a, Stream stream) {
+  const FieldArrays<S>& field = *a.field;
+  const FieldGradients<S>& out = a.dfield;
+  const FieldWork<S>& work = a.work;
+  const int blocks = backward_blocks<S>(a.n);
   const size_t shared = sizeof(BackwardShared<S>);
   const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
   if (work.exact) {
-    const ExactSums exact = begin_exact(work, &field, 0, false, n, drho, stream);
+    const ExactSums exact = begin_exact(work, &field, 0, false, a.n, a.drho, stream);
     const auto kernel = field_backward_kernel<S, true>;
     BT_ALLOW_SHARED(kernel, shared);
-    BT_LAUNCH(kernel, grid, block, shared, stream, n, field, x, drho, out.table, exact, work.mlp, dx);
+    BT_LAUNCH(kernel, grid, block, shared, stream, a.n, field, a.x, a.drho, out.table, exact, work.mlp, a.dx);
     end_exact(exact, &field, 0, out.table, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
   } else {
     const auto kernel = field_backward_kernel<S, false>;
     fill_zero(out.table, field.table_size(), stream);
     BT_ALLOW_SHARED(kernel, shared);
-    BT_LAUNCH(kernel, grid, block, shared, stream, n, field, x, drho, out.table, ExactSums(), work.mlp, dx);
+    BT_LAUNCH(kernel, grid, block, shared, stream, a.n, field, a.x, a.drho, out.table, ExactSums(), work.mlp, a.dx);
   }
   sum_weights(work.mlp, blocks, field.levels, out, stream);
 }
 
 template <class S>
-void bake_tiles(int64_t n, int64_t warps, const FieldArrays<S>& field, const S* frames, const S* extent,
-                const int32_t* tiles, const int64_t* first, int width, int height, S* pages, int32_t* bad,
-                Stream stream) {
-  if (!warps) return;
-  BT_LAUNCH(bake_kernel<S>, dim3(unsigned(ceil_div(warps * kWarp, kThreads))), dim3(kThreads), 0, stream, n, warps,
-            field, frames, extent, tiles, first, width, height, pages, bad);
+void field_tiles(const FieldTiles<S>& a, Stream stream) {
+  if (!a.warps) return;
+  BT_LAUNCH(bake_kernel<S>, dim3(unsigned(ceil_div(a.warps * kWarp, kThreads))), dim3(kThreads), 0, stream, a.n,
+            a.warps, *a.field, a.frames, a.extent, a.tiles, a.first, a.width, a.height, a.pages, a.bad);
 }
 
-#define BT_INSTANTIATE(S)                                                                                           \
-  template void field_forward<S>(int64_t, const FieldArrays<S>&, const S*, S*, Stream);                             \
-  template void field_backward<S>(int64_t, const FieldArrays<S>&, const S*, const S*, const FieldGradients<S>&, S*, \
-                                  const FieldWork<S>&, Stream);                                                     \
-  template void bake_tiles<S>(int64_t, int64_t, const FieldArrays<S>&, const S*, const S*, const int32_t*,          \
-                              const int64_t*, int, int, S*, int32_t*, Stream);
+#define BT_INSTANTIATE(S)                                        \
+  template void field_forward(const FieldForward<S>&, Stream);   \
+  template void field_backward(const FieldBackward<S>&, Stream); \
+  template void field_tiles(const FieldTiles<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -1,7 +1,17 @@
-// Device code of the residual field: core/field.h on rows of 16 registers.
+// The residual field on CUDA: at points, at the fragments of a view (shading), and at the texels of an atlas.
+//
+// Work of one look-up with L = 4 levels: 32 entries of 16 bytes gathered from the table (1 KB of 32-byte sectors at
+// worst; the table of at most 8 MB stays in the L2), 1,500 operations, of which 1,120 belong to the MLP. An H200
+// gathers some 5 TB/s from its L2 and does 60 Tflop/s: 5 look-ups a ns by memory and 40 by arithmetic. The gathers
+// decide, and neighbouring fragments that share cells find them in the L1. So a thread does one look-up, with the
+// weights in shared memory, read by all lanes at once, 4 multiply-adds a load; tensor cores would round to tf32 and
+// gain nothing. The backward pass repeats the look-up, adds 32 times 16 bytes to the table's gradient (one vector
+// reduction each, once per run of fragments in one cell where that halves them) and takes 2,240 more operations.
+//
+// Here stands its device code: core/field.h on rows of 16 registers.
 #pragma once
 
-#include "cuda/field.h"
+#include "cuda/kernels.h"
 #include "cuda/warp.h"
 
 namespace bt::cuda {

@@ -1,22 +1,145 @@
-// The CUDA kernels as functions of device pointers and a stream. Nothing here allocates, waits for the device or knows
-// Python; the caller gives all memory, also the working memory. Shapes are those of cpu/kernels.h unless stated.
+// The CUDA kernels as functions of an operation's arguments (csrc/ops), all on the device, and a stream. Nothing here
+// allocates, waits for the device or knows Python; the caller gives all memory, also the working memory.
 #pragma once
 
-#include <cstdint>
-
-#include "core/surfel.h"
 #include "cuda/device.h"
+#include "cuda/pairs.h"
+#include "ops/appearance.h"
+#include "ops/field.h"
+#include "ops/visibility.h"
 
 namespace bt::cuda {
 
-// viewmat [16] and K [9] lie on the device. geom, frames, radii are written; broken [1] int32 is raised by the number
-// of rows that are not finite.
 template <class S>
-void project_forward(bool through_pixel, const S* viewmat, const S* K, int width, int height, S near,
-                     const Surfels<S>& in, S* geom, S* frames, S* radii, int32_t* broken, Stream stream);
-// dframes may be null.
+void project_forward(const ProjectForward<S>& a, Stream stream);
 template <class S>
-void project_backward(const S* viewmat, const S* K, const Surfels<S>& in, const S* geom, const S* dgeom,
-                      const S* dframes, const SurfelGradients<S>& out, Stream stream);
+void project_backward(const ProjectBackward<S>& a, Stream stream);
+
+// Visibility: nothing waits. Where a count decides an allocation, the caller reads the last entry of slot_start or
+// offsets, allocates, and calls the next function.
+
+// Orders the surfels front to back and counts their tiles: order [n] and slot_start [n + 1] are written; the number of
+// pairs is slot_start[n].
+template <class S>
+struct BinCount {
+  View<S> view;
+  int32_t* order;
+  int64_t* slot_start;
+  Workspace workspace;
+
+  template <class R>
+  void fields(R& r) {
+    view.fields(r);
+    r.array("order", order, view.n);
+    r.array("slot_start", slot_start, view.n + 1);
+    r.memory("workspace", workspace);
+  }
+};
+template <class S>
+int64_t bin_count_workspace(int64_t n);
+template <class S>
+void bin_count(const BinCount<S>& a, Stream stream);
+
+// Lists the pairs (below 2^31): slot [pairs], surfel [pairs] and tile_pairs [tiles + 1] are written.
+template <class S>
+struct BinFill {
+  View<S> view;
+  const int32_t* order;
+  const int64_t* slot_start;
+  int64_t pairs;
+  int32_t *slot, *surfel;
+  int64_t* tile_pairs;
+  Workspace workspace;
+
+  template <class R>
+  void fields(R& r) {
+    view.fields(r);
+    r.array("order", order, view.n);
+    r.array("slot_start", slot_start, view.n + 1);
+    r.rows("slot", slot, pairs, 1);
+    check_pairs(r, pairs);
+    r.array("surfel", surfel, pairs);
+    r.array("tile_pairs", tile_pairs, tiles_of(view.width, view.height) + 1);
+    r.memory("workspace", workspace);
+  }
+};
+int64_t bin_fill_workspace(int64_t pairs, int width, int height);
+template <class S>
+void bin_fill(const BinFill<S>& a, Stream stream);
+
+// Finds which pixels blend which pairs: masks [kTileWarps, pairs], offsets [pairs + 1] and tile_start [tiles + 1] are
+// written; the number of fragments is offsets[pairs].
+template <class S>
+struct TraceMark {
+  View<S> view;
+  int64_t pairs;
+  const int32_t* surfel;
+  const int64_t* tile_pairs;
+  uint32_t* masks;
+  int64_t *offsets, *tile_start;
+  Workspace workspace;
+
+  template <class R>
+  void fields(R& r) {
+    view.fields(r);
+    r.rows("surfel", surfel, pairs, 1);
+    check_pairs(r, pairs);
+    const int64_t tiles = tiles_of(view.width, view.height);
+    r.array("tile_pairs", tile_pairs, tiles + 1);
+    r.array("masks", masks, kTileWarps * pairs);
+    r.array("offsets", offsets, pairs + 1);
+    r.array("tile_start", tile_start, tiles + 1);
+    r.memory("workspace", workspace);
+  }
+};
+int64_t trace_mark_workspace(int64_t pairs);
+template <class S>
+void trace_mark(const TraceMark<S>& a, Stream stream);
+
+// Writes the fragments.
+template <class S>
+struct TraceFill {
+  View<S> view;
+  Fragments<S, Pairs> fragments;
+
+  template <class R>
+  void fields(R& r) {
+    view.fields(r);
+    fragments.fields(r, view.n, view.width, view.height);
+  }
+};
+template <class S>
+void trace_fill(const TraceFill<S>& a, Stream stream);
+
+template <class S>
+void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream);
+template <class S>
+void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream);
+template <class S>
+void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream);
+void masked_counts(const MaskedCounts<Pairs>& a, Stream stream);
+
+template <class S>
+void view_color_forward(const ViewColorForward<S>& a, Stream stream);
+template <class S>
+void view_color_backward(const ViewColorBackward<S>& a, Stream stream);
+template <class S>
+void lean_color(const LeanColor<S>& a, Stream stream);
+
+template <class S>
+int64_t ssim_workspace(int height, int width, int channels, bool gradient);
+template <class S>
+void ssim(const Ssim<S>& a, Stream stream);
+
+template <class S>
+void field_forward(const FieldForward<S>& a, Stream stream);
+template <class S>
+void field_backward(const FieldBackward<S>& a, Stream stream);
+template <class S>
+void shade_forward(const ShadeForward<S>& a, Stream stream);
+template <class S>
+void shade_backward(const ShadeBackward<S>& a, Stream stream);
+template <class S>
+void field_tiles(const FieldTiles<S>& a, Stream stream);
 
 }  // namespace bt::cuda

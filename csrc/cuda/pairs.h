@@ -15,11 +15,18 @@
 
 #include "core/bounds.h"
 #include "cuda/device.h"
+#include "ops/arguments.h"
 
 namespace bt::cuda {
 
 constexpr int kTileThreads = kTile * kTile, kTileWarps = kTileThreads / kWarp;
 constexpr int kWarpWidth = 8, kWarpHeight = 4;
+
+// Pairs are counted in 32 bits.
+template <class R>
+void check_pairs(R& r, int64_t pairs) {
+  if (pairs > INT32_MAX) r.refuse("more than 2^31 pairs of surfel and tile");
+}
 
 struct Pairs {
   int width, height;          // of the image
@@ -31,15 +38,31 @@ struct Pairs {
   const int64_t* tile_pairs;  // [tiles + 1]
   const int32_t* order;       // [surfels] front to back
   const int64_t* slot_start;  // [surfels + 1]
-  int64_t tiles() const { return int64_t(tiles_across(width)) * tiles_across(height); }
-};
+  int64_t fragments;
+  int64_t tiles() const { return tiles_of(width, height); }
+  bool fits(int64_t n, int wide, int high) const { return n == surfels && wide == width && high == height; }
 
-template <class S>
-struct FragmentArrays {
-  int64_t total;
-  int32_t *surfel, *pixel;
-  S *weight, *uv, *depth, *sigma;  // uv [2, total]; sigma is negative in the low-pass branch
+  template <class R>  // as in ops/arguments.h
+  void fields(R& r) {
+    r.number("width", width);
+    r.number("height", height);
+    r.number("fragments", fragments);
+    r.rows("surfel", surfel, pairs, 1);
+    check_pairs(r, pairs);
+    r.array("slot", slot, pairs);
+    r.array("masks", masks, kTileWarps * pairs);
+    r.array("offsets", offsets, pairs + 1);
+    r.array("tile_pairs", tile_pairs, tiles() + 1);
+    r.rows("order", order, surfels, 1);
+    r.array("slot_start", slot_start, surfels + 1);
+  }
 };
+template <class R>
+void take(R& r, const char* name, Pairs& to) {
+  const Pairs* given = nullptr;
+  r.object(name, given);
+  to = *given;
+}
 
 // Where a thread of a tile's block stands.
 struct Spot {

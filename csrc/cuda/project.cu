@@ -8,47 +8,43 @@ namespace {
 constexpr int kThreads = 128;
 
 template <class Kernel, class S>
-__global__ void __launch_bounds__(kThreads)
-    forward_kernel(const S* viewmat, const S* K, int width, int height, S near, Surfels<S> in, S* geom, S* frames,
-                   S* radii, int32_t* broken) {
+__global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= in.n) return;
-  const Pinhole<S> cam = pinhole(viewmat, K);
-  if (!project_visible<Kernel>(cam, width, height, in, i, near, geom, frames, radii)) atomicAdd(broken, 1);
+  if (i >= a.surfels.n) return;
+  const Pinhole<S> cam = pinhole(a.viewmat, a.K);
+  const bool fine = project_visible<Kernel>(cam, a.width, a.height, a.surfels, i, a.near, a.geom, a.frames, a.radii);
+  if (!fine) atomicAdd(a.broken, 1);
 }
 
 template <class S>
-__global__ void __launch_bounds__(kThreads) backward_kernel(const S* viewmat, const S* K, Surfels<S> in, const S* geom,
-                                                            const S* dgeom, const S* dframes, SurfelGradients<S> out) {
+__global__ void __launch_bounds__(kThreads) backward_kernel(ProjectBackward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= in.n) return;
-  const Pinhole<S> cam = pinhole(viewmat, K);
-  project_vjp(cam, in, i, geom + i * kGeom, dgeom + i * kGeom, dframes ? dframes + i * kFrame : nullptr, out);
+  if (i >= a.surfels.n) return;
+  const Pinhole<S> cam = pinhole(a.viewmat, a.K);
+  project_vjp(cam, a.surfels, i, a.geom + i * kGeom, a.dgeom + i * kGeom, a.dframes ? a.dframes + i * kFrame : nullptr,
+              a.out);
 }
 }  // namespace
 
 template <class S>
-void project_forward(bool through_pixel, const S* viewmat, const S* K, int width, int height, S near,
-                     const Surfels<S>& in, S* geom, S* frames, S* radii, int32_t* broken, Stream stream) {
-  if (!in.n) return;
-  with_kernel(through_pixel, [&](auto kernel) {
-    BT_LAUNCH((forward_kernel<decltype(kernel), S>), dim3(unsigned(ceil_div(in.n, kThreads))), dim3(kThreads), 0,
-              stream, viewmat, K, width, height, near, in, geom, frames, radii, broken);
+void project_forward(const ProjectForward<S>& a, Stream stream) {
+  const int64_t n = a.surfels.n;
+  if (!n) return;
+  with_kernel(a.through_pixel, [&](auto kernel) {
+    BT_LAUNCH((forward_kernel<decltype(kernel), S>), dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream,
+              a);
   });
 }
 template <class S>
-void project_backward(const S* viewmat, const S* K, const Surfels<S>& in, const S* geom, const S* dgeom,
-                      const S* dframes, const SurfelGradients<S>& out, Stream stream) {
-  if (!in.n) return;
-  BT_LAUNCH(backward_kernel<S>, dim3(unsigned(ceil_div(in.n, kThreads))), dim3(kThreads), 0, stream, viewmat, K, in,
-            geom, dgeom, dframes, out);
+void project_backward(const ProjectBackward<S>& a, Stream stream) {
+  const int64_t n = a.surfels.n;
+  if (!n) return;
+  BT_LAUNCH(backward_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, a);
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template void project_forward<S>(bool, const S*, const S*, int, int, S, const Surfels<S>&, S*, S*, S*, int32_t*, \
-                                   Stream);                                                                        \
-  template void project_backward<S>(const S*, const S*, const Surfels<S>&, const S*, const S*, const S*,           \
-                                    const SurfelGradients<S>&, Stream);
+#define BT_INSTANTIATE(S)                                          \
+  template void project_forward(const ProjectForward<S>&, Stream); \
+  template void project_backward(const ProjectBackward<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

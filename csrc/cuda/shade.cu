@@ -148,48 +148,44 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
 }  // namespace
 
 template <class S>
-void shade_forward(const FragmentArrays<S>& f, S bound, const S* base, const S* frames, const FieldArrays<S>* field,
-                   S* colors, Stream stream) {
-  if (!f.total) return;
+void shade_forward(const ShadeForward<S>& a, Stream stream) {
+  if (!a.f.total) return;
   FieldArrays<S> none = {};
-  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(f.total, kChunk * kForwardWarps))), dim3(kForwardWarps * kWarp),
-            0, stream, f, bound, base, frames, field ? *field : none, colors);
+  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(a.f.total, kChunk * kForwardWarps))), dim3(kForwardWarps * kWarp),
+            0, stream, a.f, a.bound, a.base, a.frames, a.field ? *a.field : none, a.colors);
 }
 
 template <class S>
-void shade_backward(int64_t n, const FragmentArrays<S>& f, S bound, const S* base, const S* frames,
-                    const FieldArrays<S>* field, const S* colors, const S* dcolors, S* dbase,
-                    const FieldGradients<S>* dfield, S* duv, S* dframes, const FieldWork<S>& work, Stream stream) {
-  const bool learns = field && dfield;
-  const FieldArrays<S>* learned = learns ? field : nullptr;
+void shade_backward(const ShadeBackward<S>& a, Stream stream) {
+  const bool learns = a.learns();
+  const FieldArrays<S>* learned = learns ? a.field : nullptr;
   FieldArrays<S> arrays = {};
-  if (learns) arrays = *field;
-  const ShadeGradients<S> out = {dbase, learns ? dfield->table : nullptr, duv, dframes, work.mlp};
-  const int blocks = backward_blocks<S>(f.total);
+  if (learns) arrays = *a.field;
+  const ShadeGradients<S> out = {a.dbase, learns ? a.dfield.table : nullptr, a.duv, a.dframes, a.work.mlp};
+  const int blocks = backward_blocks<S>(a.f.total);
   const size_t shared = learns ? sizeof(BackwardShared<S>) : 0;
   const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
   const auto run = [&](auto kernel, const ExactSums& exact) {
     BT_ALLOW_SHARED(kernel, shared);
-    BT_LAUNCH(kernel, grid, block, shared, stream, f, bound, base, frames, arrays, colors, dcolors, out, exact);
+    BT_LAUNCH(kernel, grid, block, shared, stream, a.f, a.bound, a.base, a.frames, arrays, a.colors, a.dcolors, out,
+              exact);
   };
-  if (work.exact) {
-    const ExactSums exact = begin_exact(work, learned, n, dframes != nullptr, f.total, dcolors, stream);
+  if (a.work.exact) {
+    const ExactSums exact = begin_exact(a.work, learned, a.n, a.dframes != nullptr, a.f.total, a.dcolors, stream);
     learns ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
-    end_exact(exact, learned, n, out.table, dbase, dframes, stream);
+    end_exact(exact, learned, a.n, out.table, a.dbase, a.dframes, stream);
   } else {
-    fill_zero(dbase, 3 * n, stream);
-    if (dframes) fill_zero(dframes, kFrame * n, stream);
+    fill_zero(a.dbase, 3 * a.n, stream);
+    if (a.dframes) fill_zero(a.dframes, kFrame * a.n, stream);
     if (learns) fill_zero(out.table, arrays.table_size(), stream);
     learns ? run(backward_kernel<S, false, true>, ExactSums()) : run(backward_kernel<S, false, false>, ExactSums());
   }
-  if (learns) sum_weights(work.mlp, blocks, arrays.levels, *dfield, stream);
+  if (learns) sum_weights(a.work.mlp, blocks, arrays.levels, a.dfield, stream);
 }
 
-#define BT_INSTANTIATE(S)                                                                                             \
-  template void shade_forward<S>(const FragmentArrays<S>&, S, const S*, const S*, const FieldArrays<S>*, S*, Stream); \
-  template void shade_backward<S>(int64_t, const FragmentArrays<S>&, S, const S*, const S*, const FieldArrays<S>*,    \
-                                  const S*, const S*, S*, const FieldGradients<S>*, S*, S*, const FieldWork<S>&,      \
-                                  Stream);
+#define BT_INSTANTIATE(S)                                      \
+  template void shade_forward(const ShadeForward<S>&, Stream); \
+  template void shade_backward(const ShadeBackward<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -3,7 +3,7 @@
 // registers. At 88 bytes and some 400 operations per value for both passes, memory and arithmetic are about even on an
 // H200; what is read twice, at the rims of tiles, comes from the L2.
 #include "core/ssim.h"
-#include "cuda/appearance.h"
+#include "cuda/kernels.h"
 #include "cuda/workspace.h"
 
 namespace bt::cuda {
@@ -183,8 +183,11 @@ int64_t ssim_workspace(int height, int width, int channels, bool gradient) {
 }
 
 template <class S>
-void ssim(int height, int width, int channels, const S* a, const S* b, S* value, S* da, void* workspace,
-          Stream stream) {
+void ssim(const Ssim<S>& images, Stream stream) {
+  const int height = images.height, width = images.width, channels = images.channels;
+  const S *a = images.a, *b = images.b;
+  S* da = images.da;
+  void* workspace = images.workspace.of(ssim_workspace<S>(height, width, channels, da != nullptr));
   const Plan<S> plan(height, width, channels, da != nullptr, workspace);
   const SsimWindow<S> window;
   const bool any = plan.count() > 0;
@@ -192,7 +195,7 @@ void ssim(int height, int width, int channels, const S* a, const S* b, S* value,
     BT_LAUNCH(windows_kernel<S>, plan.windows, dim3(kThreads<S>), 0, stream, height, width, channels, window, a, b,
               plan.sums, da ? plan.parts : nullptr);
   BT_LAUNCH(mean_kernel<S>, dim3(1), dim3(kSumThreads), 0, stream, plan.count(), plan.sums,
-            any ? double(plan.rows) * double(plan.columns) * channels : 0.0, value);
+            any ? double(plan.rows) * double(plan.columns) * channels : 0.0, images.value);
   if (da && any)
     BT_LAUNCH(gradient_kernel<S>, plan.pixels, dim3(kThreads<S>), 0, stream, height, width, channels, window, a, b,
               plan.parts, da);
@@ -202,7 +205,7 @@ void ssim(int height, int width, int channels, const S* a, const S* b, S* value,
 
 #define BT_INSTANTIATE(S)                                  \
   template int64_t ssim_workspace<S>(int, int, int, bool); \
-  template void ssim<S>(int, int, int, const S*, const S*, S*, S*, void*, Stream);
+  template void ssim(const Ssim<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

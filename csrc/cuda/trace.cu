@@ -6,8 +6,8 @@
 // marked pairs alone. Both are bound by arithmetic (about 100 operations per lane and pair, a third of the lanes with a
 // fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
+#include "cuda/kernels.h"
 #include "cuda/primitives.h"
-#include "cuda/trace.h"
 #include "cuda/workspace.h"
 
 namespace bt::cuda {
@@ -135,43 +135,41 @@ int64_t trace_mark_workspace(int64_t pairs) {
 }
 
 template <class S>
-void trace_mark(bool through_pixel, const S* geom, const S* radii, S near, int width, int height, int64_t pairs,
-                const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks, int64_t* offsets,
-                int64_t* tile_start, void* workspace, Stream stream) {
-  const int64_t tiles = int64_t(tiles_across(width)) * tiles_across(height);
-  Arena arena(workspace);
+void trace_mark(const TraceMark<S>& a, Stream stream) {
+  const View<S>& v = a.view;
+  const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
+  Arena arena(a.workspace.of(trace_mark_workspace(pairs)));
   const MarkSpace w(arena, pairs);
   if (pairs)
-    with_kernel(through_pixel, [&](auto kernel) {
-      BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, geom, radii,
-                near, width, height, pairs, surfel, tile_pairs, masks);
+    with_kernel(v.through_pixel, [&](auto kernel) {
+      BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v.geom,
+                v.radii, v.near, v.width, v.height, pairs, a.surfel, a.tile_pairs, a.masks);
     });
-  BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs, masks,
+  BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs, a.masks,
             w.counts);
-  exclusive_sum(w.counts, offsets, pairs + 1, w.temp, w.temp_size, stream);
-  BT_LAUNCH(start_kernel, dim3(unsigned(ceil_div(tiles + 1, kThreads))), dim3(kThreads), 0, stream, tiles, tile_pairs,
-            offsets, tile_start);
+  exclusive_sum(w.counts, a.offsets, pairs + 1, w.temp, w.temp_size, stream);
+  BT_LAUNCH(start_kernel, dim3(unsigned(ceil_div(tiles + 1, kThreads))), dim3(kThreads), 0, stream, tiles, a.tile_pairs,
+            a.offsets, a.tile_start);
 }
 
 template <class S>
-void trace_fill(bool through_pixel, const S* geom, S near, const Pairs& p, const FragmentArrays<S>& out,
-                Stream stream) {
-  if (!out.total) return;
-  with_kernel(through_pixel, [&](auto kernel) {
-    BT_LAUNCH((fill_kernel<decltype(kernel), S>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, geom, near,
-              p, out);
+void trace_fill(const TraceFill<S>& a, Stream stream) {
+  const Pairs& p = a.fragments.layout;
+  if (!p.fragments) return;
+  with_kernel(a.view.through_pixel, [&](auto kernel) {
+    BT_LAUNCH((fill_kernel<decltype(kernel), S>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.view.geom,
+              a.view.near, p, a.fragments.f);
   });
 }
 
-void masked_counts(const Pairs& p, const uint8_t* mask, int32_t* counts, Stream stream) {
-  if (!p.pairs) return;
-  BT_LAUNCH(counts_kernel, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, mask, counts);
+void masked_counts(const MaskedCounts<Pairs>& a, Stream stream) {
+  if (!a.layout.pairs) return;
+  BT_LAUNCH(counts_kernel, dim3(unsigned(a.layout.tiles())), dim3(kTileThreads), 0, stream, a.layout, a.mask, a.counts);
 }
 
-#define BT_INSTANTIATE(S)                                                                                     \
-  template void trace_mark<S>(bool, const S*, const S*, S, int, int, int64_t, const int32_t*, const int64_t*, \
-                              uint32_t*, int64_t*, int64_t*, void*, Stream);                                  \
-  template void trace_fill<S>(bool, const S*, S, const Pairs&, const FragmentArrays<S>&, Stream);
+#define BT_INSTANTIATE(S)                                \
+  template void trace_mark(const TraceMark<S>&, Stream); \
+  template void trace_fill(const TraceFill<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

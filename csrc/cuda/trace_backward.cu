@@ -4,7 +4,7 @@
 // that sum in a register, 16 bytes per fragment. The long formulas then need no order any more, so they run through the
 // list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair.
 #include "core/kernel.h"
-#include "cuda/trace.h"
+#include "cuda/kernels.h"
 
 namespace bt::cuda {
 
@@ -69,23 +69,21 @@ struct PutGeometry {
 }  // namespace
 
 template <class S>
-void trace_backward(bool through_pixel, const S* geom, S near, S rim, const Pairs& p, const FragmentArrays<S>& f,
-                    const S* dweight, const S* duv, const S* ddepth, S* dsigma, S* partial, S* dgeom, S* absgrad,
-                    Stream stream) {
-  if (dweight && f.total)
-    BT_LAUNCH(dsigma_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, f, dweight, dsigma);
-  const S* given = dweight ? dsigma : nullptr;
+void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream) {
+  const Pairs& p = a.fragments.layout;
+  const FragmentArrays<S>& f = a.fragments.f;
+  if (a.dweight && f.total)
+    BT_LAUNCH(dsigma_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, f, a.dweight, a.dsigma);
+  const S* given = a.dweight ? a.dsigma : nullptr;
   if (p.pairs)
-    with_kernel(through_pixel, [&](auto kernel) {
-      BT_LAUNCH((surfel_kernel<decltype(kernel), S>), run_blocks(p), dim3(kRunThreads), 0, stream, geom, near, rim, p,
-                f, given, duv, ddepth, partial);
+    with_kernel(a.view.through_pixel, [&](auto kernel) {
+      BT_LAUNCH((surfel_kernel<decltype(kernel), S>), run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom,
+                a.view.near, a.rim, p, f, given, a.duv, a.ddepth, a.partial);
     });
-  sum_slots<kTraceSums>(p, static_cast<const S*>(partial), PutGeometry<S>{dgeom, absgrad}, stream);
+  sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), PutGeometry<S>{a.dgeom, a.absgrad}, stream);
 }
 
-#define BT_INSTANTIATE(S)                                                                                           \
-  template void trace_backward<S>(bool, const S*, S, S, const Pairs&, const FragmentArrays<S>&, const S*, const S*, \
-                                  const S*, S*, S*, S*, S*, Stream);
+#define BT_INSTANTIATE(S) template void trace_backward(const TraceBackward<S, Pairs>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

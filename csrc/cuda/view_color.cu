@@ -3,7 +3,7 @@
 // reads whole lines, a few numbers of each at a time, and finds the rest of them in the L1.
 #include <type_traits>
 
-#include "cuda/appearance.h"
+#include "cuda/kernels.h"
 
 namespace bt::cuda {
 
@@ -70,41 +70,40 @@ void dispatch(int kind, int terms, F&& f) {
 }  // namespace
 
 template <class S>
-void view_color_forward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
-                        const uint8_t* active, S* out, Stream stream) {
-  if (!n) return;
-  dispatch(p.kind, p.terms, [&](auto kind, auto terms) {
+void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
+  const Directions<S>& to = a.to;
+  if (!to.n) return;
+  dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
     const auto kernel = forward_kernel<S, decltype(kind)::value, decltype(terms)::value>;
-    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, p, means, center, active,
-              out);
+    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
+              to.center, to.active, a.out);
   });
 }
 
 template <class S>
-void lean_color(int64_t n, const LeanColors<S>& p, const S* means, const double* center, const uint8_t* active, S* out,
-                Stream stream) {
-  if (!n) return;
+void lean_color(const LeanColor<S>& a, Stream stream) {
+  const Directions<S>& to = a.to;
+  if (!to.n) return;
   const auto kernel = lean_kernel<S>;
-  BT_LAUNCH(kernel, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, p, means, center, active, out);
+  BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
+            to.center, to.active, a.out);
 }
 
 template <class S>
-void view_color_backward(int64_t n, const ViewColorArrays<const S>& p, const S* means, const double* center,
-                         const uint8_t* active, const S* dout, const ViewColorArrays<S>& dp, S* dmeans, Stream stream) {
-  if (!n) return;
-  dispatch(p.kind, p.terms, [&](auto kind, auto terms) {
+void view_color_backward(const ViewColorBackward<S>& a, Stream stream) {
+  const Directions<S>& to = a.to;
+  if (!to.n) return;
+  dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
     const auto kernel = backward_kernel<S, decltype(kind)::value, decltype(terms)::value>;
-    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, p, means, center, active,
-              dout, dp, dmeans);
+    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
+              to.center, to.active, a.dout, a.dcolors, a.dmeans);
   });
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template void view_color_forward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*,           \
-                                      const uint8_t*, S*, Stream);                                                 \
-  template void lean_color<S>(int64_t, const LeanColors<S>&, const S*, const double*, const uint8_t*, S*, Stream); \
-  template void view_color_backward<S>(int64_t, const ViewColorArrays<const S>&, const S*, const double*,          \
-                                       const uint8_t*, const S*, const ViewColorArrays<S>&, S*, Stream);
+#define BT_INSTANTIATE(S)                                               \
+  template void view_color_forward(const ViewColorForward<S>&, Stream); \
+  template void lean_color(const LeanColor<S>&, Stream);                \
+  template void view_color_backward(const ViewColorBackward<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -16,7 +16,7 @@ from bitymi_ns.bake import bake
 from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.ops.backend import emulated_cuda, module
-from bitymi_ns.ops.baked import Stage
+from bitymi_ns.ops.baked_cuda import Stage
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene

@@ -43,6 +43,6 @@ def test_bounds_leave_most_tiles_out() -> None:
     case = random_scene(200, 1, width=320, height=240, scale=0.05)
     _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
     tracer = backend.module(torch.device("cpu")).Trace_f64()
-    tracer.run(projection.geom, projection.radii, case.width, case.height, 0.2, projection.through_pixel)
+    tracer.run(**projection.view(projection.geom), most=0)
     boxes = (2 * projection.radii / 16 + 1).clamp(max=20).prod(-1).sum()
     assert tracer.pairs < 0.9 * float(boxes)

@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from bitymi_ns import ops
-from bitymi_ns.ops import baked, baked_cpu
-from bitymi_ns.ops.backend import emulated_cuda, module
+from bitymi_ns.ops import baked, baked_cpu, baked_cuda, trace_cpu, trace_cuda
+from bitymi_ns.ops.backend import emulated_cuda, kernel, module
 from bitymi_ns.ops.field_tiles import field_tiles
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.camera import Camera
 from tests.cuda.conftest import why_not_emulated
+from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene, traced
 from tests.ops.test_texel import Case
 
 emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
@@ -38,15 +41,17 @@ def test_tiles_are_evaluated_on_a_cuda_device_only() -> None:
         field_tiles(torch.zeros(0, 9), torch.zeros(0), torch.zeros(0, 5), (1, 4, 4), GEOMETRY, *weights)
 
 
-def test_each_baked_renderer_names_the_other() -> None:
+def test_the_cuda_renderer_refuses_the_cpu() -> None:
     cpu = torch.device("cpu")
-    scene = SimpleNamespace(device=cpu)
+    scene = SimpleNamespace(tiles=torch.zeros(0, 5, dtype=torch.int32))
     for call in (
-        lambda: baked.AtlasTexture(torch.zeros(1, 4, 4, 4), False, cpu),
-        lambda: baked.Workspace().fit(scene, 1, 8, 8, False),
-        lambda: baked.draw(scene, None, None, None, baked.empty_images(("rgb",), 1, 8, 8, cpu), baked.Workspace()),
+        lambda: baked_cuda.AtlasTexture(torch.zeros(1, 4, 4, 4), False, cpu),
+        lambda: baked_cuda.Workspace(cpu),
+        lambda: baked_cuda.compiled(scene),
+        lambda: baked_cuda.frame(None, torch.eye(4), torch.eye(3), None, {}, None),
+        lambda: baked_cuda.draw(scene, [], None, ("rgb",)),
     ):
-        with pytest.raises(RuntimeError, match=r"baked\.\S+ runs on a CUDA device only, .* `baked_cpu.draw`"):
+        with pytest.raises(RuntimeError, match=r"baked_cuda\.\S+ runs on a CUDA device only, .* `baked.draw`"):
             call()
 
 
@@ -54,6 +59,48 @@ def test_each_baked_renderer_names_the_other() -> None:
 def test_the_cpu_renderer_refuses_a_cuda_device() -> None:
     with emulated_cuda(), pytest.raises(RuntimeError, match=r"gather runs on the CPU only, .* `baked.draw`"):
         baked_cpu.gather(None, torch.zeros(0, 5, dtype=torch.int32))
+    scene = SimpleNamespace(tiles=torch.zeros(0, 5, dtype=torch.int32))
+    for call in (lambda: baked_cpu.frame(scene, None, False), lambda: baked_cpu.draw(scene, [], None, ("rgb",))):
+        with emulated_cuda(), pytest.raises(RuntimeError, match=r"runs on the CPU only, .* `baked.draw`"):
+            call()
+
+
+@emulated
+def test_the_tracers_refuse_each_others_tensors() -> None:
+    case = random_scene(5, 1, width=24, height=20)
+    _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
+    geom = projection.geom.detach()
+    with pytest.raises(RuntimeError, match=r"trace_cuda.tile_lists runs on a CUDA device only, .* call `trace`"):
+        trace_cuda.find(geom, projection)
+    with emulated_cuda():
+        with pytest.raises(RuntimeError, match=r"trace_cpu.find runs on the CPU only, .* call `trace`"):
+            trace_cpu.find(geom, projection)
+        with pytest.raises(RuntimeError, match=r"trace_cpu.count runs on the CPU only"):
+            trace_cpu.count(projection)
+        with pytest.raises(RuntimeError, match="there is no kernel texel_image_forward_f64 for tensors on 'cpu'"):
+            kernel("texel_image_forward", geom.double())
+
+
+def test_an_image_that_the_cpu_does_not_draw_is_named() -> None:
+    scene = BakedScene({}, "sv", torch.zeros(0, 5, dtype=torch.int32))
+    with pytest.raises(ValueError, match="'packed' is drawn on a CUDA device only: draw rgb and alpha"):
+        baked.draw(scene, [], None, ("packed",))
+    with pytest.raises(ValueError, match="no image 'colour'"):
+        baked.draw(scene, [], None, ("colour",))
+    with pytest.raises(ValueError, match="one size"):
+        baked.draw(scene, [], None, ("rgb",))
+
+
+def test_views_are_drawn_together_on_the_cpu_as_well() -> None:
+    case = random_scene(20, 3, width=24, height=20)
+    scene = BakedScene(case.params, "sv", torch.zeros(20, 5, dtype=torch.int32))
+    camera = camera_of(case, torch.float64)
+    moved = Camera(camera.viewmat + 0.1 * torch.eye(4, dtype=torch.float64)[:, [3]], camera.K, 24, 20)
+    together = baked.draw(scene, [camera, moved], None, ("rgb", "depth", "overdraw"))
+    for view, drawn in enumerate((camera, moved)):
+        alone = baked.draw(scene, [drawn], None, ("rgb", "depth", "overdraw"))
+        for name, image in alone.items():
+            assert image.shape[:3] == (1, 20, 24) and torch.equal(together[name][view], image[0]), name
 
 
 def test_a_device_without_kernels_is_named() -> None:

@@ -1,0 +1,237 @@
+"""Drawing a baked scene with the CUDA kernels: textures, working memory and the call itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import IntFlag
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .backend import function, module, on_device, require
+from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual
+from .project import GEOMETRY, Camera
+from .view_color import LEAN, check_lean, check_view_color, lettered
+from .view_kinds import VIEW_COLORS
+
+ON_CPU = "move the scene there, or draw with `baked.draw`"
+
+
+class Stage(IntFlag):
+    """Stages of a frame, for timing them apart; each needs what the ones before it left in the working memory."""
+
+    PREPARE = 1
+    BIN = 2
+    DRAW = 4
+    ALL = 7
+
+
+class AtlasTexture:
+    """The pages of an atlas in the memory of a device, as its texture unit reads them.
+
+    Args:
+        texels: [layers, height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
+            [layers, height / 4, width / 4, 16] uint8. On the CPU.
+        blocks: `texels` are BC7 blocks.
+        device: where the surfels are.
+
+    Raises:
+        RuntimeError: the device has too little memory, refuses textures of this size, or is no CUDA device.
+    """
+
+    def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
+        require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
+        texels = texels.detach().cpu()
+        layers, height, width = texels.shape[:3]
+        if blocks:
+            name, height, width = "bc7", 4 * height, 4 * width
+        elif texels.dtype == torch.uint8:
+            name = "uint8"
+        else:
+            name, texels = "half", texels.half()
+        data = texels.contiguous().view(torch.uint8)
+        with on_device(device):
+            self.texture = module(device).AtlasTexture(
+                format=name, layers=layers, height=height, width=width, texels=data
+            )
+        # handles are 64 bits without a sign
+        self.pages = torch.tensor([h - (1 << 64) if h >> 63 else h for h in self.texture.handles], device=device)
+
+
+def compiled(scene: BakedScene) -> Any:
+    """The scene as the kernels read it (`BakedScene` of csrc/cuda/baked.h), its atlas as textures on the device of the
+    surfels. It keeps all that it points to, so that a recorded CUDA graph never points at memory that is gone.
+
+    Raises:
+        TypeError: the surfels are not float32.
+        ValueError: a parameter of the view colour has a wrong shape.
+        RuntimeError: the scene is not on a CUDA device.
+    """
+    device = scene.tiles.device
+    require("baked_cuda.compiled", "cuda", device, ON_CPU)
+    for name, value in scene.surfels.items():
+        if value.dtype != torch.float32 and name != "view_span":
+            raise TypeError(f"the CUDA renderer takes float32 surfels, but {name} is {value.dtype}")
+    p = {name: value.detach().contiguous() for name, value in scene.surfels.items()}
+    if "view_terms" in p:
+        check_lean(scene.view_color, p, len(scene.tiles))
+        colors = dict(zip(("base", "span", "lean"), (p[name] for name in LEAN), strict=True))
+    else:
+        terms = check_view_color(scene.view_color, p, len(scene.tiles))
+        colors = lettered(VIEW_COLORS[scene.view_color].of(p)) | {"terms": terms}
+    texels = scene.atlas
+    if scene.blocks is not None and device.type == "cuda":
+        texels = scene.blocks
+    atlas = {}
+    if texels is not None:
+        is_blocks = texels is scene.blocks
+        kept = scene.kept.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
+        atlas = {"texture": kept.texture, "pages": kept.pages}
+    return module(device).BakedScene(
+        **{name: p[name] for name in GEOMETRY},
+        **colors,
+        **residual(scene),
+        **atlas,
+        kind=scene.view_color,
+        tiles=scene.tiles.contiguous(),
+        near=scene.near,
+        through_pixel=scene.through_pixel,
+    )
+
+
+class Workspace:
+    """Working memory of frames on a device; it grows when a frame is prepared that needs more, and stays.
+
+    Args:
+        device: a CUDA device.
+
+    Attributes:
+        capacity: pairs of surfel and tile that fit.
+        memory: [bytes] uint8, None before the first frame.
+
+    Raises:
+        RuntimeError: it is no CUDA device.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        require("baked_cuda.Workspace", "cuda", device, ON_CPU)
+        self._device = device
+        self.capacity = 0
+        self.memory: Tensor | None = None
+
+    def fit(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
+        """Makes room for frames of this kind with at least `capacity` pairs, or as many as `settle` found.
+
+        Raises:
+            ValueError: more surfels, views or pairs than a frame can have; the message gives the numbers.
+        """
+        kernels, device = module(self._device), self._device
+        most = kernels.MOST_PAIRS
+        if capacity > most:
+            raise ValueError(f"the view needs {capacity} pairs of surfel and tile, a frame can have {most}")
+        self.capacity = max(self.capacity, capacity) or min(most, 4 * surfels * views)
+        size = {"surfels": surfels, "views": views, "width": width, "height": height, "normals": normals}
+        with on_device(device):
+            needed = kernels.baked_memory(**size, capacity=self.capacity)
+        if self.memory is None or self.memory.numel() < needed:
+            self.memory = None  # frees the old before the new is taken
+            self.memory = torch.empty(needed, dtype=torch.uint8, device=device)
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of surfel and tile in the latest frame, which had surfels; waits for the device."""
+        assert self.memory is not None
+        return int(self.memory[:8].view(torch.int64))
+
+    def settle(self) -> bool:
+        """Whether the latest frame fitted; the next `fit` makes room for as many pairs and a quarter more, not for more
+        than that, since the sort runs over the whole capacity. Waits for the device."""
+        pairs = self.pairs
+        fitted = pairs <= self.capacity
+        self.capacity = pairs + pairs // 4 + 1
+        return fitted
+
+
+def empty_images(names: Sequence[str], views: int, width: int, height: int, device: torch.device) -> dict[str, Tensor]:
+    """Memory for images: name -> [views, height, width, channels] (IMAGES)."""
+    check_images(names)
+    shape = (views, height, width)
+    return {name: torch.empty(*shape, IMAGES[name][0], dtype=IMAGES[name][1], device=device) for name in names}
+
+
+def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
+    """Cameras of one size as viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, with width and height.
+
+    Raises:
+        ValueError: there is none, they differ in size, or one has skew.
+    """
+    size = common_size(cameras)
+    viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device, torch.float32)
+    Ks = torch.stack([camera.K for camera in cameras]).to(device, torch.float32)
+    return viewmats, Ks, *size
+
+
+def frame(
+    scene: Any,
+    viewmats: Tensor,
+    Ks: Tensor,
+    background: Tensor | None,
+    images: Mapping[str, Tensor],
+    workspace: Workspace,
+    stages: Stage = Stage.ALL,
+) -> None:
+    """Draws views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
+
+    When more pairs were needed than the workspace has room for, surfels are missing: compare `workspace.pairs` with
+    `workspace.capacity`, `fit` and draw again.
+
+    Args:
+        scene: of `compiled`.
+        viewmats: [V, 4, 4] float32, world to camera, on the scene's device.
+        Ks: [V, 3, 3] float32, likewise.
+        background: [3] float32, likewise; None = black.
+        images: what to draw, as `empty_images` makes them.
+        workspace: fitted to such a frame.
+        stages: the stages to run.
+
+    Raises:
+        ValueError: a shape is wrong, or the workspace is too small.
+        RuntimeError: the views are not on a CUDA device.
+    """
+    require("baked_cuda.frame", "cuda", viewmats.device, ON_CPU)
+    _, height, width, _ = next(iter(images.values())).shape
+    function("baked_frame", viewmats.device)(
+        **images,
+        scene=scene,
+        viewmats=viewmats,
+        Ks=Ks,
+        width=width,
+        height=height,
+        background=background,
+        stages=int(stages),
+        memory=workspace.memory,
+        capacity=workspace.capacity,
+    )
+
+
+def draw(
+    scene: BakedScene, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
+) -> dict[str, Tensor]:
+    """As `baked.draw`, all in one go. Waits for the images, to see whether the working memory was large enough."""
+    device, n = scene.tiles.device, len(scene.tiles)
+    require("baked_cuda.draw", "cuda", device, ON_CPU)
+    viewmats, Ks, width, height = stack_cameras(cameras, device)
+    arrays = compiled(scene)
+    if background is not None:
+        background = background.to(device, torch.float32).contiguous()
+    to = empty_images(images, len(cameras), width, height, device)
+    size = (n, len(cameras), width, height, "normal" in to)
+    with scene.kept.workspaces(lambda: Workspace(device)).borrow() as workspace:
+        workspace.fit(*size)
+        frame(arrays, viewmats, Ks, background, to, workspace)
+        if n and not workspace.settle():
+            workspace.fit(*size)
+            frame(arrays, viewmats, Ks, background, to, workspace)
+            workspace.settle()  # waits: the next frame may use the memory on another stream
+    return to

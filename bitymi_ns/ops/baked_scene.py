@@ -1,0 +1,100 @@
+"""What is drawn of a baked scene, and what the renderers of both devices share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from .pool import Pool
+from .project import Camera
+
+IMAGES: dict[str, tuple[int, torch.dtype]] = {
+    "rgb": (3, torch.float32),
+    "alpha": (1, torch.float32),
+    "packed": (1, torch.int32),
+    "beta": (1, torch.float32),
+    "depth": (1, torch.float32),
+    "normal": (3, torch.float32),
+    "overdraw": (1, torch.int32),
+}
+"""Channels and dtype of what can be drawn. packed, on a CUDA device only: red, green, blue and alpha as bytes, red the
+lowest."""
+
+
+class Kept:
+    """What drawing keeps of a scene from frame to frame: the atlas as its device reads it, and working memory."""
+
+    def __init__(self) -> None:
+        self._sources: list[tuple[Any, int]] = []
+        self._atlas: Any = None
+        self._workspaces: Pool[Any] | None = None
+
+    def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
+        """What `make` gives: made for the first frame, and again when a source is another one or was written to."""
+        now = [(t, t._version if isinstance(t, Tensor) else 0) for t in sources]
+        if len(now) != len(self._sources) or any(
+            a is not b and (isinstance(a, Tensor) or a != b) or version != before
+            for (a, version), (b, before) in zip(now, self._sources, strict=True)
+        ):
+            self._atlas, self._sources = make(), now
+        return self._atlas
+
+    def workspaces(self, make: Callable[[], Any]) -> Pool[Any]:
+        """Working memory of frames, by what makes it."""
+        if self._workspaces is None:
+            self._workspaces = Pool(make)
+        return self._workspaces
+
+
+class BakedScene(Protocol):
+    """What is drawn: `scene.baked.BakedScene`, which says what its attributes mean."""
+
+    surfels: Mapping[str, Tensor]
+    view_color: str
+    tiles: Tensor
+    atlas: Tensor | None
+    blocks: Tensor | None
+    offset: float
+    scale: float
+    extent: Tensor | None
+    mean_residual: Tensor | None
+    near: float
+    weight_bound: float
+    transmittance_min: float
+    kept: Kept
+
+    @property
+    def through_pixel(self) -> bool:
+        """Whether the kernel is seen through a pixel."""
+
+
+def residual(scene: BakedScene) -> dict[str, Any]:
+    """How texels change colours, as the kernels of both devices take it (`BakedResidual` of csrc/ops/baked.h)."""
+    numbers = ("offset", "scale", "weight_bound", "transmittance_min")
+    arrays = {"extent": scene.extent, "mean_residual": scene.mean_residual}
+    given = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
+    return {name: getattr(scene, name) for name in numbers} | given
+
+
+def check_images(names: Sequence[str]) -> None:
+    """Raises ValueError for an image that does not exist."""
+    unknown = [name for name in names if name not in IMAGES]
+    if unknown:
+        raise ValueError(f"there is no image '{unknown[0]}': choose among {', '.join(IMAGES)}")
+
+
+def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Width and height of views that are drawn together.
+
+    Raises:
+        ValueError: there is none, they differ in size, or one has skew.
+    """
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) != 1:
+        raise ValueError(f"views that are drawn together need one size, not {sorted(sizes)}")
+    if any(camera.skewed for camera in cameras):
+        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    return sizes.pop()

@@ -1,0 +1,249 @@
+// The arguments of one call, given by keyword: fills the struct of an operation (ops/arguments.h), names what is wrong.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+
+#include <cstdint>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#include "ops/arguments.h"
+
+namespace bt {
+
+namespace nb = nanobind;
+
+// What the kernels of a module run on.
+struct Device {
+  int32_t type;      // of DLPack
+  const char* name;  // in messages
+  bool cuda;         // they take working memory, and read rows 16 bytes at a time
+};
+
+// What an object of Python points into.
+struct Kept {
+  std::vector<nb::ndarray<nb::ro>> read;
+  std::vector<nb::ndarray<>> written;
+  std::vector<nb::object> objects;
+};
+
+class Reader;
+template <class T, class = void>
+struct IsDescribed : std::false_type {};
+template <class T>
+struct IsDescribed<T, std::void_t<decltype(std::declval<T&>().fields(std::declval<Reader&>()))>> : std::true_type {};
+
+// nanobind knows a type by its name, in all modules of a process: each has names of its own.
+#if defined(BITYMI_MODULE)
+inline namespace of_cpu {
+#elif defined(BITYMI_EMULATED)
+inline namespace of_emulated {
+#else
+inline namespace of_cuda {
+#endif
+// Arguments that are an object of Python, with what they point to.
+template <class Arguments>
+struct Held : Arguments {
+  Kept kept;
+};
+}
+
+class Reader {
+ public:
+  Reader(const std::string& what, const nb::kwargs& given, const Device& device)
+      : what_(what), given_(given), device_(device) {}
+
+  bool given(const char* name) const {
+    const PyObject* found = PyDict_GetItemString(given_.ptr(), name);
+    return found && found != Py_None;
+  }
+  template <class T>
+  void array(const char* name, T*& to, int64_t count) {
+    int64_t size;
+    to = take<T>(name, size, alignof(T));
+    expect(name, size, count);
+  }
+  template <class T>
+  void wide(const char* name, T*& to, int64_t count) {
+    int64_t size;
+    to = take<T>(name, size, device_.cuda ? 16 : alignof(T));
+    expect(name, size, count);
+  }
+  // An empty array has no address, but it was given.
+  template <class T>
+  void maybe(const char* name, T*& to, int64_t count) {
+    static std::remove_const_t<T> nothing;
+    to = nullptr;
+    if (!given(name)) return;
+    array(name, to, count);
+    if (!to) to = &nothing;
+  }
+  template <class T>
+  void rows(const char* name, T*& to, int64_t& n, int width) {
+    int64_t size;
+    to = take<T>(name, size, alignof(T));
+    if (size % width) expect(name, size, (size / width + 1) * width);
+    n = size / width;
+  }
+  template <class T>
+  void work(const char* name, T*& to, int64_t count) {
+    to = nullptr;
+    if (device_.cuda) array(name, to, count);
+  }
+  void memory(const char* name, Workspace& to) {
+    to = {nullptr, 0};
+    if (!device_.cuda) return;
+    uint8_t* at;
+    rows(name, at, to.bytes, 1);
+    to.at = at;
+  }
+  template <class T>
+  void number(const char* name, T& to) {
+    std::conditional_t<std::is_floating_point_v<T>, double, T> value;
+    if (!nb::try_cast(find(name), value)) wrong(name, std::is_same_v<T, bool> ? "a bool" : "a number");
+    to = T(value);
+  }
+  template <class S>
+  void number(const char* name, S (&to)[3]) {
+    std::tuple<double, double, double> value;
+    if (!nb::try_cast(find(name), value)) wrong(name, "three numbers");
+    to[0] = S(std::get<0>(value)), to[1] = S(std::get<1>(value)), to[2] = S(std::get<2>(value));
+  }
+  template <size_t kCount>
+  void choice(const char* name, int& to, const char* const (&names)[kCount]) {
+    std::string value;
+    if (!nb::try_cast(find(name), value)) wrong(name, "a string");
+    for (to = 0; to < int(kCount); ++to)
+      if (value == names[to]) return;
+    refuse(std::string(name) + " cannot be '" + value + "'");
+  }
+  template <class T>
+  void object(const char* name, T*& to) {
+    using Plain = std::remove_const_t<T>;
+    std::conditional_t<IsDescribed<Plain>::value, Held<Plain>, Plain>* held = nullptr;
+    const nb::handle found = find(name);
+    if (!nb::try_cast(found, held) || !held) wrong(name, "an object of this module");
+    kept_.objects.push_back(nb::borrow(found));
+    to = held;
+  }
+  template <class T>
+  void maybe_object(const char* name, T*& to) {
+    to = nullptr;
+    if (given(name)) object(name, to);
+  }
+  [[noreturn]] void refuse(const std::string& why) const { throw std::invalid_argument(what_ + ": " + why); }
+
+  // Nothing else was given; None is as good as nothing.
+  void done() const {
+    for (auto [key, value] : given_) {
+      if (value.is_none()) continue;
+      const std::string name = nb::cast<std::string>(key);
+      bool known = false;
+      for (const char* taken : taken_) known = known || name == taken;
+      if (!known) throw nb::type_error((what_ + " takes no argument '" + name + "'").c_str());
+    }
+  }
+  Kept keep() { return std::move(kept_); }
+
+ private:
+  nb::handle find(const char* name) {
+    const nb::handle found = PyDict_GetItemString(given_.ptr(), name);
+    if (!found) throw nb::type_error((what_ + " lacks the argument '" + name + "'").c_str());
+    taken_.push_back(name);
+    return found;
+  }
+  void expect(const char* name, int64_t size, int64_t count) const {
+    if (size != count)
+      refuse(std::string(name) + " has " + std::to_string(size) + " elements, expected " + std::to_string(count));
+  }
+  [[noreturn]] void wrong(const char* name, const std::string& wanted) const;
+
+  // torch has no unsigned numbers of 32 and 64 bits
+  template <class T>
+  using Stored = std::conditional_t<std::is_same_v<T, uint32_t>, int32_t,
+                                    std::conditional_t<std::is_same_v<T, uint64_t>, int64_t, T>>;
+  template <class T>
+  T* take(const char* name, int64_t& size, size_t alignment) {
+    using Access = std::conditional_t<std::is_const_v<T>, nb::ndarray<nb::ro>, nb::ndarray<>>;
+    const nb::handle object = find(name);
+    Access a;
+    if (!nb::try_cast(object, a, false) || a.device_type() != device_.type ||
+        a.dtype() != nb::dtype<Stored<std::remove_const_t<T>>>() || !dense(a))
+      not_an_array(name, nb::dtype<Stored<std::remove_const_t<T>>>());
+    size = int64_t(a.size());
+    T* at = static_cast<T*>(const_cast<void*>(static_cast<const void*>(a.data())));
+    if (reinterpret_cast<uintptr_t>(at) % alignment)
+      refuse(std::string(name) + " must start at a multiple of " + std::to_string(alignment) + " bytes");
+    if constexpr (std::is_const_v<T>)
+      kept_.read.push_back(std::move(a));
+    else
+      kept_.written.push_back(std::move(a));
+    return at;
+  }
+  template <class A>
+  static bool dense(const A& a) {
+    int64_t step = 1;
+    if (a.size() == 0) return true;
+    for (size_t i = a.ndim(); i--; step *= int64_t(a.shape(i)))
+      if (a.shape(i) != 1 && a.stride(i) != step) return false;
+    return true;
+  }
+  [[noreturn]] void not_an_array(const char* name, nb::dlpack::dtype dtype) const;
+
+  const std::string& what_;
+  const nb::kwargs& given_;
+  Device device_;
+  std::vector<const char*> taken_;
+  Kept kept_;
+};
+
+inline void Reader::wrong(const char* name, const std::string& wanted) const {
+  const nb::handle value = PyDict_GetItemString(given_.ptr(), name);
+  std::string is = nb::type_name(value.type()).c_str();
+  for (const char* property : {"dtype", "device", "shape"}) {
+    const nb::object has = nb::steal(PyObject_GetAttrString(value.ptr(), property));
+    if (has)
+      is += std::string(", ") + nb::str(has).c_str();
+    else
+      PyErr_Clear();
+  }
+  throw nb::type_error((what_ + ": " + name + " must be " + wanted + ", not " + is).c_str());
+}
+inline void Reader::not_an_array(const char* name, nb::dlpack::dtype dtype) const {
+  const char* kind = dtype.code == uint8_t(nb::dlpack::dtype_code::Float) ? "float"
+                     : dtype.code == uint8_t(nb::dlpack::dtype_code::Int) ? "int"
+                                                                          : "uint";
+  wrong(name, std::string("a dense ") + kind + std::to_string(dtype.bits) + " array on " + device_.name);
+}
+
+// Reads the arguments of one call.
+template <class Arguments>
+Arguments read(Reader& r) {
+  Arguments a = {};
+  a.fields(r);
+  r.done();
+  return a;
+}
+
+// A class whose objects are arguments that several calls share; its constructor takes them by keyword.
+template <class Arguments>
+nb::class_<Held<Arguments>> bind_class(nb::module_& m, const std::string& name, const Device& device, const char* doc) {
+  return nb::class_<Held<Arguments>>(m, name.c_str(), doc)
+      .def("__init__", [name, device](Held<Arguments>* self, const nb::kwargs& given) {
+        Reader r(name, given, device);
+        const Arguments a = read<Arguments>(r);
+        new (self) Held<Arguments>{a, r.keep()};
+      });
+}
+
+template <class S>
+constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f64";
+
+}  // namespace bt

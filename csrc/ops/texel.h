@@ -1,0 +1,88 @@
+// Arguments of the images that texels give, and of their gradient.
+#pragma once
+
+#include "ops/arguments.h"
+
+namespace bt {
+
+// Texels of all tiles in one list, rows along v: tile i of r_u x r_v texels begins at first[i]; 0, 0 = no tile.
+template <class S>
+struct TexelTiles {
+  int64_t n, texels;
+  const int64_t* first;  // [n], in texels
+  const int32_t* size;   // [n, 2]
+  const S* extent;       // [n] half side of the tile, scale units
+  const S* base;         // [n, 3] f_view
+  const S* values;       // [texels, 3]
+
+  template <class R>
+  void fields(R& r) {
+    r.rows("first", first, n, 1);
+    r.array("size", size, 2 * n);
+    r.array("extent", extent, n);
+    r.array("base", base, 3 * n);
+    r.rows("texels", values, texels, 3);
+  }
+};
+template <class S>
+struct TexelFragments {
+  int64_t count;
+  const int32_t *surfel, *pixel;
+  const S *weight, *uv;  // uv [2, count]
+
+  template <class R>
+  void fields(R& r, const char* name, TileStarts& starts) {
+    r.rows("surfel", surfel, count, 1);
+    r.array("pixel", pixel, count);
+    r.array("weight", weight, count);
+    r.array("uv", uv, 2 * count);
+    take(r, name, starts);
+    if (starts.fragments != count) r.refuse("the starts do not belong to these fragments");
+  }
+};
+
+// image [pixels, 3] = sum of w relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile w relu(base +
+// 0.5)
+template <class S>
+struct TexelForward {
+  TexelFragments<S> f;
+  TileStarts layout;  // of the screen's tiles
+  S bound;
+  TexelTiles<S> table;
+  int64_t pixels;
+  S* image;
+
+  template <class R>
+  void fields(R& r) {
+    f.fields(r, "tile_start", layout);
+    r.number("bound", bound);
+    table.fields(r);
+    r.rows("image", image, pixels, 3);
+  }
+};
+// Adds to dtexels [texels, 3] and writes dbase [n, 3]; either may be null. Fragments i with run_start[r] <= i <
+// run_start[r + 1] belong to one surfel; `order` sorts the runs by surfel.
+template <class S>
+struct TexelBackward {
+  TexelFragments<S> f;
+  TileStarts runs;
+  const int64_t* order;
+  S bound;
+  TexelTiles<S> table;
+  int64_t pixels;
+  const S* dimage;
+  S *dtexels, *dbase;
+
+  template <class R>
+  void fields(R& r) {
+    f.fields(r, "run_start", runs);
+    r.array("order", order, runs.tiles);
+    r.number("bound", bound);
+    table.fields(r);
+    r.rows("dimage", dimage, pixels, 3);
+    r.maybe("dtexels", dtexels, 3 * table.texels);
+    r.maybe("dbase", dbase, 3 * table.n);
+  }
+};
+
+}  // namespace bt

@@ -1,0 +1,89 @@
+"""Kernels take their arguments by keyword, and name the one that is wrong."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns.ops.backend import module
+from bitymi_ns.ops.pool import Pool
+
+kernels = module(torch.device("cpu"))
+
+
+def arguments(**changed: object) -> dict[str, object]:
+    a, b, value = torch.zeros(12, 12, 1), torch.zeros(12, 12, 1), torch.zeros(())
+    return {"a": a, "b": b, "height": 12, "width": 12, "channels": 1, "value": value, "da": None} | changed
+
+
+def test_all_arguments_are_read() -> None:
+    given = arguments()
+    kernels.ssim_f32(**given)
+    assert float(given["value"]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "message"),
+    [
+        (
+            {"a": torch.zeros(12, 12, 1).double()},
+            TypeError,
+            "a must be a dense float32 array on the CPU, not .*float64",
+        ),
+        ({"a": torch.zeros(12, 24, 1)[:, ::2]}, TypeError, "ssim_f32: a must be a dense float32 array"),
+        ({"b": torch.zeros(12, 12, 1, device="meta")}, TypeError, "b must be .* on the CPU, not .* meta"),
+        ({"b": torch.zeros(12, 11, 1)}, ValueError, "b has 132 elements, expected 144"),
+        ({"da": torch.zeros(1)}, ValueError, "da has 1 elements, expected 144"),
+        ({"b": None}, TypeError, "b must be a dense float32 array on the CPU, not .*None"),
+        ({"width": "12"}, TypeError, "width must be a number, not .*str"),
+        ({"depth": 1}, TypeError, "ssim_f32 takes no argument 'depth'"),
+    ],
+)
+def test_a_wrong_argument_is_named(changed: dict[str, object], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        kernels.ssim_f32(**arguments(**changed))
+
+
+def test_a_missing_argument_is_named() -> None:
+    given = arguments()
+    del given["height"]
+    with pytest.raises(TypeError, match="ssim_f32 lacks the argument 'height'"):
+        kernels.ssim_f32(**given)
+
+
+def test_an_array_that_stands_askew_is_named() -> None:
+    memory = torch.zeros(4 * 144 + 1, dtype=torch.uint8).numpy()
+    askew = memory[1:].view("f4")  # numpy lets it be
+    with pytest.raises((TypeError, ValueError), match="ssim_f32: a must"):
+        kernels.ssim_f32(**arguments(a=askew))
+
+
+def test_names_that_are_known_and_objects_of_the_module() -> None:
+    n = 3
+    to = {"means": torch.zeros(n, 3), "center": torch.zeros(3).double(), "active": torch.ones(n, dtype=torch.uint8)}
+    colors = {"terms": 1, "a": torch.zeros(n, 3), "b": torch.zeros(n, 0), "out": torch.zeros(n, 3)}
+    kernels.view_color_forward_f32(kind="sh", **to, **colors)
+    with pytest.raises(ValueError, match="kind cannot be 'fancy'"):
+        kernels.view_color_forward_f32(kind="fancy", **to, **colors)
+    with pytest.raises(TypeError, match="field must be an object of this module, not .*str"):
+        kernels.field_forward_f32(field="none", x=torch.zeros(1, 3), rho=torch.zeros(1, 3))
+
+
+def test_terms_that_are_not_there_are_refused() -> None:
+    to = {"means": torch.zeros(1, 3), "center": torch.zeros(3).double(), "active": torch.ones(1, dtype=torch.uint8)}
+    span = torch.tensor([[0, 2]], dtype=torch.int32)
+    colors = {"base": torch.zeros(1, 3), "span": span, "lean": torch.zeros(1, 6), "out": torch.zeros(1, 3)}
+    with pytest.raises(ValueError, match="the terms of surfel 0's view colour are not there"):
+        kernels.lean_color_f32(kind="sv", **to, **colors)
+
+
+def test_a_pool_gives_what_is_idle_and_forgets_what_failed() -> None:
+    pool = Pool(object)
+    with pool.borrow() as first, pool.borrow() as second:
+        assert first is not second
+    with pool.borrow() as again:
+        assert again in (first, second)
+    with pytest.raises(ZeroDivisionError), pool.borrow() as failed:
+        1 / 0  # noqa: B018
+    with pool.borrow() as one, pool.borrow() as other:
+        assert failed not in (one, other)

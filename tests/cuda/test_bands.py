@@ -20,17 +20,17 @@ def test_values_and_gradients_do_not_change(device: torch.device) -> None:
 @pytest.mark.parametrize("fit", [1000, 500])
 def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In bands of up to `fit` fragments the view can be drawn; where a row of tiles has more, the error says so."""
-    ints = trace_cuda._ints
+    empty_list = trace_cuda.empty_list
 
-    def small_ones(like: torch.Tensor, *shape: int) -> torch.Tensor:
-        if len(shape) == 1 and shape[0] > fit:  # of fragments: there are fewer pairs
+    def small_ones(geom: torch.Tensor, count: int) -> dict[str, torch.Tensor]:
+        if count > fit:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-        return ints(like, *shape)
+        return empty_list(geom, count)
 
     scene, camera = bands.make(device, 0)
     want = scene.render(camera)
     assert want.fragments.layout.pairs < 500
-    monkeypatch.setattr(trace_cuda, "_ints", small_ones)
+    monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
     monkeypatch.setattr(trace_cuda, "room", lambda geom: 2 * fit)
     if fit == 500:
         with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments.*, and there is room for 1,000"):

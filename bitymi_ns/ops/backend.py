@@ -126,7 +126,7 @@ def require(operation: str, kind: str, device: torch.device, instead: str) -> No
     Raises:
         RuntimeError: the device is not of that kind.
     """
-    if cuda_backend(device) != (kind == "cuda"):
+    if cuda_backend(device) != (kind == "cuda") or device.type not in ("cpu", "cuda"):
         where = {"cpu": "on the CPU", "cuda": "on a CUDA device"}
         raise RuntimeError(f"{operation} runs {where[kind]} only, and the tensors are on '{device}': {instead}")
 

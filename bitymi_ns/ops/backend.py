@@ -71,6 +71,7 @@ def cpu_module() -> str:
     return usable[-1]
 
 
+@functools.cache
 def load(name: str) -> ModuleType:
     """The compiled module of that name: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
 
@@ -198,4 +199,6 @@ def on_same_device(like: Tensor, **tensors: Tensor) -> None:
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:
     """`tensor` without its graph, contiguous, with the dtype and device of `like`."""
-    return tensor.detach().to(like).contiguous()
+    if tensor.dtype != like.dtype or tensor.device != like.device:
+        tensor = tensor.to(like)
+    return (tensor.detach() if tensor.requires_grad else tensor).contiguous()

@@ -17,8 +17,8 @@ from .project import GEOMETRY, Camera, project
 from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
-MAPS = {"beta": slice(4, 5), "depth": slice(5, 6), "normal": slice(6, 9)}
-"""Channels of an image with maps."""
+CHANNELS = {"rgb": slice(0, 3), "alpha": slice(3, 4), "beta": slice(4, 5), "depth": slice(5, 6), "normal": slice(6, 9)}
+"""Of an image; it has the first two alone where no maps are drawn."""
 
 
 @functools.cache
@@ -96,11 +96,10 @@ def draw(
     common_size(cameras)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:
-        image, overdraw = frame(scene, camera, any(name in MAPS or name == "overdraw" for name in images))
-        found = {name: image[..., channels] for name, channels in MAPS.items()}
-        found |= {"rgb": image[..., :3], "alpha": image[..., 3:4], "overdraw": overdraw}
-        if background is not None:
-            found["rgb"] = found["rgb"] + (1 - found["alpha"]) * background
+        image, overdraw = frame(scene, camera, any(name not in ("rgb", "alpha") for name in images))
         for name, views in drawn.items():
-            views.append(found[name])
+            found = overdraw if name == "overdraw" else image[..., CHANNELS[name]]
+            if name == "rgb" and background is not None:
+                found = found + (1 - image[..., CHANNELS["alpha"]]) * background
+            views.append(found)
     return {name: views[0][None] if len(views) == 1 else torch.stack(views) for name, views in drawn.items()}

@@ -7,6 +7,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include <cstdint>
+#include <cstring>
 #include <stdexcept>
 #include <string>
 #include <tuple>
@@ -57,12 +58,16 @@ struct Held : Arguments {
 
 class Reader {
  public:
-  Reader(const std::string& what, const nb::kwargs& given, const Device& device)
-      : what_(what), given_(given), device_(device) {}
+  Reader(const std::string& what, const nb::kwargs& given, const Device& device) : what_(what), device_(device) {
+    given_.reserve(given.size()), kept_.read.reserve(given.size()), kept_.written.reserve(given.size());
+    PyObject *key, *value;
+    for (Py_ssize_t at = 0; PyDict_Next(given.ptr(), &at, &key, &value);)
+      given_.push_back({PyUnicode_AsUTF8(key), value, false});
+  }
 
   bool given(const char* name) const {
-    const PyObject* found = PyDict_GetItemString(given_.ptr(), name);
-    return found && found != Py_None;
+    const Given* found = look(name);
+    return found && found->value != Py_None;
   }
   template <class T>
   void array(const char* name, T*& to, int64_t count) {
@@ -142,22 +147,28 @@ class Reader {
 
   // Nothing else was given; None is as good as nothing.
   void done() const {
-    for (auto [key, value] : given_) {
-      if (value.is_none()) continue;
-      const std::string name = nb::cast<std::string>(key);
-      bool known = false;
-      for (const char* taken : taken_) known = known || name == taken;
-      if (!known) throw nb::type_error((what_ + " takes no argument '" + name + "'").c_str());
-    }
+    for (const Given& g : given_)
+      if (!g.taken && g.value != Py_None) throw nb::type_error((what_ + " takes no argument '" + g.name + "'").c_str());
   }
   Kept keep() { return std::move(kept_); }
 
  private:
+  // The names as Python keeps them: a look-up in the dictionary would make a string of each first.
+  struct Given {
+    const char* name;
+    PyObject* value;
+    bool taken;
+  };
+  const Given* look(const char* name) const {
+    for (const Given& g : given_)
+      if (!std::strcmp(g.name, name)) return &g;
+    return nullptr;
+  }
   nb::handle find(const char* name) {
-    const nb::handle found = PyDict_GetItemString(given_.ptr(), name);
+    Given* found = const_cast<Given*>(look(name));
     if (!found) throw nb::type_error((what_ + " lacks the argument '" + name + "'").c_str());
-    taken_.push_back(name);
-    return found;
+    found->taken = true;
+    return found->value;
   }
   void expect(const char* name, int64_t size, int64_t count) const {
     if (size != count)
@@ -198,14 +209,13 @@ class Reader {
   [[noreturn]] void not_an_array(const char* name, nb::dlpack::dtype dtype) const;
 
   const std::string& what_;
-  const nb::kwargs& given_;
   Device device_;
-  std::vector<const char*> taken_;
+  std::vector<Given> given_;  // all of them; the call keeps the objects
   Kept kept_;
 };
 
 inline void Reader::wrong(const char* name, const std::string& wanted) const {
-  const nb::handle value = PyDict_GetItemString(given_.ptr(), name);
+  const nb::handle value = look(name)->value;
   std::string is = nb::type_name(value.type()).c_str();
   for (const char* property : {"dtype", "device", "shape"}) {
     const nb::object has = nb::steal(PyObject_GetAttrString(value.ptr(), property));

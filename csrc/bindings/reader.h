@@ -58,7 +58,7 @@ struct Held : Arguments {
 
 class Reader {
  public:
-  Reader(const std::string& what, const nb::kwargs& given, const Device& device) : what_(what), device_(device) {
+  Reader(std::string what, const nb::kwargs& given, const Device& device) : what_(std::move(what)), device_(device) {
     given_.reserve(given.size()), kept_.read.reserve(given.size()), kept_.written.reserve(given.size());
     PyObject *key, *value;
     for (Py_ssize_t at = 0; PyDict_Next(given.ptr(), &at, &key, &value);)
@@ -208,7 +208,7 @@ class Reader {
   }
   [[noreturn]] void not_an_array(const char* name, nb::dlpack::dtype dtype) const;
 
-  const std::string& what_;
+  const std::string what_;  // its own: callers give literals, too
   Device device_;
   std::vector<Given> given_;  // all of them; the call keeps the objects
   Kept kept_;

@@ -51,6 +51,13 @@ def test_a_missing_argument_is_named() -> None:
         kernels.ssim_f32(**given)
 
 
+def test_methods_and_classes_name_themselves() -> None:
+    with pytest.raises(TypeError, match=r"^Trace.run lacks the argument 'radii'"):
+        kernels.Trace_f32().run()
+    with pytest.raises(TypeError, match=r"^Patches: layers must be a number"):
+        kernels.Patches(layers="none")
+
+
 def test_an_array_that_stands_askew_is_named() -> None:
     memory = torch.zeros(4 * 144 + 1, dtype=torch.uint8).numpy()
     askew = memory[1:].view("f4")  # numpy lets it be

@@ -42,7 +42,10 @@ def cpuinfo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def test_the_record_is_that_of_the_module() -> None:
-    assert _cpu_features.FEATURES[backend.cpu_module()] == backend.module(torch.device("cpu")).CPU_FEATURES
+    module = backend.module(torch.device("cpu"))
+    if Path(module.__file__).parent != Path(_cpu_features.__file__).parent:
+        pytest.skip("another build in the place of the installed one (scripts/test_build.py)")
+    assert _cpu_features.FEATURES[backend.cpu_module()] == module.CPU_FEATURES
 
 
 @pytest.mark.skipif(not _cpu_features.FEATURES["_cpu"], reason="compiled for every CPU of its kind")

@@ -42,7 +42,7 @@ def read_exif(image: Image.Image) -> Exif:
         gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
     except Exception:  # Pillow raises many kinds on broken EXIF
         return Exif()
-    millimetres = _number(detail.get(ExifTags.Base.FocalLength))
+    millimetres = number(detail.get(ExifTags.Base.FocalLength))
     names = [tags.get(ExifTags.Base.Make), tags.get(ExifTags.Base.Model), detail.get(ExifTags.Base.LensModel)]
     focal, doubt = focal_length(detail, image.size)
     fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
@@ -66,11 +66,11 @@ def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[f
         size: width and height of the stored image in pixels.
     """
     long, short = max(size), min(size)
-    film = _number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    millimetres = _number(detail.get(ExifTags.Base.FocalLength))
-    density = _number(detail.get(ExifTags.Base.FocalPlaneXResolution))
-    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_number(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2), 25.4)
-    stated = [_number(detail.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    film = number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    millimetres = number(detail.get(ExifTags.Base.FocalLength))
+    density = number(detail.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(number(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2), 25.4)
+    stated = [number(detail.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
     if not film and not (millimetres and density):
         return None, ""
     if all(stated):
@@ -90,13 +90,13 @@ def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[f
     return pixels, ""
 
 
-def _number(value: object) -> float | None:
-    """A positive finite number, or None."""
+def number(value: object) -> float | None:
+    """A positive finite number, or None: files hold rationals with a denominator of 0, and text."""
     try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
+        found = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
-    return number if math.isfinite(number) and number > 0 else None
+    return found if math.isfinite(found) and found > 0 else None
 
 
 def _position(gps: Mapping[int, object]) -> tuple[float, float, float] | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 from PIL.ExifTags import IFD, Base
 
+from bitymi_ns.capture.exif import number
 from bitymi_ns.host.images import THREADS
 from bitymi_ns.train.exposure import exif_stops
 
@@ -50,11 +51,7 @@ def _settings(path: Path) -> Settings | None:
 
 
 def _number(value: object) -> float:
-    """A positive finite number, or 0: files hold rationals with a denominator of 0, text, and several ISO values."""
+    """A positive finite number, or 0; of several ISO values the first."""
     if isinstance(value, (tuple, list)):
         value = value[0] if value else None
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return 0.0
-    return number if math.isfinite(number) and number > 0.0 else 0.0
+    return number(value) or 0.0

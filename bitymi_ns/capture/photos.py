@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pillow_heif
 from PIL import Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
@@ -22,8 +21,6 @@ THUMB = 256
 """Longer side in pixels of the grey thumbnails by which duplicates are found."""
 SHARPNESS_SIZE = 1024
 """Longer side in pixels at which sharpness is judged."""
-
-pillow_heif.register_heif_opener()
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import pillow_heif
+
 Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
+
+pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.recognise import is_photograph
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
 
@@ -54,11 +54,7 @@ def photo_folder(source: Path) -> Path:
 
 
 def _photos_in(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if _is_photo(path)]
-
-
-def _is_photo(path: Path) -> bool:
-    return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
+    return [path for path in folder.iterdir() if is_photograph(path)]
 
 
 def find_photos(folder: Path) -> list[str]:
@@ -68,7 +64,7 @@ def find_photos(folder: Path) -> list[str]:
         CaptureError: the folder is missing, or cannot be read.
     """
     try:
-        paths = [path for path in folder.rglob("*") if _is_photo(path)]
+        paths = [path for path in folder.rglob("*") if is_photograph(path)]
     except OSError as error:
         raise CaptureError(f"{folder} cannot be read: {error.strerror}") from error
     parts = [path.relative_to(folder).parts for path in paths]

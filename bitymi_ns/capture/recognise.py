@@ -200,9 +200,12 @@ def _photographs_in(folder: Path) -> Path | None:
 
 
 def _has_photographs(folder: Path) -> bool:
-    return folder.is_dir() and any(
-        path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") for path in folder.iterdir()
-    )
+    return folder.is_dir() and any(is_photograph(path) for path in folder.iterdir())
+
+
+def is_photograph(path: Path) -> bool:
+    """Whether it is a file with the ending of a photograph, and not hidden."""
+    return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
 def _colmap_given(data: Path, colmap_path: Path) -> Found:

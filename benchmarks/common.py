@@ -17,9 +17,10 @@ from bitymi_ns.measure.markdown import table
 __all__ = ["CommandFailed", "difference", "number", "page", "publish", "read_curve", "say", "table"]
 
 
-def publish(text: str, output: Path | None) -> None:
-    """Print a page, and write it where asked."""
-    print(text)
+def publish(text: str, output: Path | None, silent: bool = False) -> None:
+    """Print a page (unless `silent`), and write it where asked."""
+    if not silent:
+        print(text)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(text, "utf8")

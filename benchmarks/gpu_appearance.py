@@ -21,11 +21,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from common import number, say, table
-from gpu_common import Options, Section, backward, milliseconds, trained_like
+from gpu_common import Options, Section, attempt, backward, failures, milliseconds, trained_like
 from torch import Tensor
 
 from bitymi_ns import ops
@@ -72,8 +73,11 @@ def appearance(options: Options) -> str:
     for width, height in options.sizes:
         for n in options.surfels:
             rows = []
-            for case in _cases(n, width, height, options.device):
-                ms = milliseconds(case.run, options)
+            where = f"{n:,} surfels, {width} x {height}"
+            for case in attempt(where, partial(_cases, n, width, height, options.device)) or ():
+                ms = attempt(f"{where}, {case.name}", partial(milliseconds, case.run, options))
+                if ms is None:
+                    continue
                 say(f"{n:,} surfels, {width} x {height}, {case.name}: {ms:.3f} ms")
                 seconds = 1e-3 * ms
                 rows.append(
@@ -91,7 +95,7 @@ def appearance(options: Options) -> str:
                 )
             parts.append(f"#### {n:,} surfels at {width} x {height}\n\n" + table(header, rows))
     note = f"A matrix product in full single precision: {number(1e-12 * rate, 1)} Tflop/s."
-    return "### Appearance\n\n" + "\n\n".join(parts) + "\n\n" + note
+    return "### Appearance\n\n" + "\n\n".join(parts) + "\n\n" + note + failures()
 
 
 def _cases(n: int, width: int, height: int, device: torch.device) -> list[Case]:

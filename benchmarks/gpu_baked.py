@@ -10,18 +10,20 @@ without, with n surfels of which v are visible, b pairs of surfel and tile, f fr
             read from the second-level cache, which the rows fit in; each of a tile's four warps reads its own.
 
 On a card 3840 x 2160 is drawn in any case. "frame" is the three stages launched by the host, "graph" the same as a CUDA
-graph, "packed" that with 8 bits a channel instead of floats.
+graph, "packed" that with 8 bits a channel instead of floats, "waited for" the time of a program
+that waits for each frame.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 from common import number, say, table
-from gpu_common import Options, Section, milliseconds, trained_like
+from gpu_common import Options, Section, attempt, failures, milliseconds, trained_like, with_launches
 
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bundle import read_bundle
@@ -44,6 +46,7 @@ HEADER = (
     "frame ms",
     "graph ms",
     "packed, graph ms",
+    "packed, waited for ms",
     "frames/s",
     "G fragments/s",
     "draw: of fp32",
@@ -58,17 +61,27 @@ def frames(options: Options) -> str:
     sizes = [*options.sizes, *([LARGE] if options.device.type == "cuda" and LARGE not in options.sizes else [])]
     for width, height in sizes:
         for n in options.surfels:
-            scene, camera = textured(n, width, height, options.device)
-            row, graphs[n, width, height] = _row(f"{n:,}", scene, [camera], options, rate)
-            rows.append(row)
+            if made := attempt(
+                f"{n:,} surfels, {width} x {height}", partial(_synthetic, n, width, height, options, rate)
+            ):
+                rows.append(made[0])
+                graphs[n, width, height] = made[1]
         for folder in options.bundles:
-            bundle = read_bundle(folder, decode=options.device.type != "cuda")
-            scene = bundle.scene.to(options.device)
-            rows.append(
-                _row(f"{Path(folder).name}, {len(bundle):,}", scene, _around(bundle, width, height), options, rate)[0]
-            )
+            if made := attempt(f"{folder}, {width} x {height}", partial(_bundle, folder, width, height, options, rate)):
+                rows.append(made[0])
     text = f"### Baked renderer\n\nfp32, measured by a product of matrices: {number(rate / 1e12, 1)} TFLOP/s.\n\n"
-    return text + table(HEADER, rows) + _gsplat(options, graphs)
+    return text + table(HEADER, rows) + (_gsplat(options, graphs) if options.peers else "") + failures()
+
+
+def _synthetic(n: int, width: int, height: int, options: Options, rate: float) -> tuple[list[str], float]:
+    scene, camera = textured(n, width, height, options.device)
+    return _row(f"synthetic, {n:,}", scene, [camera], options, rate)
+
+
+def _bundle(folder: Path, width: int, height: int, options: Options, rate: float) -> tuple[list[str], float]:
+    bundle = read_bundle(folder, decode=options.device.type != "cuda")
+    scene = bundle.scene.to(options.device)
+    return _row(f"{Path(folder).name}, {len(bundle):,}", scene, _around(bundle, width, height), options, rate)
 
 
 def textured(n: int, width: int, height: int, device: torch.device) -> tuple[BakedScene, Camera]:
@@ -115,7 +128,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
     """A line of the table, means over the cameras; and the milliseconds of the recorded frame."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
-    sums = dict.fromkeys(("pairs", "fragments", "prepare", "bin", "draw", "frame", "graph", "packed"), 0.0)
+    sums = dict.fromkeys(("pairs", "fragments", "prepare", "bin", "draw", "frame", "graph", "packed", "alone"), 0.0)
     for camera in cameras:
         sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
         frame = BakedRenderer(scene, width, height)
@@ -134,6 +147,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         ]
         for stage, run in cases:
             sums[stage] += milliseconds(run, options)
+        sums["alone"] += with_launches(packed.run, options)
     mean = {key: value / len(cameras) for key, value in sums.items()}
     say(f"baked, {name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
     pixels, draw = width * height, 1e-3 * mean["draw"]
@@ -142,7 +156,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         f"{width} x {height}",
         number(mean["pairs"] / 1e6, 2),
         number(mean["fragments"] / pixels, 1),
-        *(number(mean[key], 3) for key in ("prepare", "bin", "draw", "frame", "graph", "packed")),
+        *(number(mean[key], 3) for key in ("prepare", "bin", "draw", "frame", "graph", "packed", "alone")),
         number(1e3 / mean["graph"], 0),
         number(mean["fragments"] / draw / 1e9, 1),
         f"{100 * 60 * mean['fragments'] / draw / rate:.0f} %",

@@ -1,4 +1,4 @@
-"""What the sections of gpu.py share: timing with CUDA events, the card's measured limits, scenes like trained ones."""
+"""What the sections of gpu.py share: timing on the device, the card's measured limits, scenes like trained ones."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
+from common import say
 from torch import Tensor
 
 from bitymi_ns.ops import backend
@@ -20,6 +22,10 @@ from bitymi_ns.scene.scene import Scene
 
 SITES = 7
 LOG2_TABLE = 17
+FAILURES: list[str] = []
+T = TypeVar("T")
+CLOCK = 2.0e9
+"""Cycles per second, at most about what cards run at: how long `torch.cuda._sleep` spins."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,7 @@ class Options:
         warm_up, runs: of every timing.
         copy_bytes: measured bytes per second of a device-to-device copy, read and written bytes counted.
         bundles: folders of real scenes for the baked renderer.
+        peers: whether gsplat is timed as well.
     """
 
     device: torch.device
@@ -42,6 +49,7 @@ class Options:
     runs: int
     copy_bytes: float
     bundles: Sequence[Path] = ()
+    peers: bool = True
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,22 @@ class Section:
     run: Callable[[Options], str]
 
 
+def attempt(what: str, run: Callable[[], T]) -> T | None:
+    """What a part of a section gives; None where it failed, which is said and noted in FAILURES."""
+    try:
+        return run()
+    except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
+        text = f"{what}: {type(error).__name__}: {' '.join(str(error).split())[:400]}"
+        say(text)
+        FAILURES.append(text)
+        return None
+
+
+def failures() -> str:
+    """The parts that failed so far, as a list in Markdown."""
+    return "".join(f"\n\n- Failed: {text}" for text in FAILURES)
+
+
 def missing(needs: Sequence[str], device: torch.device) -> list[str]:
     """Those functions that the kernel module of a device does not have."""
     module = backend.module(device)
@@ -66,19 +90,46 @@ def missing(needs: Sequence[str], device: torch.device) -> list[str]:
 
 
 def milliseconds(run: Callable[[], object], options: Options) -> float:
-    """Median time of a call between two CUDA events: what the device does and what it waits for the host."""
+    """Median time of a call on the device alone, as far as the call does not wait for the device itself.
+
+    Several calls are queued behind a spin of the device that lasts longer than the host needs to queue them, so that
+    they run one after the other and launches are not what is measured. A call that waits for the device (training
+    waits twice per view) is timed with its waits.
+    """
     for _ in range(options.warm_up):
         run()
     if options.device.type != "cuda":
         return 1e3 * statistics.median(_seconds(run) for _ in range(options.runs))
-    events = [[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in range(options.runs)]
     torch.cuda.synchronize()
-    for start, end in events:
+    host = _seconds(run)
+    torch.cuda.synchronize()
+    calls = max(1, min(16, options.runs, round(2e-3 / max(host, 1e-6))))
+    samples = max(5, math.ceil(options.runs / calls))
+    spin = int(min(0.02, 2.0 * calls * host + 1e-4) * CLOCK)
+    times = []
+    for _ in range(samples):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda._sleep(spin)
         start.record()
-        run()
+        for _ in range(calls):
+            run()
         end.record()
-    torch.cuda.synchronize()
-    return statistics.median(start.elapsed_time(end) for start, end in events)
+        torch.cuda.synchronize()
+        times.append(start.elapsed_time(end) / calls)
+    return statistics.median(times)
+
+
+def with_launches(run: Callable[[], object], options: Options) -> float:
+    """Median milliseconds of a call as a program sees it that waits for each."""
+    for _ in range(options.warm_up):
+        run()
+
+    def complete() -> None:
+        run()
+        if options.device.type == "cuda":
+            torch.cuda.synchronize()
+
+    return 1e3 * statistics.median(_seconds(complete) for _ in range(options.runs))
 
 
 def _seconds(run: Callable[[], object]) -> float:

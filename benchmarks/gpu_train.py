@@ -12,6 +12,7 @@ import math
 import sys
 import tempfile
 import time
+import traceback
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,8 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
-from bitymi_ns.train.views import background_color, over_background
+from bitymi_ns.train.losses import mean_psnr, psnr
+from bitymi_ns.train.views import judging_background
 
 
 @dataclass
@@ -91,13 +93,16 @@ def waits_of(trainer: Trainer, steps: int) -> float:
     return sum("synchronizing" in str(w.message) for w in caught) / steps
 
 
-def run(name: str, capture: Capture, steps: int, points: int, device: torch.device, options: Options) -> Result:
-    """Trains, bakes and draws."""
+def run(
+    name: str, capture: Capture, steps: int, points: int, device: torch.device, options: Options, keep: Path | None
+) -> Result:
+    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given."""
     preset = load_preset(name)
     scene = new_scene(capture, preset).to(device)
     trainer = Trainer(scene, capture.train, preset.train, steps)
     due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
     cuda = device.type == "cuda"
+    pixels = capture.held_out[0].camera.width * capture.held_out[0].camera.height
     if cuda:
         torch.cuda.reset_peak_memory_stats(device)
     curve, seconds, waits = [], 0.0, None
@@ -112,9 +117,12 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
         seconds += time.perf_counter() - start
         if trainer.step in due:
             trainer.training.watch.finish(scene)
-            psnr, *_ = evaluate(scene, capture.held_out, preset.train)
-            curve.append(Point(trainer.step, seconds, len(scene), psnr))
-            say(f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {psnr:.2f} dB, {len(scene):,} surfels")
+            quality = evaluate(scene, capture.held_out, preset.train)
+            curve.append(Point(trainer.step, seconds, len(scene), quality.psnr))
+            say(
+                f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {quality.psnr:.2f} dB, "
+                f"{len(scene):,} surfels, {quality.fragments / pixels:.1f} fragments per pixel"
+            )
     peak = torch.cuda.max_memory_allocated(device) if cuda else 0
     camera = capture.held_out[0].camera.to(device)
     with torch.no_grad():
@@ -123,8 +131,9 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
     made = bake.bake(scene, [view.camera for view in capture.train])
     bake_seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
-        bundle.export(made, Path(folder) / "bundle")
-        baked = bundle.read_bundle(Path(folder) / "bundle").scene
+        target = Path(folder if keep is None else keep) / f"{name}-{steps}"
+        bundle.export(made, target)
+        baked = bundle.read_bundle(target).scene
     if cuda:
         baked = baked.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)
@@ -135,13 +144,12 @@ def run(name: str, capture: Capture, steps: int, points: int, device: torch.devi
 
 
 def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.device) -> float:
-    background = background_color("white" if preset.train.background == "white" else "black", 0, 0, device)
+    background = judging_background(preset.train.background, device)
     values = []
-    for camera, image, _ in capture.held_out:
-        rgb = baked.render(camera.to(device), background).rgb.clamp(0, 1)
-        target = over_background(image.to(device).float() / 255, background)
-        values.append(-10 * math.log10(max((rgb - target).square().mean().item(), 1e-10)))
-    return sum(values) / len(values)
+    for view in (view.to(device) for view in capture.held_out):
+        rgb = baked.render(view.camera, background).rgb.clamp(0, 1)
+        values.append(psnr(rgb, view.target(background, device), view.mask))
+    return mean_psnr(values)
 
 
 def report(results: list[Result], capture: Capture) -> str:
@@ -190,6 +198,7 @@ def main() -> int:
     parser.add_argument("--device", default="cuda", help="cuda or cpu (%(default)s)")
     parser.add_argument("--warm-up", type=int, default=10, help="frames before those that are timed (%(default)s)")
     parser.add_argument("--runs", type=int, default=200, help="frames that are timed (%(default)s)")
+    parser.add_argument("--keep", type=Path, help="folder in which the bundles stay")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
@@ -200,14 +209,21 @@ def main() -> int:
     except (OSError, KeyError, ValueError) as error:
         parser.error(f"the capture {arguments.data} cannot be read: {error}")
     options = Options(device, (), (), arguments.warm_up, arguments.runs, 0.0)
-    results = []
+    what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    notes = [f"Device: {what}.", f"Frames: median of about {arguments.runs} after {arguments.warm_up}."]
+    results, failed = [], False
     for name in arguments.presets:
         steps = arguments.steps or load_preset(name).trainer.iterations
-        results.append(run(name, capture, steps, min(arguments.points, steps), device, options))
-    what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    notes = [f"Device: {what}.", f"Frames: median of {arguments.runs} after {arguments.warm_up}, launches included."]
-    publish(page(f"Training on a card: {arguments.data.name}", report(results, capture), notes), arguments.output)
-    return 0
+        try:
+            results.append(run(name, capture, steps, min(arguments.points, steps), device, options, arguments.keep))
+        except (RuntimeError, ValueError, OSError) as error:
+            traceback.print_exc()
+            notes.append(f"{name} failed: {' '.join(str(error).split())[:400]}")
+            failed = True
+        last = name == arguments.presets[-1]
+        text = page(f"Training on a card: {arguments.data.name}", report(results, capture), notes)
+        publish(text, arguments.output, silent=not last)
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,11 @@ and tile, f fragments and p pixels (gathers count once; what a later kernel of t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from common import number, say, table
-from gpu_common import Options, Section, backward, milliseconds, missing, peak_memory, trained_like
+from gpu_common import Options, Section, attempt, backward, failures, milliseconds, missing, peak_memory, trained_like
 from torch import Tensor
 from torch.nn.functional import l1_loss
 
@@ -38,10 +39,16 @@ def operations(options: Options) -> str:
     for width, height in options.sizes:
         for n in options.surfels:
             scene, camera = trained_like(n, width, height, options.device, texture=False)
-            sizes, cases = _operations(scene, camera)
+            where = f"{n:,} surfels, {width} x {height}"
+            made = attempt(where, partial(_operations, scene, camera))
+            if made is None:
+                continue
+            sizes, cases = made
             rows = []
             for name, needed, run in cases:
-                ms = milliseconds(run, options)
+                ms = attempt(f"{where}, {name}", partial(milliseconds, run, options))
+                if ms is None:
+                    continue
                 say(f"{n:,} surfels, {width} x {height}, {name}: {ms:.3f} ms")
                 rate = needed / (1e-3 * ms)
                 rows.append(
@@ -59,7 +66,7 @@ def operations(options: Options) -> str:
                 f"and tile, {sizes['f']:,} fragments ({sizes['f'] / sizes['p']:.1f} a pixel)\n"
             )
             parts.append(title + "\n" + table(header, rows))
-    return "### Training operations\n\n" + "\n\n".join(parts)
+    return "### Training operations\n\n" + "\n\n".join(parts) + failures()
 
 
 def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tuple[str, int, Callable[[], object]]]]:
@@ -118,8 +125,12 @@ def steps(options: Options) -> str:
         photo = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1)).to(options.device)
         for n in options.surfels:
             rows = []
-            for name, run, pairs in _steps(n, width, height, photo, with_ssim, options.device):
-                ms = milliseconds(run, options)
+            where = f"{n:,} surfels, {width} x {height}"
+            cases = attempt(where, partial(_steps, n, width, height, photo, with_ssim, options))
+            for name, run, pairs in cases or ():
+                ms = attempt(f"{where}, {name}", partial(milliseconds, run, options))
+                if ms is None:
+                    continue
                 say(f"{n:,} surfels, {width} x {height}, step of {name}: {ms:.3f} ms")
                 memory = peak_memory(run, options.device) / 1e6
                 rows.append([name, number(ms, 3), number(pairs, 0), number(memory, 0)])
@@ -129,12 +140,14 @@ def steps(options: Options) -> str:
         f"Loss: {loss}. gsplat gets the same centres, orientations and opacities, the scales at which its Gaussians "
         "have the curvature of the Beta kernels at their centres, and SH of degree 3; its pairs are its own count."
     )
-    return "### Training steps\n\n" + "\n\n".join(parts) + "\n\n" + note
+    return "### Training steps\n\n" + "\n\n".join(parts) + "\n\n" + note + failures()
 
 
 def _steps(
-    n: int, width: int, height: int, photo: Tensor, with_ssim: bool, device: torch.device
+    n: int, width: int, height: int, photo: Tensor, with_ssim: bool, options: Options
 ) -> list[tuple[str, Callable[[], object], int | None]]:
+    device = options.device
+
     def loss(rgb: Tensor) -> Tensor:
         l1 = l1_loss(rgb, photo)
         return 0.8 * l1 + 0.2 * (1 - ops.ssim(rgb, photo)) if with_ssim else l1
@@ -149,7 +162,7 @@ def _steps(
 
         pairs = scene.render(camera, field_mode="off").fragments.layout.pairs
         cases.append((name, _step(render, loss, parameters), pairs))
-    return cases + _gsplat_steps(n, width, height, loss, device)
+    return cases + (_gsplat_steps(n, width, height, loss, device) if options.peers else [])
 
 
 def _step(

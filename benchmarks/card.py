@@ -1,0 +1,236 @@
+#!/usr/bin/env python
+"""Brings the package to a bare machine with a card, and runs what is to be known there in an order that loses nothing.
+
+`card.py stage FOLDER --python python3.12` compiles the wheel here, for that Python and that card, and fetches the
+wheels of what the core packages need beside torch and numpy; nothing is compiled or fetched there. On the machine,
+`card.py run ORDER... --stage FOLDER --output RESULTS` unpacks them beside a copy of this checkout and runs the orders:
+each step is a process with a limit of its own, its output is appended to RESULTS/log.txt, and a step that fails is a
+line of the summary.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+CARRIED = ("bitymi_ns", "benchmarks", "tests", "method_configs", "pyproject.toml", "csrc", "docs", "README.md")
+NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
+"""Wheels that machines with torch and the usual scientific packages lack."""
+TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A process.
+
+    Attributes:
+        name: in the summary.
+        words: its command; several = run at the same time.
+        limit: seconds.
+    """
+
+    name: str
+    commands: Sequence[Sequence[str]]
+    limit: float
+
+
+def python(script: str, *words: str) -> list[str]:
+    """A command that runs a script of this folder."""
+    return [sys.executable, f"benchmarks/{script}", *words]
+
+
+def sanitizer(tool: str, *sections: str) -> list[str]:
+    """A command that runs kernels under a tool of compute-sanitizer."""
+    command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", "--print-limit", "20"]
+    return [*command, *python("card_smoke.py", "--sections", *sections)]
+
+
+def orders(results: Path, data: Path) -> dict[str, list[Step]]:
+    """What can be run: name -> steps."""
+    tests = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", "--timeout=90", "tests/cuda"]
+    bundles = results / "bundles"
+    baked = ("--surfels", "150000", "--runs", "100", "--no-check", "--sections", "baked")
+    ncu = ["ncu", "--profile-from-start", "off", "--set", "detailed", "--clock-control", "none", "--page", "details"]
+    large = ("--surfels", "150000", "--size", "1297x840")
+    return {
+        "check": [
+            Step("tests", [[*tests, "-k", "not emulated"]], 240),
+            Step("kernels", [python("card_smoke.py", *large, "--times", "20")], 90),
+            Step("sanitizers", [sanitizer(tool, "baked", "training") for tool in SANITIZERS], 150),
+        ],
+        "tables": [
+            Step("tables", [python("gpu.py", "--runs", "100", "--no-check", "--output", str(results / "gpu.md"))], 240),
+        ],
+        "fox": [
+            Step(
+                "fox",
+                [
+                    python("gpu_train.py", str(data / "fox"), "--presets", "bitymi", "--steps", "3000")
+                    + ["--keep", str(bundles), "--output", str(results / "fox.md")]
+                ],
+                200,
+            ),
+            Step(
+                "baked",
+                [
+                    python("gpu.py", *baked, "--bundles", str(bundles / "bitymi-3000"))
+                    + ["--output", str(results / "baked.md")]
+                ],
+                90,
+            ),
+        ],
+        "profile": [
+            Step(
+                "profile",
+                [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", "baked", "training")]],
+                400,
+            )
+        ],
+        "train": [
+            Step(
+                name,
+                [
+                    python("gpu_train.py", str(data / name), "--presets", "bitymi", "--keep", str(bundles / name))
+                    + ["--output", str(results / f"{name}.md")]
+                ],
+                400,
+            )
+            for name in ("snowmiku_1600", "train")
+        ],
+    }
+
+
+PROFILED = ("baked", "training")
+SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
+
+
+def stage(arguments: argparse.Namespace) -> int:
+    """Makes the folder that travels."""
+    folder = arguments.folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        tools = Path(arguments.tools or Path(temporary) / "tools")
+        if not tools.exists():
+            subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
+            subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
+        pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
+        wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
+        options = [
+            "-Ccmake.define.BITYMI_CUDA=ON",
+            f"-Ccmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}",
+        ]
+        options.append(f"-Cbuild-dir={arguments.build or Path(temporary) / 'build'}")
+        for old in folder.glob("bitymi_ns-*.whl"):
+            old.unlink()
+        subprocess.run([*wheel, *options], check=True)
+        fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder)]
+        for name in NEEDED:
+            if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
+                with_needs = [] if name == "pydantic" else ["--no-deps"]
+                subprocess.run([*fetched, *with_needs, name], check=True)
+    for wheel_file in sorted(folder.glob("*.whl")):
+        print(f"{wheel_file.stat().st_size / 1e6:8.2f} MB  {wheel_file.name}")
+    return 0
+
+
+def unpack(wheels: Path, work: Path) -> dict[str, str]:
+    """Installs the wheels aside, copies the checkout with their compiled modules, and gives the environment for it."""
+    site = work / "site"
+    command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
+    subprocess.run([*command, str(site), *map(str, sorted(wheels.glob("*.whl")))], check=True)
+    tree = work / "tree"
+    tree.mkdir()
+    for name in CARRIED:
+        source = ROOT / name
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, tree / name)
+    for compiled in [*(site / "bitymi_ns").glob("*.so"), site / "bitymi_ns/_cpu_features.py"]:
+        shutil.copy(compiled, tree / "bitymi_ns")
+    shutil.rmtree(site / "bitymi_ns")
+    path = os.pathsep.join([str(tree), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+
+
+def run_step(step: Step, tree: Path, environment: dict[str, str], log: Path, deadline: float) -> str:
+    """Runs a step and gives its line of the summary."""
+    start = time.perf_counter()
+    limit = min(step.limit, deadline - time.monotonic())
+    if limit < 5:
+        return f"| {step.name} | not begun: no time left | |"
+    running = []
+    with tempfile.TemporaryDirectory() as folder:
+        for i, command in enumerate(step.commands):
+            output = open(Path(folder) / str(i), "w+")  # noqa: SIM115
+            environment_of = {**environment, "TMPDIR": folder}
+            try:
+                process = subprocess.Popen(
+                    command, cwd=tree, env=environment_of, stdout=output, stderr=output, start_new_session=True
+                )
+            except OSError as error:
+                return f"| {step.name} | {error} | |"
+            running.append((command, process, output))
+        ends = []
+        for command, process, output in running:
+            try:
+                status = str(process.wait(max(1.0, limit - (time.perf_counter() - start))))
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, 9)
+                process.wait()
+                status = "stopped"
+            output.seek(0)
+            text = output.read()
+            output.close()
+            with log.open("a") as file:
+                file.write(f"\n===== {step.name}: {' '.join(command)}\n{text}\n===== status {status}\n")
+            ends.append(status)
+    return f"| {step.name} | {', '.join(ends)} | {time.perf_counter() - start:.0f} |"
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    staging = commands.add_parser("stage", help="make the folder of wheels")
+    staging.add_argument("folder", type=Path)
+    staging.add_argument("--python", default=sys.executable, help="a Python of the machine's version (%(default)s)")
+    staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
+    staging.add_argument(
+        "--tools", type=Path, help="virtual environment with the build tools, made where it is missing"
+    )
+    staging.add_argument("--build", type=Path, help="build folder that is kept")
+    running = commands.add_parser("run", help="run orders on the machine")
+    running.add_argument("orders", nargs="+", choices=list(orders(Path(), Path())))
+    running.add_argument("--stage", type=Path, required=True, help="folder of wheels")
+    running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
+    running.add_argument("--output", type=Path, required=True)
+    running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
+    arguments = parser.parse_args()
+    if arguments.command == "stage":
+        return stage(arguments)
+    deadline = time.monotonic() + arguments.seconds
+    results = arguments.output.resolve()
+    results.mkdir(parents=True, exist_ok=True)
+    log = results / "log.txt"
+    lines = ["| step | exit status | s |", "|---|---|---:|"]
+    with tempfile.TemporaryDirectory() as work:
+        environment = unpack(arguments.stage.resolve(), Path(work))
+        for name in arguments.orders:
+            for step in orders(results, arguments.data.resolve())[name]:
+                lines.append(run_step(step, Path(work) / "tree", environment, log, deadline))
+                print(lines[-1], flush=True)
+                (results / "summary.md").write_text("\n".join(lines) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

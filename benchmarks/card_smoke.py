@@ -1,0 +1,118 @@
+#!/usr/bin/env python
+"""Each CUDA kernel once on a scene of a given size: what sanitizers and profilers are pointed at.
+
+`--sections baked training` chooses; `--profile` marks one warm run of them for a profiler that waits for the mark (ncu
+--profile-from-start off), `--times` prints the device's time by kernel over a number of runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+
+import torch
+from gpu_baked import textured
+from gpu_common import trained_like
+from torch.nn.functional import l1_loss
+
+from bitymi_ns import ops
+from bitymi_ns.scene.baked_renderer import BakedRenderer
+
+
+def baked(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+    """A frame with a BC7 atlas."""
+    scene, camera = textured(n, width, height, device)
+    renderer = BakedRenderer(scene, width, height)
+    renderer.draw([camera])
+    return renderer.run
+
+
+def images(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+    """The same with every image."""
+    scene, camera = textured(n, width, height, device)
+    return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
+
+
+def training(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+    """A training step: field, SSIM, Adam."""
+    scene, camera = trained_like(n, width, height, device)
+    photo = torch.rand(height, width, 3, device=device)
+    optimizer = torch.optim.Adam(scene.parameters(), lr=0.0, fused=device.type == "cuda")
+
+    def run() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        rgb = scene.render(camera, field_mode="train").rgb
+        (0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))).backward()
+        optimizer.step()
+
+    return run
+
+
+def deterministic(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+    """A training step with sums that do not depend on the order."""
+    step = training(n, width, height, device)
+
+    def run() -> None:
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        try:
+            step()
+        finally:
+            torch.use_deterministic_algorithms(False)
+
+    return run
+
+
+SECTIONS = {"baked": baked, "images": images, "training": training, "deterministic": deterministic}
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--surfels", type=int, default=300)
+    parser.add_argument("--size", default="96x64", metavar="WxH", help="image size (%(default)s)")
+    parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
+    parser.add_argument("--profile", action="store_true", help="warm up, then mark one run")
+    parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
+    arguments = parser.parse_args()
+    width, height = (int(part) for part in arguments.size.split("x"))
+    device = torch.device("cuda")
+    for name in arguments.sections:
+        run = SECTIONS[name](arguments.surfels, width, height, device)
+        if not arguments.profile and not arguments.times:
+            run()
+            torch.cuda.synchronize()
+            print(f"{name}: done", flush=True)
+            continue
+        for _ in range(5):
+            run()
+        torch.cuda.synchronize()
+        if arguments.profile:
+            torch.cuda.profiler.start()
+            run()
+            torch.cuda.synchronize()
+            torch.cuda.profiler.stop()
+        if arguments.times:
+            print_times(name, run, arguments.times)
+    return 0
+
+
+def print_times(name: str, run: Callable[[], object], runs: int) -> None:
+    """Device time of every kernel, of the longest first, per run."""
+    activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
+        for _ in range(runs):
+            run()
+        torch.cuda.synchronize()
+    kernels = [e for e in profile.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
+    total = sum(e.self_device_time_total for e in kernels) / runs
+    print(f"\n#### {name}: {total:.0f} us on the device per run, {sum(e.count for e in kernels) / runs:.0f} kernels\n")
+    print("| kernel | per run | us per run |\n|---|---:|---:|")
+    for e in sorted(kernels, key=lambda e: -e.self_device_time_total)[:45]:
+        print(f"| `{e.key[:90]}` | {e.count / runs:.1f} | {e.self_device_time_total / runs:.1f} |")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

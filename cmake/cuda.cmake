@@ -15,7 +15,7 @@ if(BITYMI_EMULATED_CUDA)
   nanobind_add_module(_emulated NB_STATIC NOMINSIZE ${emulated_sources} ${cuda_bindings})
   target_include_directories(_emulated PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
   target_compile_definitions(_emulated PRIVATE BITYMI_EMULATED)
-  target_compile_options(_emulated PRIVATE -O2 -Wall -Wextra)
+  target_compile_options(_emulated PRIVATE -O2 -Wall -Wextra -ffp-contract=off)
   if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
     # kernels are included, so g++ takes their anonymous namespaces for those of headers
     target_compile_options(_emulated PRIVATE -Wno-subobject-linkage)
@@ -76,6 +76,11 @@ set_target_properties(bitymi_cuda PROPERTIES
 # Not the list itself: its semicolons would end the command of the shell.
 target_compile_definitions(bitymi_cuda PRIVATE BITYMI_ARCHITECTURES="${architectures}")
 target_compile_options(bitymi_cuda PRIVATE --expt-relaxed-constexpr -lineinfo -Xcompiler=-Wall)
+# What one kernel counts another one lists: were products and sums fused in one of them and not in the other, their bounds
+# would differ in the last bit, and now and then by a tile.
+set_source_files_properties(${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/bin.cu
+  ${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/baked_bin.cu ${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/baked_prepare.cu
+  PROPERTIES COMPILE_OPTIONS --fmad=false)
 find_package(CUDAToolkit REQUIRED)
 nanobind_add_module(_cuda NB_STATIC NOMINSIZE ${cuda_bindings})
 target_include_directories(_cuda PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)

@@ -33,6 +33,8 @@ class Bins:
         slot: [P] int32, by tile, then front to back: the pair's slot.
         surfel: [P] int32, likewise: the pair's surfel.
         tile_pairs: [tiles + 1] int64, where each tile's pairs begin.
+        differing: [1] int32, by how many pairs the lists differ from what was counted: 0, else the kernels were compiled
+            wrongly.
     """
 
     order: Tensor
@@ -40,6 +42,12 @@ class Bins:
     slot: Tensor
     surfel: Tensor
     tile_pairs: Tensor
+    differing: Tensor
+
+    @property
+    def layout(self) -> dict[str, Tensor]:
+        """What finds its way in a fragment list."""
+        return {name: value for name, value in vars(self).items() if name != "differing"}
 
 
 def _ints(like: Tensor, *shape: int) -> Tensor:
@@ -68,6 +76,7 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
             f"image of {camera.width} x {camera.height} pixels"
         )
     lists = {"slot": _ints(geom, pairs), "surfel": _ints(geom, pairs), "tile_pairs": _longs(geom, tiles + 1)}
+    lists["differing"] = _ints(geom, 1)
     space = workspace("bin_fill", geom, pairs=pairs, width=camera.width, height=camera.height)
     kernel("bin_fill", geom)(**view, **ranks, **lists, workspace=space)
     return Bins(**ranks, **lists)
@@ -89,7 +98,9 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tens
         workspace=workspace("trace_mark", geom, pairs=pairs),
     )
     count = int(marks["offsets"][-1])
-    layout = module(geom.device).Pairs(**marks, **vars(bins), width=camera.width, height=camera.height, fragments=count)
+    layout = module(geom.device).Pairs(
+        **marks, **bins.layout, width=camera.width, height=camera.height, fragments=count
+    )
     return layout, tile_start
 
 

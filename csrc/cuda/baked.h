@@ -87,7 +87,8 @@ enum BakedStage { kPrepare = 1, kBin = 2, kDraw = 4 };
 constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair holds 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 
-// Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64).
+// Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64); the next 8 by how many
+// pairs the lists differ from what was counted, 0 unless a compiler rounds one formula in two ways.
 size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals);
 
 // A frame of all views: the stages (a sum of BakedStage); one needs what those before it left in `memory`.

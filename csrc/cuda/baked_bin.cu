@@ -18,6 +18,7 @@ constexpr int kRestPerThread = 16;
 
 __global__ void __launch_bounds__(kThreads) order_counts_kernel(BakedFrame f) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (r == 0) f.memory.total[1] = 0;
   if (r < f.rows) f.memory.ordered_counts[r] = f.memory.counts[f.memory.order[r]];
 }
 
@@ -30,15 +31,24 @@ __device__ int32_t warp_sum_before(int32_t value, int lane) {
   return sum - value;
 }
 
-// Writes the pairs of one row of tiles from `at` on, never beyond `end`; the place after the last.
+// The counts come from another kernel, and one formula may be rounded in two ways (cmake/cuda.cmake keeps nvcc from
+// it). Whatever was counted: nobody writes beyond the places of his surfel, none of these stays unwritten, and the
+// difference is noted.
+__device__ void note_difference(const BakedFrame& f, int64_t listed, int64_t counted) {
+  const int64_t difference = listed < counted ? counted - listed : listed - counted;
+  if (difference)
+    atomicAdd(reinterpret_cast<unsigned long long*>(f.memory.total + 1), static_cast<unsigned long long>(difference));
+}
+
+// Writes the pairs of one row of tiles from `at` on, never beyond `end`; the place after the last, were there no end.
 template <class Key>
 __device__ int64_t write_pairs(const TileRow& r, uint32_t first_tile, uint32_t row, int64_t at, int64_t end, Key* keys,
                                int32_t* values) {
-  for (int tx = r.left; tx <= r.right && at < end; ++tx, ++at) {
-    keys[at] = Key(first_tile + tx);
-    values[at] = int32_t(row << 8 | part_mask(r, tx));
+  for (int tx = r.left; tx <= r.right && at + (tx - r.left) < end; ++tx) {
+    keys[at + (tx - r.left)] = Key(first_tile + tx);
+    values[at + (tx - r.left)] = int32_t(row << 8 | part_mask(r, tx));
   }
-  return at;
+  return at + (r.right - r.left + 1);
 }
 
 // The surfels in order of depth, one thread each, a warp for the large ones; the last blocks clear what is left over.
@@ -69,7 +79,7 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
     int64_t at = from;
     for (int ty = area.top; ty <= area.bottom; ++ty)
       at = write_pairs(tile_row(area, ty, f.width), base + ty * f.tiles_x, id, at, end, keys, values);
-    // both counts come from the same code; should they ever differ, no place may stay unwritten
+    note_difference(f, at - from, count);
     for (; at < end; ++at) keys[at] = Key(f.tiles);
   }
   for (unsigned rest = __ballot_sync(kFullMask, count > kPairsAlone); rest; rest &= rest - 1) {
@@ -89,6 +99,7 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
       write_pairs(row, base + ty * f.tiles_x, big, at + before, end, keys, values);
       at += __shfl_sync(kFullMask, before + mine, kWarp - 1);
     }
+    if (lane == 0) note_difference(f, at - start, pairs);
     for (at += lane; at < end; at += kWarp) keys[at] = Key(f.tiles);
   }
 }
@@ -138,7 +149,7 @@ void bin(const BakedFrame& f, Stream stream) {
 int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   Arena arena(base);
   BakedMemory& m = f.memory;
-  m.total = arena.take<int64_t>(1);
+  m.total = arena.take<int64_t>(2);
   m.ranges = arena.take<int32_t>(2 * f.tiles);
   m.rows = arena.take<float>(f.rows * kRow);
   m.normals = normals ? arena.take<float4>(f.rows) : nullptr;

@@ -23,7 +23,7 @@ enum RowColumn {
 static_assert(kRow == 24 && kR2 == 12);
 
 struct BakedMemory {
-  int64_t* total;                                       // [1] pairs of surfel and tile
+  int64_t* total;                                       // [2] pairs of surfel and tile; by how many the lists differ
   float* rows;                                          // [rows, kRow]
   float4* normals;                                      // [rows], null: not wanted
   uint32_t *depth, *depth_sorted;                       // [rows]

@@ -34,10 +34,10 @@ struct CountSpace {
   }
 };
 
-// Bits that tell the tiles apart.
+// Bits that tell the tiles apart, and the number behind the last.
 int tile_bits(int64_t tiles) {
   int bits = 1;
-  while ((int64_t(1) << bits) < tiles) ++bits;
+  while ((int64_t(1) << bits) <= tiles) ++bits;
   return bits;
 }
 struct FillSpace {
@@ -77,32 +77,43 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 // One thread per surfel, by rank; a warp lists its large surfels together, so that one disc before the camera does not
-// keep a thread busy with the whole screen.
+// keep a thread busy with the whole screen. The count comes from another kernel, and one formula may be rounded in two
+// ways (cmake/cuda.cmake keeps nvcc from it). Whatever was counted: nobody writes beyond the slots of his surfel, a
+// slot without a tile is a pair behind those of all tiles, and the difference is noted.
 template <class Kernel, class S>
-__global__ void __launch_bounds__(kThreads) list_kernel(int64_t n, const S* geom, int width, int height,
-                                                        const int32_t* order, const int64_t* slot_start, FillSpace w) {
+__global__ void __launch_bounds__(kThreads)
+    list_kernel(int64_t n, const S* geom, int width, int height, const int32_t* order, const int64_t* slot_start,
+                FillSpace w, int32_t* differing) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = int(threadIdx.x) % kWarp, across = tiles_across(width);
   const int64_t from = r < n ? slot_start[r] : 0, count = r < n ? slot_start[r + 1] - from : 0;
-  const auto list = [&](int32_t id, int64_t at, int mine, int step) {
+  const auto list = [&](int32_t id, int64_t at, int64_t end, int mine, int step) {
     for_tile_rows<Kernel>(geom + int64_t(id) * kGeom, width, height, [&](int row, int first, int last) {
       for (int column = first + mine; column <= last; column += step) {
         const int64_t slot = at + column - first;
+        if (slot >= end) break;
         w.tile[slot] = uint32_t(row * across + column);
         w.slots[slot] = int32_t(slot);
         w.owner[slot] = id;
       }
       at += last - first + 1;
     });
+    if (at != end && mine == 0) atomicAdd(differing, int32_t(at < end ? end - at : at - end));
+    for (int64_t slot = at + mine; slot < end; slot += step) {
+      w.tile[slot] = uint32_t(across * tiles_across(height));
+      w.slots[slot] = int32_t(slot);
+      w.owner[slot] = id;
+    }
   };
   const int32_t id = count ? order[r] : 0;
-  if (count && count <= kAlone) list(id, from, 0, 1);
+  if (count && count <= kAlone) list(id, from, from + count, 0, 1);
   unsigned large = __ballot_sync(kFullMask, count > kAlone);
   while (large) {
     const int j = __ffs(int(large)) - 1;
     large &= large - 1;
     const int32_t whose = __shfl_sync(kFullMask, id, j);
-    list(whose, __shfl_sync(kFullMask, from, j), lane, kWarp);
+    const int64_t at = __shfl_sync(kFullMask, from, j);
+    list(whose, at, at + __shfl_sync(kFullMask, count, j), lane, kWarp);
   }
 }
 
@@ -165,10 +176,11 @@ void bin_fill(const BinFill<S>& a, Stream stream) {
   const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
   Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
   const FillSpace w(arena, pairs, tiles);
+  fill_zero(a.differing, 1, stream);
   if (pairs) {
     with_kernel(v.through_pixel, [&](auto kernel) {
       BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v.n, v.geom, v.width,
-                v.height, a.order, a.slot_start, w);
+                v.height, a.order, a.slot_start, w, a.differing);
     });
     sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
     BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, a.slot, w.owner, a.surfel);

@@ -40,7 +40,9 @@ int64_t bin_count_workspace(int64_t n);
 template <class S>
 void bin_count(const BinCount<S>& a, Stream stream);
 
-// Lists the pairs (below 2^31): slot [pairs], surfel [pairs] and tile_pairs [tiles + 1] are written.
+// Lists the pairs (below 2^31): slot [pairs], surfel [pairs] and tile_pairs [tiles + 1] are written, and differing [1]:
+// by how many pairs the lists differ from the counts, 0 unless a compiler rounds one formula in two ways. A pair that
+// was counted and is not there stands behind those of the tiles.
 template <class S>
 struct BinFill {
   View<S> view;
@@ -49,6 +51,7 @@ struct BinFill {
   int64_t pairs;
   int32_t *slot, *surfel;
   int64_t* tile_pairs;
+  int32_t* differing;
   Workspace workspace;
 
   template <class R>
@@ -60,6 +63,7 @@ struct BinFill {
     check_pairs(r, pairs);
     r.array("surfel", surfel, pairs);
     r.array("tile_pairs", tile_pairs, tiles_of(view.width, view.height) + 1);
+    r.array("differing", differing, 1);
     r.memory("workspace", workspace);
   }
 };

@@ -75,11 +75,13 @@ __global__ void __launch_bounds__(kTileThreads)
   for (int64_t k = first + s.lane; k < end; k += kWarp) row[k] = 0;
 }
 
-__global__ void __launch_bounds__(kThreads) size_kernel(int64_t pairs, const uint32_t* masks, int32_t* counts) {
+// Pairs behind those of the tiles have no masks.
+__global__ void __launch_bounds__(kThreads)
+    size_kernel(int64_t pairs, const int64_t* listed, const uint32_t* masks, int32_t* counts) {
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (k > pairs) return;
   int32_t count = 0;
-  if (k < pairs)
+  if (k < *listed)
     for (int w = 0; w < kTileWarps; ++w) count += __popc(masks[w * pairs + k]);
   counts[k] = count;
 }
@@ -100,8 +102,11 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
     S g[kGeom];
     load_shape(geom + int64_t(id) * kGeom, g);
     const S dx = x - g[kCx], dy = y - g[kCy];
-    const Fragment<S> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+    Fragment<S> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
     if (mine) {
+      // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here, may
+      // find nothing, and the gradient would divide by it.
+      f.sigma = max_(f.sigma, S(kAlphaMin));
       const Blend<S> b = blend(f.sigma, transmittance);
       transmittance = b.behind;
       out.surfel[i] = id, out.pixel[i] = pixel;
@@ -145,8 +150,8 @@ void trace_mark(const TraceMark<S>& a, Stream stream) {
       BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v.geom,
                 v.radii, v.near, v.width, v.height, pairs, a.surfel, a.tile_pairs, a.masks);
     });
-  BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs, a.masks,
-            w.counts);
+  BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs,
+            a.tile_pairs + tiles, a.masks, w.counts);
   exclusive_sum(w.counts, a.offsets, pairs + 1, w.temp, w.temp_size, stream);
   BT_LAUNCH(start_kernel, dim3(unsigned(ceil_div(tiles + 1, kThreads))), dim3(kThreads), 0, stream, tiles, a.tile_pairs,
             a.offsets, a.tile_start);

@@ -263,6 +263,34 @@ def test_sizes(width: int, height: int, device: torch.device, cpu) -> None:
     check(scene_of(case), camera_of(case), device, cpu)
 
 
+@pytest.mark.parametrize("fewer", ["listed", "counted"])
+def test_lists_that_differ_from_the_counts_stay_in_their_places(fewer: str, device: torch.device) -> None:
+    """Were a surfel's tiles counted for an image that is wider, or less wide, than that for which they are listed."""
+    case = random_scene(60, 4, 160, 160)
+    case.params["log_scales"][:8] += 3.0  # more tiles than a thread writes by itself
+    case.params["opacity_logits"] -= 3.0
+    scene = scene_of(case).to(device)
+    large, small = (BakedRenderer(scene, size, size, images=("rgb", "overdraw")) for size in (160, 145))
+    for renderer in (large, small):
+        renderer._fit(8_000)
+        renderer._viewmats.copy_(case.viewmat)
+        renderer._Ks.copy_(case.K)
+        renderer.run()
+        assert renderer.complete() and renderer.workspace.differing == 0
+    whole = {name: image.clone() for name, image in small.images.items()}
+    counted, listed = (large, small) if fewer == "listed" else (small, large)
+    listed.workspace = counted.workspace
+    listed.run(Stage.BIN)
+    listed.run(Stage.DRAW)
+    assert listed.workspace.differing > 0
+    assert all(image.isfinite().all() for image in listed.images.values())
+    if fewer == "listed":  # all pairs are there, and places without one are not drawn
+        assert all(torch.equal(small.images[name], image) for name, image in whole.items())
+    else:
+        missing = large.images["overdraw"][:, :145, :145].sum() - whole["overdraw"].sum()
+        assert missing < 0
+
+
 def test_many_tiles_need_wide_keys(device: torch.device) -> None:
     """Above 65,535 tiles keys have 32 bits; the tiles that a narrower image has as well must get the same lists."""
     case = random_scene(30, 9, 1_000, 20)

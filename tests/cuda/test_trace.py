@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops import trace_cuda
+from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.scene import Camera
@@ -212,6 +213,48 @@ def test_a_surfel_over_the_whole_screen_is_listed_by_its_warp_and_summed_by_its_
         want = render(case, torch.float64, torch.device("cpu"))
     assert got.fragments.layout.pairs > 64
     compare(got, want)
+
+
+@pytest.mark.parametrize("name", GOLDEN_NAMES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_all_tiles_that_were_counted_are_listed(name: str, dtype: torch.dtype, device: torch.device) -> None:
+    case = load_golden(name)
+    leaves = [case.params[key].to(device, dtype) for key in SURFEL_KEYS]
+    camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+    projection = ops.project(*leaves, camera)
+    bins = trace_cuda.tile_lists(projection.geom, projection)
+    assert int(bins.differing) == 0 and len(bins.slot) == bins.tile_pairs[-1] > 0
+
+
+@pytest.mark.parametrize("fewer", ["listed", "counted"])
+def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, device: torch.device) -> None:
+    """Were a surfel's tiles counted for an image that is wider, or less wide, than that for which they are listed."""
+    case = random_scene(30, 4, 160, 160)
+    case.params["log_scales"][:4] += 3.0  # more tiles than a thread lists by itself
+    case.params["opacity_logits"] -= 3.0
+    leaves = [case.params[key].to(device) for key in SURFEL_KEYS]
+    large, small = (Camera(case.viewmat, case.K, size, size) for size in (160, 145))
+    projection = ops.project(*leaves, large)  # the rows of both
+    geom, views = projection.geom, [projection, replace(projection, camera=small)]
+    counted, listed = views if fewer == "listed" else reversed(views)
+    bins, want = trace_cuda.tile_lists(geom, counted), trace_cuda.tile_lists(geom, listed)
+    assert int(bins.differing) == int(want.differing) == 0
+    size = {"pairs": len(bins.slot), "width": listed.camera.width, "height": listed.camera.height}
+    kernel("bin_fill", geom)(**listed.view(geom), **vars(bins), workspace=workspace("bin_fill", geom, **size))
+    assert int(bins.differing) > 0
+    slots = bins.slot.cpu().long()
+    assert torch.equal(slots.sort().values, torch.arange(len(slots)))
+    rank = torch.searchsorted(bins.slot_start.cpu(), slots, right=True) - 1
+    assert torch.equal(bins.surfel.cpu(), bins.order.cpu()[rank])
+    if fewer == "listed":
+        assert torch.equal(bins.tile_pairs, want.tile_pairs)
+        pairs = int(want.tile_pairs[-1])
+        assert pairs < len(slots) and torch.equal(bins.surfel[:pairs], want.surfel)
+        layout, tile_start = trace_cuda.blended(geom, listed, bins)
+        want_layout, want_start = trace_cuda.blended(geom, listed, want)
+        assert torch.equal(tile_start, want_start) and layout.fragments == want_layout.fragments > 0
+        got, fragments = (trace_cuda.fill(geom, listed, each) for each in (layout, want_layout))
+        assert all(torch.equal(got[name], value) for name, value in fragments.items())
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])

@@ -88,16 +88,17 @@ def compiled(scene: BakedScene) -> Any:
         is_blocks = texels is scene.blocks
         kept = scene.kept.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
         atlas = {"texture": kept.texture, "pages": kept.pages}
-    return module(device).BakedScene(
-        **{name: p[name] for name in GEOMETRY},
-        **colors,
-        **residual(scene),
-        **atlas,
-        kind=scene.view_color,
-        tiles=scene.tiles.contiguous(),
-        near=scene.near,
-        through_pixel=scene.through_pixel,
-    )
+    with on_device(device):
+        return module(device).BakedScene(
+            **{name: p[name] for name in GEOMETRY},
+            **colors,
+            **residual(scene),
+            **atlas,
+            kind=scene.view_color,
+            tiles=scene.tiles.contiguous(),
+            near=scene.near,
+            through_pixel=scene.through_pixel,
+        )
 
 
 class Workspace:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, kernel_class, module, on_same_device
+from .backend import cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
 from .constants import FEATURES, WIDTH
 
 WEIGHTS = ("table", "w1", "w2", "w3")
@@ -50,7 +50,8 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
     weights = {name: dense(t, table) for name, t in zip(WEIGHTS, (table, w1, w2, w3), strict=True)}
     where = {"min_resolution": geometry.min_resolution, "contract": geometry.contract}
     where |= {"mid": tuple(geometry.mid), "half": geometry.half}
-    return kernel_class("Field", table)(**weights, **where, levels=levels, log2_size=log2_size)
+    with on_device(table.device):
+        return kernel_class("Field", table)(**weights, **where, levels=levels, log2_size=log2_size)
 
 
 def gradients(params: Sequence[Tensor]) -> dict[str, Tensor]:

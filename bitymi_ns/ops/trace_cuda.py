@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import kernel, module, require, workspace
+from .backend import kernel, module, on_device, require, workspace
 from .constants import TILE
 from .fragment_list import empty_list, too_many
 from .project import Projection
@@ -33,7 +33,7 @@ class Bins:
         slot: [P] int32, by tile, then front to back: the pair's slot.
         surfel: [P] int32, likewise: the pair's surfel.
         tile_pairs: [tiles + 1] int64, where each tile's pairs begin.
-        differing: [1] int32, by how many pairs the lists differ from what was counted: 0, else the kernels were compiled
+        differing: [1] int32, by how many pairs the lists differ from what was counted; not 0: the kernels were compiled
             wrongly.
     """
 
@@ -98,9 +98,9 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tens
         workspace=workspace("trace_mark", geom, pairs=pairs),
     )
     count = int(marks["offsets"][-1])
-    layout = module(geom.device).Pairs(
-        **marks, **bins.layout, width=camera.width, height=camera.height, fragments=count
-    )
+    size = {"width": camera.width, "height": camera.height}
+    with on_device(geom.device):
+        layout = module(geom.device).Pairs(**marks, **bins.layout, **size, fragments=count)
     return layout, tile_start
 
 

@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import coverage
+from bitymi_ns.ops.bc7 import decode_bc7
 from bitymi_ns.progress import Progress, no_progress
 
 Format = Literal["bc7", "uint8", "fp16"]
@@ -216,8 +216,7 @@ def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: i
         if len(data) != expected:
             raise ValueError(f"a {format} page of {width} x {height} texels has {expected} bytes, not {len(data)}")
         if format == "bc7":
-            image = Image.frombytes("RGBA", (width, height), bytes(data), "bcn", (7, "BC7"))
-            page[:] = np.asarray(image)
+            page[:] = decode_bc7(bytes(data), width, height)
         else:
             page[:] = np.frombuffer(data, dtype=np.dtype(dtype).newbyteorder("<")).reshape(height, width, 4)
     return pages

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .backend import function, module, on_device, require
 from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual
+from .bc7 import decode_bc7
 from .project import GEOMETRY, Camera
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
@@ -27,13 +30,26 @@ class Stage(IntFlag):
     ALL = 7
 
 
+def draws_blocks(device: torch.device) -> bool:
+    """Whether the texture unit of a CUDA device decodes BC7 blocks, which is found out by drawing some."""
+    with on_device(device):
+        return module(device).bc7_way() != ""
+
+
+def decoded(blocks: Tensor) -> Tensor:
+    """BC7 blocks [layers, height / 4, width / 4, 16] uint8 as texels [layers, height, width, 4] uint8, on the CPU."""
+    height, width = 4 * blocks.shape[1], 4 * blocks.shape[2]
+    pages = [decode_bc7(bytes(page.contiguous().numpy()), width, height) for page in blocks.cpu()]
+    return torch.from_numpy(np.stack(pages))
+
+
 class AtlasTexture:
     """The pages of an atlas in the memory of a device, as its texture unit reads them.
 
     Args:
         texels: [layers, height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
             [layers, height / 4, width / 4, 16] uint8. On the CPU.
-        blocks: `texels` are BC7 blocks.
+        blocks: `texels` are BC7 blocks; decoded, with a warning, where the device draws no such textures.
         device: where the surfels are.
 
     Raises:
@@ -43,6 +59,12 @@ class AtlasTexture:
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
         require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
         texels = texels.detach().cpu()
+        if blocks and not draws_blocks(device):
+            texels, blocks = decoded(texels), False
+            warnings.warn(
+                f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory",
+                stacklevel=2,
+            )
         layers, height, width = texels.shape[:3]
         if blocks:
             name, height, width = "bc7", 4 * height, 4 * width
@@ -81,7 +103,7 @@ def compiled(scene: BakedScene) -> Any:
         terms = check_view_color(scene.view_color, p, len(scene.tiles))
         colors = lettered(VIEW_COLORS[scene.view_color].of(p)) | {"terms": terms}
     texels = scene.atlas
-    if scene.blocks is not None and device.type == "cuda":
+    if scene.blocks is not None and (texels is None or draws_blocks(device)):
         texels = scene.blocks
     atlas = {}
     if texels is not None:

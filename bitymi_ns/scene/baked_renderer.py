@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 
 import torch
@@ -88,8 +89,18 @@ class BakedRenderer:
             self._draw(Stage.ALL)  # before recording: first calls load kernels
             torch.cuda.synchronize(self._viewmats.device)
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
-                self._draw(Stage.ALL)
+            # Freed textures wait for the device, which nobody may while a graph is recorded; nor do other threads end it.
+            collects = gc.isenabled()
+            gc.disable()
+            try:
+                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                    self._draw(Stage.ALL)
+            except BaseException:
+                self._graph = None  # half a recording
+                raise
+            finally:
+                if collects:
+                    gc.enable()
         self._graph.replay()
 
     def complete(self) -> bool:

@@ -1,11 +1,12 @@
 // Atlas pages on the device; on the host a stand-in with the texture unit's rounding.
+#include <cstring>
+#include <map>
 #include <stdexcept>
 
 #include "cuda/atlas_texture.h"
 
 #if !defined(__CUDACC__)
 #include <cmath>
-#include <cstring>
 #include <memory>
 #endif
 
@@ -13,33 +14,141 @@ namespace bt::cuda {
 
 #if defined(__CUDACC__)
 
+namespace {
+// Ways to a texture of BC7 blocks. What the rows of a copy into an array of blocks are is not written down, and drivers
+// may lack one or the other: `bc7_way` tries them.
+enum class Way { kRowsOfTexels, kRowsOfBlocks, kView, kViewOfElements };
+constexpr const char* kWays[] = {"array, rows of texels", "array, rows of blocks", "view", "view of elements"};
+
+// The first array and texture of a page; `page` is set as soon as there is something to free.
+cudaTextureObject_t make_page(TexelFormat format, Way way, int height, int width, const char* texels,
+                              cudaArray_t& page) {
+  const bool blocks = format == TexelFormat::kBc7, half = format == TexelFormat::kHalf;
+  const bool view = blocks && (way == Way::kView || way == Way::kViewOfElements);
+  const cudaChannelFormatDesc channels = view ? cudaCreateChannelDesc<uint4>()
+                                         : blocks
+                                             ? cudaCreateChannelDesc<cudaChannelFormatKindUnsignedBlockCompressed7>()
+                                         : half ? cudaCreateChannelDescHalf4()
+                                                : cudaCreateChannelDesc<uchar4>();
+  // a row of blocks is four rows of texels
+  const size_t row = blocks ? size_t(width) / 4 * 16 : size_t(width) * (half ? 8 : 4);
+  const size_t rows = blocks ? height / 4 : height;
+  check(cudaMallocArray(&page, &channels, view ? width / 4 : width, view ? height / 4 : height),
+        "memory for a page of the atlas");
+  if (blocks && way == Way::kRowsOfTexels) {
+    cudaMemcpy3DParms copy = {};
+    copy.srcPtr = make_cudaPitchedPtr(const_cast<char*>(texels), row, width, rows);
+    copy.dstArray = page;
+    copy.extent = make_cudaExtent(width, height, 1);
+    copy.kind = cudaMemcpyHostToDevice;
+    check(cudaMemcpy3D(&copy), "copy of the atlas");
+  } else {
+    check(cudaMemcpy2DToArray(page, 0, 0, texels, row, row, rows, cudaMemcpyHostToDevice), "copy of the atlas");
+  }
+  cudaResourceDesc resource = {};
+  resource.resType = cudaResourceTypeArray;
+  resource.res.array.array = page;
+  cudaTextureDesc sampling = {};
+  sampling.addressMode[0] = sampling.addressMode[1] = cudaAddressModeClamp;
+  sampling.filterMode = cudaFilterModeLinear;
+  const bool as_stored = half || (blocks && way == Way::kViewOfElements);
+  sampling.readMode = as_stored ? cudaReadModeElementType : cudaReadModeNormalizedFloat;
+  sampling.normalizedCoords = 0;
+  cudaResourceViewDesc as_blocks = {};
+  as_blocks.format = cudaResViewFormatUnsignedBlockCompressed7;
+  as_blocks.width = width, as_blocks.height = height;
+  cudaTextureObject_t texture = 0;
+  check(cudaCreateTextureObject(&texture, &resource, &sampling, view ? &as_blocks : nullptr), "texture of the atlas");
+  return texture;
+}
+
+// A page of blocks of one colour each, and what lies between its texels.
+constexpr int kProbeWidth = 32, kProbeHeight = 16, kProbeAcross = kProbeWidth / 4;
+constexpr int kProbeX = kProbeWidth / 2 - 1, kProbeY = kProbeHeight / 2 - 1;
+int probe_red(int block) { return 6 * block + 11; }  // odd, as the last bit of every colour below
+// Mode 6: six zeros and a one, red, green, blue and alpha twice with 7 bits, their two last bits, and weights of 0.
+void probe_block(int block, unsigned char* to) {
+  const uint64_t red = probe_red(block) >> 1, green = 127 - red, full = 127;
+  const uint64_t low =
+      1 << 6 | red << 7 | red << 14 | green << 21 | green << 28 | full << 49 | full << 56 | uint64_t(1) << 63;
+  const uint64_t high = 1;
+  memcpy(to, &low, 8), memcpy(to + 8, &high, 8);
+}
+__global__ void probe_kernel(uint64_t texture, float4* to) {
+  to[blockIdx.x * kProbeX + threadIdx.x] = fetch_texel(texture, 2.0f * threadIdx.x + 2, 2.0f * blockIdx.x + 2);
+}
+void probe(Way way) {                                                 // throws when it does not work
+  std::vector<unsigned char> blocks(4 * kProbeWidth * kProbeHeight);  // more than are read, however rows are understood
+  for (int i = 0; i < kProbeAcross * kProbeHeight / 4; ++i) probe_block(i, blocks.data() + 16 * i);
+  struct Owned {
+    cudaArray_t page = nullptr;
+    cudaTextureObject_t texture = 0;
+    float4* found = nullptr;
+    ~Owned() {
+      cudaFree(found);
+      if (texture) cudaDestroyTextureObject(texture);
+      if (page) cudaFreeArray(page);
+    }
+  } owned;
+  const char* texels = reinterpret_cast<const char*>(blocks.data());
+  owned.texture = make_page(TexelFormat::kBc7, way, kProbeHeight, kProbeWidth, texels, owned.page);
+  check(cudaMalloc(&owned.found, kProbeX * kProbeY * sizeof(float4)), "memory for a probe");
+  BT_LAUNCH(probe_kernel, dim3(kProbeY), dim3(kProbeX), 0, nullptr, owned.texture, owned.found);
+  float4 found[kProbeY][kProbeX];
+  check(cudaMemcpy(found, owned.found, sizeof found, cudaMemcpyDeviceToHost), "probe");
+  for (int j = 0; j < kProbeY; ++j)
+    for (int i = 0; i < kProbeX; ++i) {
+      const int x = 2 * i + 2, y = 2 * j + 2;  // the middle of four texels
+      float red = 0;
+      for (int k = 0; k < 4; ++k) red += probe_red((y - k / 2) / 4 * kProbeAcross + (x - k % 2) / 4) / (4 * 255.0f);
+      const float4 c = found[j][i];
+      const float off = fmaxf(fmaxf(fabsf(c.x - red), fabsf(c.y - (1 + 1 / 255.0f - red))),
+                              fmaxf(fabsf(c.z - 1 / 255.0f), fabsf(c.w - 1)));
+      if (!(off < 1.5f / 255)) throw std::runtime_error("the texture unit decodes other colours");
+    }
+}
+int found_way() {  // of the current device, asked once; -1: none
+  static std::map<int, int> known;
+  int device = 0;
+  check(cudaGetDevice(&device), "current device");
+  const auto at = known.find(device);
+  if (at != known.end()) return at->second;
+  int found = -1;
+  for (int way = 0; way < int(sizeof kWays / sizeof *kWays) && found < 0; ++way) {
+    try {
+      probe(Way(way));
+      found = way;
+    } catch (const std::runtime_error&) {
+      cudaGetLastError();  // what was found here is no error of a later call
+    }
+  }
+  return known[device] = found;
+}
+}  // namespace
+
+std::string bc7_way() {
+  const int way = found_way();
+  return way < 0 ? "" : kWays[way];
+}
+
 AtlasTexture::AtlasTexture(TexelFormat format, int layers, int height, int width, const void* texels) {
   const bool blocks = format == TexelFormat::kBc7;
-  const cudaChannelFormatDesc channels = blocks ? cudaCreateChannelDesc<cudaChannelFormatKindUnsignedBlockCompressed7>()
-                                         : format == TexelFormat::kHalf ? cudaCreateChannelDescHalf4()
-                                                                        : cudaCreateChannelDesc<uchar4>();
-  // a row of blocks is four rows of texels
-  const size_t row = blocks ? size_t(width) / 4 * 16 : size_t(width) * (format == TexelFormat::kHalf ? 8 : 4);
-  const size_t rows = blocks ? height / 4 : height;
+  const int way = blocks ? found_way() : 0;
+  if (way < 0) throw std::runtime_error("this card draws no BC7 textures: decode the blocks first");
+  const size_t bytes = size_t(height) * width * (blocks ? 1 : format == TexelFormat::kHalf ? 8 : 4);
   check(cudaGetDevice(&device_), "current device");
   try {
     for (int layer = 0; layer < layers; ++layer) {
+      pages_.push_back(nullptr);
       cudaArray_t page = nullptr;
-      check(cudaMallocArray(&page, &channels, width, height), "memory for a page of the atlas");
-      pages_.push_back(page);
-      const char* from = static_cast<const char*>(texels) + row * rows * layer;
-      check(cudaMemcpy2DToArray(page, 0, 0, from, row, row, rows, cudaMemcpyHostToDevice), "copy of the atlas");
-      cudaResourceDesc resource = {};
-      resource.resType = cudaResourceTypeArray;
-      resource.res.array.array = page;
-      cudaTextureDesc sampling = {};
-      sampling.addressMode[0] = sampling.addressMode[1] = cudaAddressModeClamp;
-      sampling.filterMode = cudaFilterModeLinear;
-      sampling.readMode = format == TexelFormat::kHalf ? cudaReadModeElementType : cudaReadModeNormalizedFloat;
-      sampling.normalizedCoords = 0;
-      cudaTextureObject_t texture = 0;
-      check(cudaCreateTextureObject(&texture, &resource, &sampling, nullptr), "texture of the atlas");
-      handles_.push_back(texture);
+      const char* from = static_cast<const char*>(texels) + bytes * layer;
+      try {
+        handles_.push_back(make_page(format, Way(way), height, width, from, page));
+      } catch (...) {
+        pages_.back() = page;
+        throw;
+      }
+      pages_.back() = page;
     }
     // a copy from pageable memory may still be under way, and streams other than the default one do not wait for it
     check(cudaStreamSynchronize(nullptr), "copy of the atlas");
@@ -55,13 +164,16 @@ void AtlasTexture::release() {
   cudaSetDevice(device_);
   cudaDeviceSynchronize();  // frames under way still read the pages
   for (uint64_t texture : handles_) cudaDestroyTextureObject(texture);
-  for (void* page : pages_) cudaFreeArray(static_cast<cudaArray_t>(page));
+  for (void* page : pages_)
+    if (page) cudaFreeArray(static_cast<cudaArray_t>(page));
   cudaSetDevice(current);
   handles_.clear();
   pages_.clear();
 }
 
 #else
+
+std::string bc7_way() { return ""; }
 
 namespace {
 struct Page {

@@ -6,6 +6,7 @@ rounds them alike): 1.2e-3 was the largest difference seen.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -15,8 +16,9 @@ from torch import Tensor
 from bitymi_ns.bake import bake
 from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module
-from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.ops.baked_cuda import Stage, draws_blocks
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
@@ -169,8 +171,37 @@ def test_bundles(format: str, device: torch.device, cpu, tmp_path) -> None:
     scene = undecoded.scene
     with cpu(), pytest.raises(ValueError, match="decode=True"):
         scene.render(front(8, 8))
-    if device.type == "cuda":  # decoded by the texture unit
-        check(scene, front(48, 40), device, cpu)
+    check_blocks(scene, bundle.scene, device, cpu)
+
+
+def check_blocks(scene: BakedScene, want: BakedScene, device: torch.device, cpu) -> None:
+    """A scene with BC7 blocks alone is drawn as the decoded one: by the texture unit, or decoded with a warning."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        got = scene.to(device).render(front(48, 40)).rgb.cpu()
+    with cpu():
+        rgb = want.render(front(48, 40)).rgb
+    assert (got - rgb).abs().max() < 3e-3
+    unit = draws_blocks(device)
+    assert unit == (device.type == "cuda"), "a card's texture unit decodes BC7"
+    assert [str(each.message) for each in told if "BC7" in str(each.message)] == (
+        []
+        if unit
+        else [f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory"]
+    )
+
+
+def test_a_card_that_draws_no_blocks(device: torch.device, cpu, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with cpu():
+        made = real_scene(make_surfels, count=20)
+        export(bake(made, options=BakeOptions(format="bc7")), tmp_path / "b")
+        bundle = read_bundle(tmp_path / "b")
+    monkeypatch.setattr(baked_cuda, "draws_blocks", lambda device: False)
+    assert check(bundle.scene, front(48, 40), device, cpu) < 3e-3  # the decoded texels that the scene has
+    blocks = replace(bundle.scene, atlas=None)
+    with pytest.warns(UserWarning, match="draws no BC7 textures"):
+        got = blocks.to(device).render(front(48, 40)).rgb
+    assert torch.equal(got, bundle.scene.to(device).render(front(48, 40)).rgb)
 
 
 def test_the_order_of_threads_changes_nothing(device: torch.device) -> None:

@@ -89,7 +89,7 @@ class BakedRenderer:
             self._draw(Stage.ALL)  # before recording: first calls load kernels
             torch.cuda.synchronize(self._viewmats.device)
             self._graph = torch.cuda.CUDAGraph()
-            # Freed textures wait for the device, which nobody may while a graph is recorded; nor do other threads end it.
+            # A texture that is freed waits for the device, which is an error while a graph is recorded.
             collects = gc.isenabled()
             gc.disable()
             try:

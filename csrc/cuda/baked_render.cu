@@ -93,7 +93,14 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   }
 }
 
-__device__ uint32_t to_byte(float x) { return uint32_t(clamp_(x, 0.0f, 1.0f) * 255.0f + 0.5f); }
+// Rounded as the image of floats would be: the product for itself.
+__device__ uint32_t to_byte(float x) {
+#if defined(__CUDA_ARCH__)
+  return uint32_t(__fmul_rn(clamp_(x, 0.0f, 1.0f), 255.0f) + 0.5f);
+#else
+  return uint32_t(clamp_(x, 0.0f, 1.0f) * 255.0f + 0.5f);
+#endif
+}
 
 template <bool kMaps>
 __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {

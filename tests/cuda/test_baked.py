@@ -30,6 +30,12 @@ from tests.ops.test_view_color import lean_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 STEP = 1 / 255
+FLIP = 4 / 255
+"""By which a colour on a card may differ: its special function unit takes exponentials and logarithms to about 2^-21. A
+fragment whose opacity is 1/255 to within that is drawn there and not here, and colours are below 4."""
+TEXEL = 2 / 256
+"""Of the texels' range, by which they may differ on a card: a texture unit's weights have 8 bits of fraction along each
+of two axes, and how it rounds the last bit is not written down."""
 EXTREME = extreme_scenes()
 
 
@@ -70,15 +76,23 @@ def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:
     return Camera(viewmat, torch.tensor([[60.0, 0, width / 2], [0, 55.0, height / 2], [0, 0, 1]]), width, height)
 
 
-def check(scene: BakedScene, camera: Camera, device: torch.device, cpu, background: Tensor | None = None) -> float:
-    """Holds a view of the scene on the device against the CPU's; the largest difference of colours."""
+def most(device: torch.device, emulated: float, card: float) -> float:
+    """The bound for that device."""
+    return card if device.type == "cuda" else emulated
+
+
+def check(
+    scene: BakedScene, camera: Camera, device: torch.device, cpu, background: Tensor | None = None, close: float = STEP
+) -> float:
+    """Holds a view of the scene on the device against the CPU's, colours to `close`, but for a pixel in a thousand; the
+    largest difference of colours."""
     got = scene.to(device).render(camera, None if background is None else background.to(device), maps=True)
     with cpu():
         want = scene.render(camera, background, maps=True)
     for name in FIELDS:
         a, b = getattr(got, name).cpu(), getattr(want, name)
         assert a.shape == b.shape and a.dtype == b.dtype and a.isfinite().all(), name
-        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else 1e-4 * max(1.0, float(b.abs().max()))
+        step = close if name == "rgb" else 0.5 if name == "overdraw" else 1e-4 * max(1.0, float(b.abs().max()))
         assert ((a - b).abs() <= step).double().mean() >= 0.999, name
     return float((got.rgb.cpu() - want.rgb).abs().max())
 
@@ -89,14 +103,16 @@ def test_golden_textured_scene(device: torch.device, cpu) -> None:
     scene = BakedScene(params, "sv", *atlas_of(golden))
     check(scene, camera_of(golden), device, cpu, golden.background.float())
     got = scene.to(device).render(camera_of(golden), golden.background.float().to(device), maps=True)
-    assert (got.rgb.cpu().double() - golden.outputs["rgb"]).abs().max() < STEP
-    assert torch.equal(got.overdraw[..., 0].cpu().double(), golden.outputs["overdraw"].double())
+    assert (got.rgb.cpu().double() - golden.outputs["rgb"]).abs().max() < most(device, STEP, STEP + TEXEL + FLIP)
+    differs = got.overdraw[..., 0].cpu().double() != golden.outputs["overdraw"].double()
+    assert differs.double().mean() <= most(device, 0, 1e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_random_scenes(seed: int, device: torch.device, cpu) -> None:
     case = random_scene(120, seed, width=61, height=45)
-    assert check(scene_of(case), camera_of(case), device, cpu, case.background.float()) < 1e-4
+    off = check(scene_of(case), camera_of(case), device, cpu, case.background.float(), close=1e-4)
+    assert off < most(device, 1e-4, FLIP)
 
 
 @pytest.mark.parametrize("seed, prefilter", [*((i, "low_pass") for i in range(6)), (0, "pixel"), (1, "pixel")])
@@ -122,7 +138,8 @@ def test_numbers_that_misbehave(case: SceneCase, prefilter: str, device: torch.d
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
 def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: torch.device, cpu) -> None:
-    assert check(textured(60, 0, dtype), front(), device, cpu, torch.tensor([0.2, 0.4, 0.6])) < 3e-3
+    off = check(textured(60, 0, dtype), front(), device, cpu, torch.tensor([0.2, 0.4, 0.6]))
+    assert off < most(device, 3e-3, TEXEL + FLIP)
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
@@ -161,7 +178,7 @@ def test_bundles(format: str, device: torch.device, cpu, tmp_path) -> None:
         export(bake(made, options=BakeOptions(format=format)), tmp_path / "b")
         bundle = read_bundle(tmp_path / "b")
         undecoded = read_bundle(tmp_path / "b", decode=False)
-    assert check(bundle.scene, front(48, 40), device, cpu) < 3e-3
+    assert check(bundle.scene, front(48, 40), device, cpu) < most(device, 3e-3, TEXEL + FLIP)
     if format != "bc7":
         assert bundle.scene.blocks is None and torch.equal(undecoded.scene.atlas, bundle.scene.atlas)
         return
@@ -181,7 +198,7 @@ def check_blocks(scene: BakedScene, want: BakedScene, device: torch.device, cpu)
         got = scene.to(device).render(front(48, 40)).rgb.cpu()
     with cpu():
         rgb = want.render(front(48, 40)).rgb
-    assert (got - rgb).abs().max() < 3e-3
+    assert (got - rgb).abs().max() < most(device, 3e-3, TEXEL + FLIP)
     unit = draws_blocks(device)
     assert unit == (device.type == "cuda"), "a card's texture unit decodes BC7"
     assert [str(each.message) for each in told if "BC7" in str(each.message)] == (
@@ -197,7 +214,9 @@ def test_a_card_that_draws_no_blocks(device: torch.device, cpu, tmp_path, monkey
         export(bake(made, options=BakeOptions(format="bc7")), tmp_path / "b")
         bundle = read_bundle(tmp_path / "b")
     monkeypatch.setattr(baked_cuda, "draws_blocks", lambda device: False)
-    assert check(bundle.scene, front(48, 40), device, cpu) < 3e-3  # the decoded texels that the scene has
+    assert check(bundle.scene, front(48, 40), device, cpu) < most(
+        device, 3e-3, TEXEL + FLIP
+    )  # the decoded texels that the scene has
     blocks = replace(bundle.scene, atlas=None)
     with pytest.warns(UserWarning, match="draws no BC7 textures"):
         got = blocks.to(device).render(front(48, 40)).rgb
@@ -233,8 +252,8 @@ def test_all_surfels_are_blended_without_a_least_transmittance(device: torch.dev
     case.params["opacity_logits"] += 4.0
     scene, camera = scene_of(case, transmittance_min=0.0), camera_of(case)
     check(scene, camera, device, cpu)
-    most = scene.to(device).render(camera, maps=True).overdraw
-    assert most.sum() > 1.5 * scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
+    deep = scene.to(device).render(camera, maps=True).overdraw
+    assert deep.sum() > 1.5 * scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
 
 
 def test_packed_image(device: torch.device) -> None:
@@ -258,7 +277,8 @@ def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu) -> 
     assert torch.equal(rgb, again) and again.data_ptr() == renderer.images["rgb"].data_ptr()
     with cpu():
         want = scene_of(case).render(camera).rgb
-    assert (rgb[0].cpu() - want).abs().max() < 1e-4
+    off = (rgb[0].cpu() - want).abs()
+    assert off.max() < most(device, 1e-4, FLIP) and (off < 1e-4).double().mean() > 0.999
     torch.testing.assert_close(scene.render(camera).rgb, rgb[0], atol=0, rtol=0)
 
 

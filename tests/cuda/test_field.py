@@ -89,7 +89,9 @@ def test_gradients_by_finite_differences(device: torch.device) -> None:
     def function(x: Tensor, *values: Tensor) -> Tensor:
         return ops.field(x, field.geometry, *values)
 
-    assert torch.autograd.gradcheck(function, (x, *weights), eps=1e-7, atol=1e-5, rtol=1e-3)
+    # the table's sums come in any order on a card: their last bits may differ from call to call
+    nondet = 1e-10 if device.type == "cuda" else 0.0
+    assert torch.autograd.gradcheck(function, (x, *weights), eps=1e-7, atol=1e-5, rtol=1e-3, nondet_tol=nondet)
 
 
 def test_no_points_and_points_far_away(device: torch.device) -> None:

@@ -105,9 +105,7 @@ class Reader {
   void memory(const char* name, Workspace& to) {
     to = {nullptr, 0};
     if (!device_.cuda) return;
-    uint8_t* at;
-    rows(name, at, to.bytes, 1);
-    to.at = at;
+    to.at = take<uint8_t>(name, to.bytes, 16);
   }
   template <class T>
   void number(const char* name, T& to) {

@@ -42,7 +42,7 @@ def test_view_colors_and_gradients_against_the_cpu(
         leaves = {k: v.to(device, dtype).requires_grad_() for k, v in parameters(kind, terms, n).items()}
         x = means.to(device, dtype).requires_grad_()
         color = ops.view_color(kind, leaves, x, center.to(device), active.to(device))
-        (color * torch.cos(torch.arange(3 * n, device=device)).view(n, 3).to(dtype)).sum().backward()
+        (color * torch.cos(torch.arange(3 * n, device=device).double()).view(n, 3).to(dtype)).sum().backward()
         return [t.detach().cpu().double() for t in (color, x.grad, *(v.grad for v in leaves.values()))]
 
     got = run(device)

@@ -39,7 +39,7 @@ def value_and_gradients(field: HashField, x: Tensor) -> list[Tensor]:
     x = x.clone().requires_grad_()
     field.zero_grad()
     rho = field(x)
-    (rho * torch.cos(torch.arange(rho.numel(), device=rho.device)).view_as(rho).to(rho)).sum().backward()
+    (rho * torch.cos(torch.arange(rho.numel(), device=rho.device).double()).view_as(rho).to(rho)).sum().backward()
     return [t.detach().cpu().double() for t in (rho, x.grad, *(p.grad for p in field.parameters()))]
 
 
@@ -135,7 +135,7 @@ class Shading:
         geometry = None if mode == "plain" else self.field.geometry
         args = (geometry, () if mode == "plain" else tuple(params), bound, mode == "move")
         colors = ops.shade(fragments, *leaves, *args)
-        (colors * torch.cos(torch.arange(colors.numel(), device=device)).view_as(colors).to(colors)).sum().backward()
+        (colors * torch.cos(torch.arange(colors.numel(), device=device).double()).view_as(colors).to(colors)).sum().backward()
         grads = [t.grad for t in (*leaves, fragments.uv, *params)]
         return [t.detach().cpu().double() for t in (colors, *grads) if t is not None]
 

@@ -22,7 +22,7 @@ def test_fragments_and_gradients_are_those_of_the_cpu(scale: float, device: torc
         fragments = ops.trace(projection)
         order = torch.argsort(fragments.pixel.long() * 64 + fragments.surfel.long())
         image = torch.stack([fragments.weight, *fragments.uv, fragments.depth])[:, order]
-        (image * torch.cos(torch.arange(image.numel(), device=where) * 1.3).view_as(image)).sum().backward()
+        (image * torch.cos(torch.arange(image.numel(), device=where).double() * 1.3).view_as(image)).sum().backward()
         return [fragments.pixel[order], image.detach(), *(leaf.grad for leaf in leaves)]
 
     got = [t.cpu() for t in run(device)]

@@ -52,8 +52,8 @@ def render(
     image = ops.composite_image(fragments, projection, base.clamp(min=0)[rows], maps)
     if loss is None:
         # directions by pixel and surfel: they do not depend on the order in which the list has them
-        by_fragment = torch.sin(fragments.pixel * 0.7 + fragments.surfel * 1.3).to(dtype)
-        by_pixel = torch.cos(torch.arange(image.numel(), device=device) * 1.7).to(dtype).view_as(image)
+        by_fragment = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
+        by_pixel = torch.cos(torch.arange(image.numel(), device=device).double() * 1.7).to(dtype).view_as(image)
         total = (image * by_pixel).sum() + (fragments.uv * by_fragment).sum() + (fragments.depth * by_fragment).sum()
     else:
         total = loss(image)
@@ -286,7 +286,7 @@ def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, cpu: CpuCo
             leaves = [case.params[key].to(where).clone().requires_grad_() for key in SURFEL_KEYS]
             camera = Camera(case.viewmat, case.K, case.width, case.height)
             fragments = ops.trace(ops.project(*leaves, camera))
-            direction = torch.sin(fragments.pixel * 0.7 + fragments.surfel * 1.3).double()
+            direction = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).double()
             (getattr(fragments, part) * direction).sum().backward()
             result += [leaf.grad.cpu() for leaf in leaves]
         return result

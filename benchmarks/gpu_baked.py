@@ -21,6 +21,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import gpu_gsplat
 import torch
 from common import number, say, table
 from gpu_common import Options, Section, attempt, failures, milliseconds, trained_like, with_launches
@@ -33,8 +34,6 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
-TIMES_GSPLAT = (1, 3, 10)
-"""gsplat's numbers of Gaussians over ours: equal, and what equal quality takes at least and at most."""
 HEADER = (
     "scene",
     "size",
@@ -70,7 +69,7 @@ def frames(options: Options) -> str:
             if made := attempt(f"{folder}, {width} x {height}", partial(_bundle, folder, width, height, options, rate)):
                 rows.append(made[0])
     text = f"### Baked renderer\n\nfp32, measured by a product of matrices: {number(rate / 1e12, 1)} TFLOP/s.\n\n"
-    return text + table(HEADER, rows) + (_gsplat(options, graphs) if options.peers else "") + failures()
+    return text + table(HEADER, rows) + (gpu_gsplat.frames(options, graphs) if options.peers else "") + failures()
 
 
 def _synthetic(n: int, width: int, height: int, options: Options, rate: float) -> tuple[list[str], float]:
@@ -125,7 +124,7 @@ def fp32_rate(options: Options) -> float:
 
 
 def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:
-    """A line of the table, means over the cameras; and the milliseconds of the recorded frame."""
+    """A line of the table, means over the cameras; and the milliseconds of the recorded, packed frame."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
     sums = dict.fromkeys(("pairs", "fragments", "prepare", "bin", "draw", "frame", "graph", "packed", "alone"), 0.0)
@@ -162,7 +161,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         f"{100 * 60 * mean['fragments'] / draw / rate:.0f} %",
         f"{100 * (100 * mean['pairs'] + 12 * pixels) / draw / options.copy_bytes:.0f} %",
     ]
-    return row, mean["graph"]
+    return row, mean["packed"]
 
 
 def _around(bundle, width: int, height: int) -> list[Camera]:
@@ -179,43 +178,6 @@ def _around(bundle, width: int, height: int) -> list[Camera]:
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         cameras.append(Camera(viewmat, K, width, height))
     return cameras
-
-
-def _gsplat(options: Options, graphs: dict[tuple[int, int, int], float]) -> str:
-    """gsplat's 3DGS frames at the same sizes with as many Gaussians, and with more."""
-    if options.device.type != "cuda":
-        return ""
-    try:
-        import gsplat
-        import gsplat.cuda._backend  # compiles the kernels where that was not done
-    except (ImportError, RuntimeError, OSError) as error:
-        return f"\n\ngsplat cannot be timed here: {error}"
-    rows = []
-    for (n, width, height), ours in graphs.items():
-        for times in TIMES_GSPLAT:
-            scene, camera = trained_like(times * n, width, height, options.device, view_color="sh", texture=False)
-            q = {name: value.detach() for name, value in scene.surfels.items()}
-            beta = 4 * torch.sigmoid(q["beta_raw"])
-            scales = q["log_scales"].exp() * (3 / (2 * beta).sqrt())[:, None]  # the kernel's curvature at its centre
-            scales = torch.cat([scales, scales.amin(dim=1, keepdim=True)], dim=1)
-            colors = torch.cat([q["sh_dc"][:, None], q["sh_rest"]], dim=1)
-            opacities = torch.sigmoid(q["opacity_logits"])
-            view = (camera.viewmat[None], camera.K[None], width, height)
-
-            @torch.no_grad()
-            def draw(a=(q["means"], q["quats"], scales, opacities, colors), view=view) -> object:
-                return gsplat.rasterization(*a, *view, sh_degree=3, packed=False)
-
-            ms = milliseconds(draw, options)
-            say(f"gsplat, {times * n:,} Gaussians, {width} x {height}: {ms:.3f} ms")
-            rows.append([f"{times * n:,}", f"{width} x {height}", number(ms, 3), number(ours, 3), number(ms / ours, 2)])
-    header = ("Gaussians", "size", "gsplat ms", "ours, graph ms", "gsplat / ours")
-    version = getattr(gsplat, "__version__", "")
-    note = (
-        f"\n\ngsplat {version} `rasterization`, SH of degree 3, with as many Gaussians as our scene has surfels, and "
-        "with 3 and 10 times as many:\n\n"
-    )
-    return note + table(header, rows)
 
 
 SECTIONS = (Section("baked", ("baked_frame",), frames),)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+import gpu_gsplat
 import torch
 from common import number, say, table
 from gpu_common import Options, Section, attempt, backward, failures, milliseconds, missing, peak_memory, trained_like
@@ -136,10 +137,7 @@ def steps(options: Options) -> str:
                 rows.append([name, number(ms, 3), number(pairs, 0), number(memory, 0)])
             parts.append(f"#### {n:,} surfels at {width} x {height}\n\n" + table(header, rows))
     loss = "0.8 L1 + 0.2 (1 - SSIM)" if with_ssim else "L1 (this build has no SSIM kernel)"
-    note = (
-        f"Loss: {loss}. gsplat gets the same centres, orientations and opacities, the scales at which its Gaussians "
-        "have the curvature of the Beta kernels at their centres, and SH of degree 3; its pairs are its own count."
-    )
+    note = f"Loss: {loss}. {gpu_gsplat.NOTE} Its pairs are its own count."
     return "### Training steps\n\n" + "\n\n".join(parts) + "\n\n" + note + failures()
 
 
@@ -162,7 +160,7 @@ def _steps(
 
         pairs = scene.render(camera, field_mode="off").fragments.layout.pairs
         cases.append((name, _step(render, loss, parameters), pairs))
-    return cases + (_gsplat_steps(n, width, height, loss, device) if options.peers else [])
+    return cases + (gpu_gsplat.steps(n, width, height, loss, _step, device) if options.peers else [])
 
 
 def _step(
@@ -177,53 +175,6 @@ def _step(
         optimizer.step()
 
     return run
-
-
-def _gsplat_steps(
-    n: int, width: int, height: int, loss: Callable[[Tensor], Tensor], device: torch.device
-) -> list[tuple[str, Callable[[], object], int | None]]:
-    if device.type != "cuda":
-        return []
-    try:
-        import gsplat
-        import gsplat.cuda._backend  # compiles the kernels where that was not done
-    except (ImportError, RuntimeError, OSError) as error:
-        say(f"gsplat cannot be timed: {error}")
-        return []
-    scene, camera = trained_like(n, width, height, device, view_color="sh", texture=False)
-    q = {name: value.detach() for name, value in scene.surfels.items()}
-    beta = 4 * torch.sigmoid(q["beta_raw"])
-    scales = q["log_scales"].exp() * (3 / (2 * beta).sqrt())[:, None]
-    scales = torch.cat([scales, scales.amin(dim=1, keepdim=True)], dim=1)
-    values = {
-        "means": q["means"],
-        "quats": q["quats"],
-        "scales": scales.log(),
-        "opacities": q["opacity_logits"],
-        "colors": torch.cat([q["sh_dc"][:, None], q["sh_rest"]], dim=1),
-    }
-    view = (camera.viewmat[None], camera.K[None], width, height)
-    cases: list[tuple[str, Callable[[], object], int | None]] = []
-    for name, function in (("gsplat 2DGS", gsplat.rasterization_2dgs), ("gsplat 3DGS", gsplat.rasterization)):
-        leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
-
-        def call(leaves: dict[str, Tensor] = leaves, function: Callable = function) -> tuple:
-            return function(
-                leaves["means"],
-                leaves["quats"],
-                leaves["scales"].exp(),
-                torch.sigmoid(leaves["opacities"]),
-                leaves["colors"],
-                *view,
-                sh_degree=3,
-                packed=False,
-            )
-
-        version = getattr(gsplat, "__version__", "")
-        pairs = int(call()[-1]["flatten_ids"].shape[0])
-        step = _step(lambda call=call: call()[0][0], loss, list(leaves.values()))
-        cases.append((f"{name} {version}, SH 3", step, pairs))
-    return cases
 
 
 SECTIONS = (Section("operations", OPERATIONS, operations), Section("steps", STEP, steps))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import torch
@@ -86,7 +87,7 @@ class Projection:
         """`broken` as a number; waits for the device."""
         return int(self.broken)
 
-    @property
+    @cached_property
     def visible(self) -> Tensor:
         """[N] bool: the surfel can reach some pixel."""
         return self.radii[:, 0] > 0

@@ -20,7 +20,7 @@ class _Shade(torch.autograd.Function):
         inputs = {"bound": bound, "base": b, "frames": f, "field": handle}
         kernel("shade_forward", base)(**by_name(arrays), **inputs, colors=colors)
         ctx.save_for_backward(b, f, colors, *arrays, *params)
-        ctx.geometry, ctx.bound, ctx.move = geometry, bound, move
+        ctx.field, ctx.bound, ctx.move = handle, bound, move
         return colors
 
     @staticmethod
@@ -39,7 +39,7 @@ class _Shade(torch.autograd.Function):
             bound=ctx.bound,
             base=base,
             frames=frames,
-            field=kernel_field(ctx.geometry, *params) if learn else None,
+            field=ctx.field if learn else None,
             colors=colors,
             dcolors=dense(dcolors, base),
             dbase=dbase,

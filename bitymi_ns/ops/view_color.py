@@ -20,6 +20,11 @@ def _directions(means: Tensor, center: Tensor, active: Tensor) -> dict[str, Tens
     return {"means": dense(means, means), "center": origin, "active": active}
 
 
+def _flags(active: Tensor) -> Tensor:
+    """The same as uint8, without a copy where it is bool and dense."""
+    return active.view(torch.uint8).contiguous() if active.dtype == torch.bool else active.to(torch.uint8)
+
+
 def lettered(parameters: Sequence[Tensor], prefix: str = "") -> dict[str, Tensor]:
     """Parameters by the kernels' names: a, b and, where there is a third, c."""
     return {prefix + letter: p for letter, p in zip("abc", parameters, strict=False)}
@@ -107,7 +112,7 @@ def view_color(
         ValueError: unknown kind, or a parameter has the wrong shape or lies on another device.
     """
     n = means.shape[0]
-    flags = means.new_ones(n, dtype=torch.uint8) if active is None else active.to(means.device, torch.uint8)
+    flags = means.new_ones(n, dtype=torch.uint8) if active is None else _flags(active.to(means.device))
     if "view_terms" in params:
         base, span, terms = (params[name] for name in LEAN)
         out, to = means.new_empty(n, 3), _directions(means, center, flags)

@@ -34,12 +34,14 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a camera needs a positive image size, not {self.width} x {self.height}")
 
-    @property
+    @cached_property
     def exact_center(self) -> Tensor:
-        """[3] float64, camera centre in the world frame: far from the origin float32 would not place it."""
-        viewmat = self.viewmat.double()
-        # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
-        return -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
+        """[3] float64, camera centre in the world frame: far from the origin float32 would not place it. Computed once:
+        a view is trained on many times."""
+        with torch.inference_mode(False):  # else it could not go into a graph later
+            viewmat = self.viewmat.double()
+            # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+            return -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
 
     @property
     def center(self) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.optimizers import make_optimizers
+from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import View, training_order
 
@@ -87,15 +87,13 @@ class Trainer:
     def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
         """Do one step: the terms of its loss, the rendered view, and what the strategy did after it."""
         self.training.begin(self.step)
-        for optimizer in self.optimizers.values():
-            optimizer.zero_grad(set_to_none=True)
+        forget_gradients(self.optimizers.values())
         view = self.training.view(training_order(self._views, self.config.seed, self.step))
         terms, output = self.training.losses(view)
         total = torch.stack(list(terms.values())).sum()
         if total.requires_grad:
             total.backward()
-        for optimizer in self.optimizers.values():
-            optimizer.step()
+        step(self.optimizers.values())
         report = self.training.finish()
         self._loss = total.detach()
         self.step += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
@@ -75,7 +76,7 @@ def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Ten
 
 def as_float(image: Tensor) -> Tensor:
     """The image as float32 in [0, 1]."""
-    return image.float() / 255.0 if image.dtype == torch.uint8 else image.float()
+    return image / 255.0 if image.dtype == torch.uint8 else image.float()
 
 
 def reduce_image(image: Tensor, width: int, height: int) -> Tensor:
@@ -225,5 +226,10 @@ def training_order(n: int, seed: int, step: int) -> int:
     Depends on the arguments alone, so that a resumed run sees the same views.
     """
     epoch, position = divmod(step, n)
+    return _order(n, seed, epoch)[position]
+
+
+@functools.lru_cache(maxsize=2)
+def _order(n: int, seed: int, epoch: int) -> list[int]:
     generator = torch.Generator().manual_seed((seed * 1_000_003 + 7_919 + epoch) & 0x7FFF_FFFF_FFFF_FFFF)
-    return int(torch.randperm(n, generator=generator)[position])
+    return torch.randperm(n, generator=generator).tolist()

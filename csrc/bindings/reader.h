@@ -35,6 +35,61 @@ struct Kept {
   std::vector<nb::object> objects;
 };
 
+// What is read of torch's tensors without DLPack, whose capsule takes torch about 10 us of Python per tensor.
+class Torch {
+ public:
+  // Null while nobody has imported torch.
+  static const Torch* get() {
+    static const Torch* torch = nullptr;
+    if (!torch && nb::borrow<nb::dict>(nb::module_::import_("sys").attr("modules")).contains("torch")) torch = new Torch;
+    return torch;
+  }
+  bool is_tensor(nb::handle object) const {
+    const PyObject* type = reinterpret_cast<const PyObject*>(Py_TYPE(object.ptr()));
+    return type == tensor_ || type == parameter_;
+  }
+  // Where the numbers of a dense tensor begin, and how many they are; false where it is none of these.
+  bool look(nb::handle tensor, nb::dlpack::dtype dtype, int32_t device, void*& at, int64_t& size) const {
+    const PyObject* wanted = dtype_of(dtype);
+    if (!wanted || nb::steal(PyObject_GetAttr(tensor.ptr(), dtype_)).ptr() != wanted) return false;
+    PyObject* here = device == nb::device::cpu::value ? is_cpu_ : device == nb::device::cuda::value ? is_cuda_ : nullptr;
+    if (!here || nb::steal(PyObject_GetAttr(tensor.ptr(), here)).ptr() != Py_True) return false;
+    if (ask(tensor, is_contiguous_).ptr() != Py_True) return false;
+    const nb::object pointer = ask(tensor, data_ptr_), count = ask(tensor, numel_);
+    if (!pointer.is_valid() || !count.is_valid()) return false;
+    at = PyLong_AsVoidPtr(pointer.ptr()), size = PyLong_AsLongLong(count.ptr());
+    return true;
+  }
+
+ private:
+  // For as long as the process: at its end there may be no Python to give them back to.
+  Torch() {
+    const nb::object torch = nb::module_::import_("torch");
+    tensor_ = torch.attr("Tensor").inc_ref().ptr();
+    parameter_ = torch.attr("nn").attr("Parameter").inc_ref().ptr();
+    const char* names[] = {"float32", "float64", "int32", "int64", "uint8"};
+    for (int i = 0; i < kTypes; ++i) types_[i] = torch.attr(names[i]).inc_ref().ptr();
+  }
+  const PyObject* dtype_of(nb::dlpack::dtype dtype) const {
+    const nb::dlpack::dtype known[] = {nb::dtype<float>(), nb::dtype<double>(), nb::dtype<int32_t>(),
+                                       nb::dtype<int64_t>(), nb::dtype<uint8_t>()};
+    for (int i = 0; i < kTypes; ++i)
+      if (dtype == known[i]) return types_[i];
+    return nullptr;
+  }
+  static nb::object ask(nb::handle tensor, PyObject* what) {
+    nb::object answer = nb::steal(PyObject_CallMethodNoArgs(tensor.ptr(), what));
+    if (!answer.is_valid()) PyErr_Clear();  // it has no memory
+    return answer;
+  }
+  static constexpr int kTypes = 5;
+  PyObject *tensor_, *parameter_, *types_[kTypes];
+  PyObject *dtype_ = PyUnicode_InternFromString("dtype"), *is_cpu_ = PyUnicode_InternFromString("is_cpu"),
+           *is_cuda_ = PyUnicode_InternFromString("is_cuda"),
+           *is_contiguous_ = PyUnicode_InternFromString("is_contiguous"),
+           *data_ptr_ = PyUnicode_InternFromString("data_ptr"), *numel_ = PyUnicode_InternFromString("numel");
+};
+
 class Reader;
 template <class T, class = void>
 struct IsDescribed : std::false_type {};
@@ -59,7 +114,7 @@ struct Held : Arguments {
 class Reader {
  public:
   Reader(std::string what, const nb::kwargs& given, const Device& device) : what_(std::move(what)), device_(device) {
-    given_.reserve(given.size()), kept_.read.reserve(given.size()), kept_.written.reserve(given.size());
+    given_.reserve(given.size()), kept_.objects.reserve(given.size());
     PyObject *key, *value;
     for (Py_ssize_t at = 0; PyDict_Next(given.ptr(), &at, &key, &value);)
       given_.push_back({PyUnicode_AsUTF8(key), value, false});
@@ -180,16 +235,28 @@ class Reader {
                                     std::conditional_t<std::is_same_v<T, uint64_t>, int64_t, T>>;
   template <class T>
   T* take(const char* name, int64_t& size, size_t alignment) {
-    using Access = std::conditional_t<std::is_const_v<T>, nb::ndarray<nb::ro>, nb::ndarray<>>;
+    constexpr nb::dlpack::dtype kDtype = nb::dtype<Stored<std::remove_const_t<T>>>();
     const nb::handle object = find(name);
-    Access a;
-    if (!nb::try_cast(object, a, false) || a.device_type() != device_.type ||
-        a.dtype() != nb::dtype<Stored<std::remove_const_t<T>>>() || !dense(a))
-      not_an_array(name, nb::dtype<Stored<std::remove_const_t<T>>>());
-    size = int64_t(a.size());
-    T* at = static_cast<T*>(const_cast<void*>(static_cast<const void*>(a.data())));
+    void* at;
+    if (const Torch* torch = Torch::get(); torch && torch->is_tensor(object)) {
+      if (!torch->look(object, kDtype, device_.type, at, size)) not_an_array(name, kDtype);
+      kept_.objects.push_back(nb::borrow(object));
+    } else {
+      at = take_other<T>(name, object, size);
+    }
     if (reinterpret_cast<uintptr_t>(at) % alignment)
       refuse(std::string(name) + " must start at a multiple of " + std::to_string(alignment) + " bytes");
+    return static_cast<T*>(at);
+  }
+  template <class T>
+  void* take_other(const char* name, nb::handle object, int64_t& size) {
+    using Access = std::conditional_t<std::is_const_v<T>, nb::ndarray<nb::ro>, nb::ndarray<>>;
+    constexpr nb::dlpack::dtype kDtype = nb::dtype<Stored<std::remove_const_t<T>>>();
+    Access a;
+    if (!nb::try_cast(object, a, false) || a.device_type() != device_.type || a.dtype() != kDtype || !dense(a))
+      not_an_array(name, kDtype);
+    size = int64_t(a.size());
+    void* at = const_cast<void*>(static_cast<const void*>(a.data()));
     if constexpr (std::is_const_v<T>)
       kept_.read.push_back(std::move(a));
     else

@@ -27,6 +27,7 @@ from bitymi_ns.ops import (
     trace,
     view_color,
 )
+from bitymi_ns.ops.constants import IMAGE_CHANNELS
 
 from .camera import Camera
 from .config import SceneConfig
@@ -51,6 +52,7 @@ class RenderOutput:
         soft_overdraw: [H, W, 1] fragments per pixel, those of small weight in part; None without `overdraw_half`.
         fragments: the view's fragments; where they were too many, what is known of them without the list.
         projection: the view's surfels.
+        image: [H, W, 5] rgb, alpha and beta in one tensor; None where there are maps, a background or the overdraw.
     """
 
     rgb: Tensor
@@ -61,6 +63,7 @@ class RenderOutput:
     soft_overdraw: Tensor | None
     fragments: Fragments | Bands
     projection: Projection
+    image: Tensor | None = None
 
     @property
     def overdraw(self) -> Tensor:
@@ -181,6 +184,7 @@ class Scene(nn.Module):
             soft_overdraw=image[..., -1:] if overdraw_half is not None else None,
             fragments=fragments,
             projection=projection,
+            image=image if background is None and image.shape[-1] == IMAGE_CHANNELS else None,
         )
 
     def _draw_in_bands(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -82,7 +83,7 @@ class Trainer:
         self.training = Training(scene, views, self.optimizers, config, max_steps, extent, pixels)
         self.step = 0
         self._views = len(views)
-        self._loss = torch.tensor(math.nan)
+        self._terms: list[Tensor] = []
 
     def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
         """Do one step: the terms of its loss, the rendered view, and what the strategy did after it."""
@@ -90,18 +91,18 @@ class Trainer:
         forget_gradients(self.optimizers.values())
         view = self.training.view(training_order(self._views, self.config.seed, self.step))
         terms, output = self.training.losses(view)
-        total = torch.stack(list(terms.values())).sum()
-        if total.requires_grad:
-            total.backward()
+        learning = [term for term in terms.values() if term.requires_grad]
+        if learning:
+            torch.autograd.backward(learning, [_one(term) for term in learning])
         step(self.optimizers.values())
         report = self.training.finish()
-        self._loss = total.detach()
+        self._terms = [term.detach() for term in terms.values()]
         self.step += 1
         return terms, output, report
 
     @property
     def loss(self) -> float:
-        return self._loss.item()
+        return torch.stack(self._terms).sum().item() if self._terms else math.nan
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact resume needs: tensors, numbers and text only."""
@@ -124,6 +125,16 @@ class Trainer:
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.training.load_state_dict(state["training"])
         self.step = state["step"]
+
+
+@functools.cache
+def _ones(device: torch.device, dtype: torch.dtype) -> Tensor:
+    return torch.ones((), device=device, dtype=dtype)
+
+
+def _one(term: Tensor) -> Tensor:
+    """The gradient of a sum with respect to one of its terms, made once."""
+    return _ones(term.device, term.dtype)
 
 
 def fit(

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.ops.picture_cuda import picture_losses
 from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
@@ -34,6 +36,17 @@ def objective(
     Returns:
         `photometric`; `falloff` unless its weight is 0; `overdraw` where the view was rendered with `soft_overdraw`.
     """
+    image = output.image
+    if (
+        image is not None
+        and mask is None
+        and config.ssim_weight > 0.0
+        and min(image.shape[:2]) >= SSIM_WINDOW
+        and cuda_backend(image.device)
+    ):
+        squared = _squared(config.falloff_error)
+        both = picture_losses(image, target, config.ssim_weight, config.falloff_weight, config.falloff_gamma, squared)
+        return dict(zip(("photometric", "falloff"), both[: 1 + (config.falloff_weight > 0.0)], strict=False))
     terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
     if config.falloff_weight > 0.0 or output.soft_overdraw is not None:
         omega = error_weight(output.rgb, target, config.falloff_gamma, config.falloff_error, mask)
@@ -91,15 +104,17 @@ def error_weight(
         [H, W, 1].
     """
     difference = rgb.detach() - target.detach()
-    if error == "l1_sum":
-        e = difference.abs().sum(-1, keepdim=True)
-    elif error == "mse":
-        e = difference.square().mean(-1, keepdim=True)
-    else:
-        raise ValueError(f"falloff_error must be l1_sum or mse, not {error!r}")
+    squared = _squared(error)
+    e = difference.square().mean(-1, keepdim=True) if squared else difference.abs().sum(-1, keepdim=True)
     omega = torch.exp(-gamma * e)
     # where() also keeps a NaN in an excluded pixel of the photograph out
     return omega if mask is None else torch.where(mask.reshape(omega.shape), omega, 0.0)
+
+
+def _squared(error: str) -> bool:
+    if error not in ("l1_sum", "mse"):
+        raise ValueError(f"falloff_error must be l1_sum or mse, not {error!r}")
+    return error == "mse"
 
 
 def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -58,7 +58,7 @@ def view_losses(
     )
     shown = output
     if view.correction is not None:
-        shown = replace(output, rgb=view.shown(output.rgb, output.alpha, background))
+        shown = replace(output, rgb=view.shown(output.rgb, output.alpha, background), image=None)
     terms = objective(shown, view.target(background, device), config.loss, view.mask)
     own = watch or LossWatch()
     own.note(scene, step, terms)

@@ -16,7 +16,9 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import ALPHA_MIN
+from bitymi_ns.ops.picture_cuda import note_centers
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
@@ -101,8 +103,7 @@ class Strategy:
         Reads `projection.mean2d_grad` and `mean2d_absgrad` ([N, 2], pixels), `visible` [N] and `radii` [N, 2].
         """
         projection = output.projection
-        visible = projection.visible
-        n, device = len(visible), visible.device
+        n, device = len(projection.radii), projection.radii.device
         if len(self.grad_sum) == 0:
             self._clear(n, device)
         if len(self.grad_sum) != n:
@@ -111,6 +112,10 @@ class Strategy:
             for name in STATISTICS:
                 setattr(self, name, getattr(self, name).to(device))
         height, width = output.rgb.shape[:2]
+        if cuda_backend(device):
+            note_centers(projection, width, height, *(getattr(self, name) for name in STATISTICS))
+            return
+        visible = projection.visible
         for total, gradient in (
             (self.grad_sum, projection.mean2d_grad),
             (self.abs_grad_sum, projection.mean2d_absgrad),

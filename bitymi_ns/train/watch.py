@@ -15,15 +15,20 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 
+TOGETHER = 4
+"""Steps whose losses are sent to the host together."""
+
+
 class LossWatch:
     """Notices a loss that is not finite.
 
-    On a CUDA device the host does not wait for the numbers: they are looked at when they have arrived, a few steps
-    later.
+    On a CUDA device the host does not wait for the numbers: they are sent off together with those of other steps, and
+    looked at when they have arrived, a few steps later.
     """
 
     def __init__(self) -> None:
-        self._underway: deque[tuple[int, tuple[str, ...], Tensor, torch.cuda.Event]] = deque()
+        self._noted: list[tuple[int, tuple[str, ...], list[Tensor]]] = []
+        self._underway: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
         """Take in the terms of a step's loss.
@@ -31,31 +36,43 @@ class LossWatch:
         Raises:
             TrainingDiverged: a term of this step, or of an earlier one, is not finite.
         """
-        names, values = tuple(terms), torch.stack([term.detach() for term in terms.values()])
-        if values.device.type != "cuda":
-            self._check(scene, step, names, values)
+        names, values = tuple(terms), [term.detach() for term in terms.values()]
+        if values[0].device.type != "cuda":
+            self._check(scene, [(step, names)], torch.stack(values))
             return
+        self._noted.append((step, names, values))
+        if len(self._noted) >= TOGETHER:
+            self._send()
+        while self._underway and self._underway[0][2].query():
+            self._check(scene, *self._underway.popleft()[:2])
+
+    def _send(self) -> None:
+        if not self._noted:
+            return
+        values = torch.stack([value for _, _, values in self._noted for value in values])
         arrived = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
         arrived.copy_(values, non_blocking=True)
         event = torch.cuda.Event()
         event.record(torch.cuda.current_stream(values.device))
-        self._underway.append((step, names, arrived, event))
-        while self._underway and self._underway[0][3].query():
-            self._check(scene, *self._underway.popleft()[:3])
+        self._underway.append(([(step, names) for step, names, _ in self._noted], arrived, event))
+        self._noted = []
 
     def finish(self, scene: Scene) -> None:
         """Wait for all that is underway; raises what `note` raises."""
+        self._send()
         while self._underway:
-            self._underway[0][3].synchronize()
-            self._check(scene, *self._underway.popleft()[:3])
+            self._underway[0][2].synchronize()
+            self._check(scene, *self._underway.popleft()[:2])
 
     def forget(self) -> None:
         """Look at nothing that is underway: the run has gone back to before it."""
         self._underway.clear()
+        self._noted.clear()
 
     @staticmethod
-    def _check(scene: Scene, step: int, names: tuple[str, ...], values: Tensor) -> None:
-        for name, value in zip(names, values.tolist(), strict=True):
+    def _check(scene: Scene, steps: list[tuple[int, tuple[str, ...]]], values: Tensor) -> None:
+        told = [(step, name) for step, names in steps for name in names]
+        for (step, name), value in zip(told, values.tolist(), strict=True):
             if not math.isfinite(value):
                 cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
                 raise TrainingDiverged(f"the {name} loss is {value} at step {step}: {cause}")

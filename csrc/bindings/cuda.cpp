@@ -7,6 +7,7 @@
 #include "cuda/baked.h"
 #include "cuda/device_check.h"
 #include "cuda/kernels.h"
+#include "cuda/training.h"
 
 namespace bt::cuda {
 namespace {
@@ -61,6 +62,9 @@ void bind_operations(nb::module_& m) {
   bind_operation(m, name("shade_forward"), &shade_forward<S>);
   bind_operation(m, name("shade_backward"), &shade_backward<S>);
   bind_operation(m, name("ssim"), &ssim<S>);
+  bind_operation(m, name("picture_loss"), &picture_loss<S>);
+  bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
+  bind_operation(m, name("note_centers"), &note_centers<S>);
   // bytes of working memory
   m.def(name("bin_count_workspace").c_str(), &bin_count_workspace<S>, "n"_a);
   m.def(name("bin_fill_workspace").c_str(), &bin_fill_workspace, "pairs"_a, "width"_a, "height"_a);
@@ -119,6 +123,7 @@ void bind_all(nb::module_& m) {
   bind_baked(m);
   m.attr("TILE_WARPS") = kTileWarps;
   m.attr("TRACE_SUMS") = kTraceSums;
+  m.attr("LOSS_SUMS") = 2 * kMostSums;
   m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
   m.def("exact_size", &exact_size, "entries"_a, "surfels"_a, "frames"_a, "Numbers of exact_work, int64.");
 }

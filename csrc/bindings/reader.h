@@ -41,7 +41,8 @@ class Torch {
   // Null while nobody has imported torch.
   static const Torch* get() {
     static const Torch* torch = nullptr;
-    if (!torch && nb::borrow<nb::dict>(nb::module_::import_("sys").attr("modules")).contains("torch")) torch = new Torch;
+    if (!torch && nb::borrow<nb::dict>(nb::module_::import_("sys").attr("modules")).contains("torch"))
+      torch = new Torch;
     return torch;
   }
   bool is_tensor(nb::handle object) const {
@@ -52,7 +53,9 @@ class Torch {
   bool look(nb::handle tensor, nb::dlpack::dtype dtype, int32_t device, void*& at, int64_t& size) const {
     const PyObject* wanted = dtype_of(dtype);
     if (!wanted || nb::steal(PyObject_GetAttr(tensor.ptr(), dtype_)).ptr() != wanted) return false;
-    PyObject* here = device == nb::device::cpu::value ? is_cpu_ : device == nb::device::cuda::value ? is_cuda_ : nullptr;
+    PyObject* here = device == nb::device::cpu::value    ? is_cpu_
+                     : device == nb::device::cuda::value ? is_cuda_
+                                                         : nullptr;
     if (!here || nb::steal(PyObject_GetAttr(tensor.ptr(), here)).ptr() != Py_True) return false;
     if (ask(tensor, is_contiguous_).ptr() != Py_True) return false;
     const nb::object pointer = ask(tensor, data_ptr_), count = ask(tensor, numel_);

@@ -1,0 +1,110 @@
+"""What a training step computes of a picture and of the projected centres beside drawing, by the CUDA kernels.
+
+torch would do it in some fifty small operations, whose launches take the host longer than all of them take the card.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel, module, on_same_device, require
+from .constants import IMAGE_CHANNELS
+from .project import Projection
+from .ssim import similarity
+
+
+class _PictureLosses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image, target, share, weight, gamma, squared):
+        pixels, wanted = dense(image, image), dense(target, image)
+        alike, dalike = similarity(pixels[..., :3], wanted, ctx.needs_input_grad[0])
+        photometric, falloff = image.new_empty(()), image.new_empty(())
+        sums = torch.empty(module(image.device).LOSS_SUMS, dtype=torch.float64, device=image.device)
+        ctx.given = {"gamma": gamma, "squared": squared, "share": share, "weight": weight}
+        kernel("picture_loss", image)(
+            image=pixels,
+            target=wanted,
+            similarity=alike,
+            sums=sums,
+            photometric=photometric,
+            falloff=falloff,
+            **ctx.given,
+        )
+        ctx.save_for_backward(pixels, wanted)
+        ctx.dalike = dalike
+        return photometric, falloff
+
+    @staticmethod
+    def backward(ctx, dphotometric, dfalloff):
+        image, target = ctx.saved_tensors
+        dimage = torch.empty_like(image)
+        kernel("picture_loss_backward", image)(
+            image=image,
+            target=target,
+            dsimilarity=ctx.dalike,
+            dphotometric=dense(dphotometric, image),
+            dfalloff=dense(dfalloff, image),
+            dimage=dimage,
+            **ctx.given,
+        )
+        return dimage, None, None, None, None, None
+
+
+def picture_losses(
+    image: Tensor, target: Tensor, ssim_weight: float, falloff_weight: float, gamma: float, squared: bool = False
+) -> tuple[Tensor, Tensor]:
+    """The photometric and the weighted falloff loss of a picture (`train.losses.objective`), two scalars.
+
+    Args:
+        image: [H, W, 5] rgb, alpha and beta on a CUDA device, the picture at least as large as a window of SSIM.
+        target: [H, W, 3] photograph.
+        ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
+        falloff_weight: of the mean of omega beta, omega = exp(-gamma e).
+        gamma: how fast omega fades with the error e.
+        squared: e is the mean of the squares over rgb instead of the sum of the absolute values.
+
+    Raises:
+        ValueError: shapes or devices do not agree.
+        RuntimeError: the tensors are not on a CUDA device.
+    """
+    require("picture_losses", "cuda", image.device, "call `train.losses.objective`")
+    if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS or tuple(target.shape) != (*image.shape[:2], 3):
+        raise ValueError(f"the picture is {list(image.shape)} and the photograph {list(target.shape)}")
+    on_same_device(image, target=target)
+    return _PictureLosses.apply(image, target, ssim_weight, falloff_weight, gamma, squared)
+
+
+@torch.no_grad()
+def note_centers(
+    projection: Projection,
+    width: int,
+    height: int,
+    grad_sum: Tensor,
+    abs_grad_sum: Tensor,
+    visible_count: Tensor,
+    max_radius: Tensor,
+) -> None:
+    """Adds a view to the statistics of densification, in place: what `train.strategy.Strategy.accumulate` says.
+
+    Args:
+        projection: of the view, after its backward pass.
+        width, height: of the picture, pixels.
+        grad_sum, abs_grad_sum, visible_count, max_radius: [N] float32.
+
+    Raises:
+        RuntimeError: the tensors are not on a CUDA device.
+    """
+    radii = projection.radii
+    require("note_centers", "cuda", radii.device, "call `Strategy.accumulate`")
+    grads = {"grad": projection.mean2d_grad, "absgrad": projection.mean2d_absgrad}
+    kernel("note_centers", radii)(
+        radii=radii,
+        **{name: None if grad is None else dense(grad, radii) for name, grad in grads.items()},
+        width=width,
+        height=height,
+        grad_sum=grad_sum,
+        abs_grad_sum=abs_grad_sum,
+        visible_count=visible_count,
+        max_radius=max_radius,
+    )

@@ -61,9 +61,10 @@ class Camera:
     def to(self, device: torch.device | str) -> Camera:
         """The same camera on another device; the host does not wait for a copy from its memory."""
         wait = self.K.device.type != "cpu"
-        return self._with(
-            viewmat=self.viewmat.to(device, non_blocking=not wait), K=self.K.to(device, non_blocking=not wait)
-        )
+        viewmat, K = (t.to(device, non_blocking=not wait) for t in (self.viewmat, self.K))
+        if viewmat is self.viewmat and K is self.K:
+            return self  # with what it has computed
+        return self._with(viewmat=viewmat, K=K)
 
     def rows(self, top: int, bottom: int) -> Camera:
         """The camera of the image's rows from `top` to `bottom` (exclusive)."""

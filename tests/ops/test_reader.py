@@ -65,6 +65,16 @@ def test_an_array_that_stands_askew_is_named() -> None:
         kernels.ssim_f32(**arguments(a=askew))
 
 
+def test_arrays_are_tensors_parameters_or_of_numpy() -> None:
+    a = torch.rand(12, 12, 1)
+    found = []
+    for kind in (a, torch.nn.Parameter(a), a.clone().requires_grad_(), a.numpy(), a.expand(1, 12, 12, 1)):
+        given = arguments(a=kind)
+        kernels.ssim_f32(**given)
+        found.append(float(given["value"]))
+    assert len(set(found)) == 1 and 0.0 < found[0] < 1.0
+
+
 def test_names_that_are_known_and_objects_of_the_module() -> None:
     n = 3
     to = {"means": torch.zeros(n, 3), "center": torch.zeros(3).double(), "active": torch.ones(n, dtype=torch.uint8)}

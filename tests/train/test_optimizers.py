@@ -1,0 +1,59 @@
+"""Optimisers that step together do what each does alone, to the last bit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.nn import Parameter
+from torch.optim import SGD, Adam, Optimizer
+
+from bitymi_ns.train.optimizers import adam, forget_gradients, step
+
+RATES = (1e-2, 1e-2, 3e-4, 0.0)
+
+
+def optimizers() -> dict[str, Optimizer]:
+    g = torch.Generator().manual_seed(0)
+    made: dict[str, Optimizer] = {}
+    for number, rate in enumerate(RATES):
+        parameters = [Parameter(torch.randn(7 + i, 3, generator=g)) for i in range(1 + number % 2)]
+        made[str(number)] = adam(parameters, (0.9, 0.99 + 0.009 * (number // 2)))
+        made[str(number)].param_groups[0]["lr"] = rate
+    made["decayed"] = Adam([Parameter(torch.randn(5, generator=g))], lr=1e-2, weight_decay=0.1)
+    made["unfused"] = Adam([Parameter(torch.randn(5, generator=g))], lr=1e-2, foreach=False, fused=False)
+    made["other"] = SGD([Parameter(torch.randn(5, generator=g))], lr=1e-2)
+    return made
+
+
+def parameters_of(given: dict[str, Optimizer]) -> list[Parameter]:
+    return [p for optimizer in given.values() for group in optimizer.param_groups for p in group["params"]]
+
+
+@pytest.mark.parametrize("left_out", [(), (0, 3), tuple(range(9))], ids=["all", "some", "none"])
+def test_a_step_together_is_a_step_of_each(left_out: tuple[int, ...]) -> None:
+    together, alone = optimizers(), optimizers()
+    g = torch.Generator().manual_seed(1)
+    for number in range(4):
+        gradients = [torch.randn(p.shape, generator=g) for p in parameters_of(together)]
+        for given in (together, alone):
+            for i, (p, gradient) in enumerate(zip(parameters_of(given), gradients, strict=True)):
+                p.grad = None if number == 2 and i in left_out else gradient.clone()
+        step(together.values())
+        for optimizer in alone.values():
+            optimizer.step()
+        for a, b in zip(parameters_of(together), parameters_of(alone), strict=True):
+            assert torch.equal(a, b)
+    for name, optimizer in together.items():
+        a, b = (o.state_dict()["state"] for o in (optimizer, alone[name]))
+        assert a.keys() == b.keys()
+        for row, state in b.items():
+            values = {key: value for key, value in state.items() if value is not None}
+            assert all(torch.equal(a[row][key], value) for key, value in values.items())
+
+
+def test_gradients_are_forgotten() -> None:
+    given = optimizers()
+    for p in parameters_of(given):
+        p.grad = torch.ones_like(p)
+    forget_gradients(given.values())
+    assert all(p.grad is None for p in parameters_of(given))

@@ -3,8 +3,8 @@
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
 // the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
-// marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes with
-// a fragment), trace_fill also by the 28 bytes per fragment that it writes.
+// marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes
+// with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
 #include "cuda/fast.h"
 #include "cuda/kernels.h"

@@ -102,13 +102,15 @@ constexpr int kHeld = 4096 / sizeof(S);
 // there, most sectors would be written in parts, by several warps, and memory takes a part for longer than a whole one.
 // So a block collects the fragments of up to 32 pairs, in the list's order, and then writes them from end to end.
 template <class Kernel, class S>
-__global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
+    fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
   using T = FastOr<S>;
   struct alignas(16) Row {
     S g[kGeom];
   };
-  static_assert(kHeld<S> >= kTileThreads);
+  static_assert(kHeld<S> >= kTileThreads && kGeom % (kTileThreads / kWarp) == 0);
   __shared__ Row rows[kWarp];
+  __shared__ int bits[kTileWarps][kWarp];  // fragments of a warp and a pair
   __shared__ int32_t ids[kWarp], surfels[kHeld<S>], pixels[kHeld<S>];
   __shared__ S weights[kHeld<S>], us[kHeld<S>], vs[kHeld<S>], depths[kHeld<S>], sigmas[kHeld<S>];
   constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
@@ -130,18 +132,18 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
     if (!taken_pairs) return;  // no pair has more than a tile's pixels
     const int count = __shfl_sync(kFullMask, behind, taken_pairs - 1);
     if (s.lane >= taken_pairs) mark = 0;
-    int from = from_base;
-    if (mark) {
-      BT_UNROLL
-      for (int w = 0; w < kTileWarps - 1; ++w) from += w < s.warp ? __popc(p.masks[w * p.pairs + own]) : 0;
-    }
+    bits[s.warp][s.lane] = __popc(mark);
     const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
     if (row < taken_pairs) {
       const int32_t id = p.surfel[first + row];
       if (column == 0) ids[row] = id;
-      for (int c = column; c < kGeom; c += kLoaders) rows[row].g[c] = geom[int64_t(id) * kGeom + c];
+      BT_UNROLL
+      for (int c = 0; c < kGeom; c += kLoaders) rows[row].g[c + column] = geom[int64_t(id) * kGeom + c + column];
     }
     __syncthreads();  // the rows are there, and what was held is written
+    int from = from_base;
+    BT_UNROLL
+    for (int w = 0; w < kTileWarps - 1; ++w) from += w < s.warp ? bits[w][s.lane] : 0;
     unsigned todo = __ballot_sync(kFullMask, mark != 0);
     while (todo) {
       const int j = __ffs(int(todo)) - 1;
@@ -168,6 +170,7 @@ __global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S nea
     }
     __syncthreads();
     // from a multiple of 32 on, so that warps write whole sectors
+    BT_UNROLL_BY(1)
     for (int i = int(threadIdx.x) - int(base % kWarp); i < count; i += kTileThreads) {
       if (i < 0) continue;
       const int64_t at = base + i;

@@ -42,29 +42,34 @@ __global__ void __launch_bounds__(kRunThreads)
                   const S* ddepth, S* partial) {
   using T = FastOr<S>;
   const Run r = run(p);
-  T d[kTraceSums];
+  T d[kTraceSums], ax = T(S(0)), ay = T(S(0));
   BT_UNROLL
   for (int c = 0; c < kTraceSums; ++c) d[c] = T(S(0));
-  if (r.begin < r.end) {
-    S g[kGeom];
-    T ax = T(S(0)), ay = T(S(0));
-    load_shape(geom + int64_t(p.surfel[r.k]) * kGeom, g);
-    const RowOf row_of(p.width);
-    const int64_t count = r.end - r.begin;
-    const auto at = [&](const auto* values) { return values ? values + r.begin : nullptr; };
-    const int32_t* pixels = at(f.pixel);
-    const S *sigmas = at(f.sigma), *gs = at(dsigma), *gu = at(duv), *gv = duv ? gu + f.total : nullptr,
-            *gz = at(ddepth);
-    for (int i = r.lane; i < int(count); i += kRunLanes) {
-      const auto given = [&](const S* values) { return T(values ? values[i] : S(0)); };
-      const int32_t pixel = pixels[i], y = row_of(pixel), x = pixel - y * p.width;
+  S g[kGeom];
+  load_shape(geom + (r.some ? int64_t(p.surfel[r.k]) : 0) * kGeom, g);
+  const RowOf row_of(p.width);
+  const int own = int(r.end - r.begin), most = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
+  for (int at = r.lane; at - r.lane < most; at += kRunLanes) {
+    const bool mine = at < own;
+    const int64_t i = r.begin + at;
+    int32_t pixel = 0;
+    S listed = S(0), gs = S(0), gu = S(0), gv = S(0), gz = S(0);
+    if (mine) {
+      pixel = f.pixel[i], listed = f.sigma[i];
+      if (dsigma) gs = dsigma[i];
+      if (duv) gu = duv[i], gv = duv[f.total + i];
+      if (ddepth) gz = ddepth[i];
+    }
+    __syncwarp();  // no load is put off until its number is used: one wait is for all
+    if (mine) {
+      const int32_t y = row_of(pixel), x = pixel - y * p.width;
       T ddx, ddy;
       fragment_vjp<Kernel, S, T>(g, near, rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]),
-                                 T(low_pass_of(sigmas[i])), given(gs), given(gu), given(gv), given(gz), d, ddx, ddy);
+                                 T(low_pass_of(listed)), T(gs), T(gu), T(gv), T(gz), d, ddx, ddy);
       ax += abs_(ddx), ay += abs_(ddy);
     }
-    d[kShape] = ax, d[kShape + 1] = ay;
   }
+  d[kShape] = ax, d[kShape + 1] = ay;
   S sums[kTraceSums];
   BT_UNROLL
   for (int c = 0; c < kTraceSums; ++c) sums[c] = plain(d[c]);

@@ -71,6 +71,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
     const int skipped = int(begin % kWhole), count = some ? int(p.offsets[k + 1] - begin) : 0;
     const S* g = geom + int64_t(some ? p.surfel[k] : 0) * kGeom;
     const S beta = g[kBeta], normal[3] = {g[kNx], g[kNy], g[kNz]};
+    S* const run_colors = dcolors + 3 * begin;
     S sums[kSums];  // beta and the normal
     BT_UNROLL
     for (int c = 0; c < kSums; ++c) sums[c] = S(0);
@@ -87,6 +88,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
         for (int c = 0; c < 3; ++c) color[c] = colors[3 * i + c];
         if (kMaps) depth = f.depth[i];
       }
+      __syncwarp();  // no load is put off until its number is used: one wait is for all
       if (mine) {
         const int row = row_of(pixel);
         const S* d = gradient + ((row - top) * kTile + (pixel - row * p.width - left)) * kChannels;
@@ -105,7 +107,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
       BT_UNROLL
       for (int c = 0; c < 3; ++c) {
         const int j = c * kRunLanes + lane, to = 3 * at + j;
-        if (to >= 0 && to < 3 * count) dcolors[3 * begin + to] = put[j];
+        if (to >= 0 && to < 3 * count) run_colors[to] = put[j];
       }
       __syncwarp();
     }

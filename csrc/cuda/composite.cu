@@ -37,32 +37,83 @@ __global__ void __launch_bounds__(kTileThreads)
   for (int c = 0; c < kChannels; ++c) to[c] = sum[c];
 }
 
+// One block per tile, so that the tile's part of dimage is read once, into shared memory, and kRunLanes lanes per pair.
+// A run is read and written from a multiple of 8 fragments on, and dcolors goes through shared memory: memory takes
+// whole sectors of 32 bytes faster than parts.
 template <class S, bool kMaps>
-__global__ void __launch_bounds__(kRunThreads)
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1)
     backward_kernel(const S* geom, Pairs p, FragmentArrays<S> f, const S* colors, const S* dimage, S* partial,
                     S* dweight, S* dcolors, S* ddepth) {
   constexpr int kChannels = kMaps ? kMapChannels : kImageChannels, kSums = kMaps ? 4 : 1;
-  const Run r = run(p);
-  S sums[kSums];  // beta and the normal
-  for (int c = 0; c < kSums; ++c) sums[c] = S(0);
-  if (r.begin < r.end) {
-    const S* g = geom + int64_t(p.surfel[r.k]) * kGeom;
-    const S beta = g[kBeta], normal[3] = {g[kNx], g[kNy], g[kNz]};
-    for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
-      const S w = f.weight[i];
-      const S* d = dimage + int64_t(f.pixel[i]) * kChannels;
-      dweight[i] = weight_gradient<kMaps>(d, colors + 3 * i, beta, f.depth[i], normal);
-      for (int k = 0; k < 3; ++k) dcolors[3 * i + k] = w * d[k];
-      sums[0] += w * d[4];
-      if (kMaps) {
-        const S* m = d + kChannels - 4;
-        ddepth[i] = w * m[0];
-        for (int k = 1; k < kSums; ++k) sums[k] += w * m[k];
-      }
-    }
+  constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
+  __shared__ S gradient[kTileThreads * kChannels];  // both counts of channels are odd: lanes hit different banks
+  __shared__ S out[kWorkers][3 * kRunLanes];
+  // Pairs behind those of the tiles have no fragments, but slots: they are left to the last block.
+  const int64_t first = p.tile_pairs[blockIdx.x];
+  const int64_t end = blockIdx.x + 1 < gridDim.x ? p.tile_pairs[blockIdx.x + 1] : p.pairs;
+  if (first == end) return;
+  const int across = tiles_across(p.width), tile = int(blockIdx.x);
+  const int left = tile % across * kTile, top = tile / across * kTile;
+  const int columns = min_(kTile, p.width - left), rows = min_(kTile, p.height - top);
+  for (int j = int(threadIdx.x); j < kTileThreads * kChannels; j += kTileThreads) {
+    const int row = j / (kTile * kChannels), column = j - row * (kTile * kChannels);
+    if (row < rows && column < columns * kChannels)
+      gradient[j] = dimage[(int64_t(top + row) * p.width + left) * kChannels + column];
   }
-  const S sum = sum_over_run(sums, r.lane);
-  if (r.some && r.lane < kSums) partial[int64_t(p.slot[r.k]) * kSums + r.lane] = sum;
+  __syncthreads();
+  const RowOf row_of(p.width);
+  const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
+  S* const put = out[worker];
+  // The runs of a warp take their turns together.
+  for (int64_t k = first + worker; k - worker % 2 < end; k += kWorkers) {
+    const bool some = k < end;
+    const int64_t begin = some ? p.offsets[k] : 0;
+    const int skipped = int(begin % kWhole), count = some ? int(p.offsets[k + 1] - begin) : 0;
+    const S* g = geom + int64_t(some ? p.surfel[k] : 0) * kGeom;
+    const S beta = g[kBeta], normal[3] = {g[kNx], g[kNy], g[kNz]};
+    S* const run_colors = dcolors + 3 * begin;
+    S sums[kSums];  // beta and the normal
+    BT_UNROLL
+    for (int c = 0; c < kSums; ++c) sums[c] = S(0);
+    const int own = count ? skipped + count : 0, stop = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
+    for (int turn = 0; turn < stop; turn += kRunLanes) {
+      const int at = turn - skipped;  // of the turn's first fragment in the run
+      const int64_t i = begin + at + lane;
+      const bool mine = at + lane >= 0 && at + lane < count;
+      S w = S(0), color[3] = {S(0), S(0), S(0)}, depth = S(0);
+      int pixel = 0;
+      if (mine) {
+        pixel = f.pixel[i], w = f.weight[i];
+        BT_UNROLL
+        for (int c = 0; c < 3; ++c) color[c] = colors[3 * i + c];
+        if (kMaps) depth = f.depth[i];
+      }
+      __syncwarp();  // no load is put off until its number is used: one wait is for all
+      if (mine) {
+        const int row = row_of(pixel);
+        const S* d = gradient + ((row - top) * kTile + (pixel - row * p.width - left)) * kChannels;
+        dweight[i] = weight_gradient<kMaps>(d, color, beta, depth, normal);
+        BT_UNROLL
+        for (int c = 0; c < 3; ++c) put[3 * lane + c] = w * d[c];
+        sums[0] += w * d[4];
+        if (kMaps) {
+          const S* m = d + kChannels - 4;
+          ddepth[i] = w * m[0];
+          BT_UNROLL
+          for (int c = 1; c < kSums; ++c) sums[c] += w * m[c];
+        }
+      }
+      __syncwarp();
+      BT_UNROLL
+      for (int c = 0; c < 3; ++c) {
+        const int j = c * kRunLanes + lane, to = 3 * at + j;
+        if (to >= 0 && to < 3 * count) run_colors[to] = put[j];
+      }
+      __syncwarp();
+    }
+    const S sum = sum_over_run(sums, lane);
+    if (some && lane < kSums) partial[int64_t(p.slot[k]) * kSums + lane] = sum;
+  }
 }
 
 // Columns beta and normal of a row that is 0 elsewhere.
@@ -76,8 +127,8 @@ template <class S, bool kMaps>
 void backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   if (p.pairs)
-    BT_LAUNCH((backward_kernel<S, kMaps>), run_blocks(p), dim3(kRunThreads), 0, stream, a.geom, p, a.fragments.f,
-              a.colors, a.dimage, a.partial, a.dweight, a.dcolors, a.ddepth);
+    BT_LAUNCH((backward_kernel<S, kMaps>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.geom, p,
+              a.fragments.f, a.colors, a.dimage, a.partial, a.dweight, a.dcolors, a.ddepth);
   fill_zero(a.dgeom, p.surfels * kGeom, stream);
   sum_slots<kMaps ? 4 : 1>(p, static_cast<const S*>(a.partial), PutGeometry<S>{a.dgeom}, stream);
 }

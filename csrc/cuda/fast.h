@@ -2,6 +2,8 @@
 // about 2 ulp each. The formulas in core/ take it as they take a float.
 #pragma once
 
+#include <type_traits>
+
 #include "core/common.h"
 #include "cuda/device.h"
 
@@ -16,6 +18,8 @@ BT_HD Fast operator+(Fast a, Fast b) { return Fast(a.v + b.v); }
 BT_HD Fast operator-(Fast a, Fast b) { return Fast(a.v - b.v); }
 BT_HD Fast operator-(Fast a) { return Fast(-a.v); }
 BT_HD Fast operator*(Fast a, Fast b) { return Fast(a.v * b.v); }
+BT_HD Fast& operator+=(Fast& a, Fast b) { return a = a + b; }
+BT_HD Fast& operator-=(Fast& a, Fast b) { return a = a - b; }
 BT_HD bool operator<(Fast a, Fast b) { return a.v < b.v; }
 BT_HD bool operator>(Fast a, Fast b) { return a.v > b.v; }
 
@@ -46,5 +50,11 @@ inline Fast log_(Fast x) { return Fast(logf(x.v)); }
 inline Fast sqrt_(Fast x) { return Fast(sqrtf(x.v)); }
 inline Fast power_(Fast x, Fast y) { return Fast(exp2f(y.v * log2f(x.v))); }
 #endif
+
+// The real of a training kernel's pixels: doubles stay exact.
+template <class S>
+using FastOr = std::conditional_t<std::is_same_v<S, float>, Fast, S>;
+BT_HD float plain(Fast x) { return x.v; }
+BT_HD double plain(double x) { return x; }
 
 }  // namespace bt::cuda

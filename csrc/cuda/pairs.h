@@ -138,6 +138,21 @@ __device__ inline void walk(const Pairs& p, const Spot& s, Load&& load, Use&& us
   }
 }
 
+// The row of a pixel of an image. A division of integers takes 25 instructions; the product with the reciprocal is off
+// by one at most, below 2^21 rows.
+class RowOf {
+ public:
+  __device__ explicit RowOf(int width) : width_(width), inverse_(1.0f / float(width)) {}
+  __device__ int32_t operator()(int32_t pixel) const {
+    const int32_t row = int32_t(float(pixel) * inverse_), x = pixel - row * width_;
+    return row + int32_t(x >= width_) - int32_t(x < 0);
+  }
+
+ private:
+  int width_;
+  float inverse_;
+};
+
 // The other way through the list: kRunLanes lanes per pair, which take the fragments of its run in turns. Fragments of
 // a pair are about thirty on average: 16 lanes are busier than 32, and share a row of geom and one sum.
 constexpr int kRunLanes = 16, kRunThreads = 128;
@@ -157,24 +172,27 @@ __device__ inline Run run(const Pairs& p) {
 inline dim3 run_blocks(const Pairs& p) { return dim3(unsigned(ceil_div(p.pairs, kRunThreads / kRunLanes))); }
 
 // Sums of kColumns values each over the lanes of a run: lane c % kColumns gets that of column c. Each step halves both
-// the lanes that differ and the columns that a lane still keeps: 15 shuffles for 16 columns instead of 64.
+// the lanes that differ and the columns that a lane still keeps: 15 shuffles for 16 columns instead of 64. By
+// recursion: nvcc does not unroll the loop whose bounds halve, and then looks for the columns among its registers.
+template <int kStep, class S, int kColumns>
+__device__ __forceinline__ void fold_columns(S (&v)[kColumns], int lane) {
+  const bool upper = lane & kStep;
+  BT_UNROLL
+  for (int c = 0; c < kStep; ++c) {
+    const S mine = upper ? v[c + kStep] : v[c], other = upper ? v[c] : v[c + kStep];
+    v[c] = mine + __shfl_xor_sync(kFullMask, other, kStep);
+  }
+  if constexpr (kStep > 1) fold_columns<kStep / 2>(v, lane);
+}
 template <int kColumns, class S>
-__device__ inline S sum_over_run(S (&v)[kColumns], int lane) {
+__device__ __forceinline__ S sum_over_run(S (&v)[kColumns], int lane) {
   static_assert((kColumns & (kColumns - 1)) == 0 && kColumns <= kRunLanes);
   BT_UNROLL
   for (int step = kRunLanes / 2; step >= kColumns; step /= 2) {
     BT_UNROLL
     for (int c = 0; c < kColumns; ++c) v[c] += __shfl_xor_sync(kFullMask, v[c], step);
   }
-  BT_UNROLL
-  for (int step = kColumns / 2; step > 0; step /= 2) {
-    const bool upper = lane & step;
-    BT_UNROLL
-    for (int c = 0; c < step; ++c) {
-      const S mine = upper ? v[c + step] : v[c], other = upper ? v[c] : v[c + step];
-      v[c] = mine + __shfl_xor_sync(kFullMask, other, step);
-    }
-  }
+  if constexpr (kColumns > 1) fold_columns<kColumns / 2>(v, lane);
   return v[0];
 }
 

@@ -3,9 +3,10 @@
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
 // the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
-// marked pairs alone. Both are bound by arithmetic (about 100 operations per lane and pair, a third of the lanes with a
-// fragment), trace_fill also by the 28 bytes per fragment that it writes.
+// marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes
+// with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
+#include "cuda/fast.h"
 #include "cuda/kernels.h"
 #include "cuda/primitives.h"
 #include "cuda/workspace.h"
@@ -29,6 +30,7 @@ template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
                 const int64_t* tile_pairs, uint32_t* masks) {
+  using T = FastOr<S>;
   const Spot s = spot(width);
   const int64_t end = tile_pairs[blockIdx.x + 1];
   int64_t first = tile_pairs[blockIdx.x];
@@ -55,13 +57,13 @@ __global__ void __launch_bounds__(kTileThreads)
       todo &= todo - 1;
       S g[kGeom];
       load_shape(geom + int64_t(__shfl_sync(kFullMask, id, j)) * kGeom, g);
-      const S dx = x - g[kCx], dy = y - g[kCy];
+      const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       // a cheap look first: does any open pixel lie in the support or near the centre?
       const bool close = near_centre(dx, dy);
-      const bool reached = filtered<Kernel>(g) ? in_support(filtered_place<S, S>(g, dx, dy))
-                                               : close || in_support(planes<S, S>(g, dx, dy));
+      const bool reached = filtered<Kernel>(g) ? in_support(filtered_place<S, T>(g, dx, dy))
+                                               : close || in_support(planes<S, T>(g, dx, dy));
       if (!__any_sync(kFullMask, open && reached)) continue;
-      const S sigma = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma;
+      const S sigma = plain(fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma);
       const S behind = blend(sigma, transmittance).behind;
       const Verdict<S> v = judge(open, sigma, behind, S(kTransmittanceMin));
       open = open && !v.ends;
@@ -92,32 +94,93 @@ __global__ void __launch_bounds__(kThreads)
   if (t <= tiles) tile_start[t] = offsets[tile_pairs[t]];
 }
 
+// Fragments that a block holds in shared memory before it writes them: those of one pair at least.
+template <class S>
+constexpr int kHeld = 4096 / sizeof(S);
+
+// A warp has about ten fragments of a pair, and few of them fill a sector of 32 bytes from end to end: written from
+// there, most sectors would be written in parts, by several warps, and memory takes a part for longer than a whole one.
+// So a block collects the fragments of up to 32 pairs, in the list's order, and then writes them from end to end.
 template <class Kernel, class S>
-__global__ void __launch_bounds__(kTileThreads) fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
+    fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
+  using T = FastOr<S>;
+  struct alignas(16) Row {
+    S g[kGeom];
+  };
+  static_assert(kHeld<S> >= kTileThreads && kGeom % (kTileThreads / kWarp) == 0);
+  __shared__ Row rows[kWarp];
+  __shared__ int bits[kTileWarps][kWarp];  // fragments of a warp and a pair
+  __shared__ int32_t ids[kWarp], surfels[kHeld<S>], pixels[kHeld<S>];
+  __shared__ S weights[kHeld<S>], us[kHeld<S>], vs[kHeld<S>], depths[kHeld<S>], sigmas[kHeld<S>];
+  constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
   const Spot s = spot(p.width);
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   const int32_t pixel = int32_t(s.y * p.width + s.x);
+  const unsigned below = (1u << s.lane) - 1;
+  const int64_t end = p.tile_pairs[blockIdx.x + 1];
   S transmittance = S(1);
-  const auto write = [&](int64_t, int32_t id, bool mine, int64_t i) {
-    S g[kGeom];
-    load_shape(geom + int64_t(id) * kGeom, g);
-    const S dx = x - g[kCx], dy = y - g[kCy];
-    Fragment<S> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
-    if (mine) {
-      // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here, may
-      // find nothing, and the gradient would divide by it.
-      f.sigma = max_(f.sigma, S(kAlphaMin));
-      const Blend<S> b = blend(f.sigma, transmittance);
-      transmittance = b.behind;
-      out.surfel[i] = id, out.pixel[i] = pixel;
-      out.weight[i] = b.weight;
-      out.uv[i] = f.u, out.uv[out.total + i] = f.v;
-      out.depth[i] = f.depth;
-      out.sigma[i] = listed_sigma(f);
+  int taken_pairs = 0;
+  for (int64_t first = p.tile_pairs[blockIdx.x]; first < end; first += taken_pairs) {
+    // one lane per pair: the next ones whose fragments fit
+    const int64_t own = first + s.lane, base = p.offsets[first];
+    const bool some = own < end;
+    const int from_base = some ? int(p.offsets[own] - base) : 0;
+    const int behind = some ? int(p.offsets[own + 1] - base) : kHeld<S> + 1;
+    uint32_t mark = some ? p.masks[s.warp * p.pairs + own] : 0;
+    taken_pairs = __popc(__ballot_sync(kFullMask, behind <= kHeld<S>));
+    if (!taken_pairs) return;  // no pair has more than a tile's pixels
+    const int count = __shfl_sync(kFullMask, behind, taken_pairs - 1);
+    if (s.lane >= taken_pairs) mark = 0;
+    bits[s.warp][s.lane] = __popc(mark);
+    const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
+    if (row < taken_pairs) {
+      const int32_t id = p.surfel[first + row];
+      if (column == 0) ids[row] = id;
+      BT_UNROLL
+      for (int c = 0; c < kGeom; c += kLoaders) rows[row].g[c + column] = geom[int64_t(id) * kGeom + c + column];
     }
-    return 0;
-  };
-  walk<1, false>(p, s, write, [](int) {});
+    __syncthreads();  // the rows are there, and what was held is written
+    int from = from_base;
+    BT_UNROLL
+    for (int w = 0; w < kTileWarps - 1; ++w) from += w < s.warp ? bits[w][s.lane] : 0;
+    unsigned todo = __ballot_sync(kFullMask, mark != 0);
+    while (todo) {
+      const int j = __ffs(int(todo)) - 1;
+      todo &= todo - 1;
+      const unsigned taken = __shfl_sync(kFullMask, mark, j);
+      const int i = __shfl_sync(kFullMask, from, j) + __popc(taken & below);
+      const bool mine = taken >> s.lane & 1u;
+      S g[kGeom];
+      load_shape(rows[j].g, g);
+      const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
+      const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+      if (mine) {
+        // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here,
+        // may find nothing, and the gradient would divide by it.
+        const S sigma = max_(plain(f.sigma), S(kAlphaMin));
+        const Blend<S> b = blend(sigma, transmittance);
+        transmittance = b.behind;
+        surfels[i] = ids[j], pixels[i] = pixel;
+        weights[i] = b.weight;
+        us[i] = plain(f.u), vs[i] = plain(f.v);
+        depths[i] = plain(f.depth);
+        sigmas[i] = plain(f.low_pass) > S(0) ? -sigma : sigma;
+      }
+    }
+    __syncthreads();
+    // from a multiple of 32 on, so that warps write whole sectors
+    BT_UNROLL_BY(1)
+    for (int i = int(threadIdx.x) - int(base % kWarp); i < count; i += kTileThreads) {
+      if (i < 0) continue;
+      const int64_t at = base + i;
+      out.surfel[at] = surfels[i], out.pixel[at] = pixels[i];
+      out.weight[at] = weights[i];
+      out.uv[at] = us[i], out.uv[out.total + at] = vs[i];
+      out.depth[at] = depths[i];
+      out.sigma[at] = sigmas[i];
+    }
+  }
 }
 
 // Which of a surfel's fragments lie on masked pixels is known from the marks: the list itself is not read.

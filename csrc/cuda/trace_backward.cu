@@ -4,6 +4,7 @@
 // that sum in a register, 16 bytes per fragment. The long formulas then need no order any more, so they run through the
 // list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair.
 #include "core/kernel.h"
+#include "cuda/fast.h"
 #include "cuda/kernels.h"
 
 namespace bt::cuda {
@@ -20,8 +21,9 @@ struct Step {
 template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     dsigma_kernel(Pairs p, FragmentArrays<S> f, const S* dweight, S* dsigma) {
+  using T = FastOr<S>;
   const Spot s = spot(p.width);
-  S later = S(0);  // sum of w dL/dw
+  T later = T(S(0));  // sum of w dL/dw
   const auto load = [&](int64_t, int32_t, bool mine, int64_t i) {
     Step<S> t = {mine, i, S(0), S(0), S(0)};
     if (mine) t.weight = f.weight[i], t.sigma = f.sigma[i], t.dweight = dweight[i];
@@ -29,7 +31,7 @@ __global__ void __launch_bounds__(kTileThreads)
   };
   const auto use = [&](const Step<S>& t) {
     if (!t.mine) return;
-    dsigma[t.i] = blend_vjp(t.weight, abs_(t.sigma), t.dweight, later);
+    dsigma[t.i] = plain(blend_vjp(T(t.weight), T(abs_(t.sigma)), T(t.dweight), later));
   };
   walk<4, true>(p, s, load, use);
 }
@@ -38,23 +40,40 @@ template <class Kernel, class S>
 __global__ void __launch_bounds__(kRunThreads)
     surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, const S* dsigma, const S* duv,
                   const S* ddepth, S* partial) {
+  using T = FastOr<S>;
   const Run r = run(p);
-  S d[kTraceSums];
-  for (int c = 0; c < kTraceSums; ++c) d[c] = S(0);
-  if (r.begin < r.end) {
-    S g[kGeom], ax = S(0), ay = S(0);
-    load_shape(geom + int64_t(p.surfel[r.k]) * kGeom, g);
-    for (int64_t i = r.begin + r.lane; i < r.end; i += kRunLanes) {
-      const int32_t y = f.pixel[i] / p.width, x = f.pixel[i] - y * p.width;
-      S ddx, ddy;
-      fragment_vjp<Kernel, S, S>(g, near, rim, pixel_centre<S>(x) - g[kCx], pixel_centre<S>(y) - g[kCy],
-                                 low_pass_of(f.sigma[i]), dsigma ? dsigma[i] : S(0), duv ? duv[i] : S(0),
-                                 duv ? duv[f.total + i] : S(0), ddepth ? ddepth[i] : S(0), d, ddx, ddy);
+  T d[kTraceSums], ax = T(S(0)), ay = T(S(0));
+  BT_UNROLL
+  for (int c = 0; c < kTraceSums; ++c) d[c] = T(S(0));
+  S g[kGeom];
+  load_shape(geom + (r.some ? int64_t(p.surfel[r.k]) : 0) * kGeom, g);
+  const RowOf row_of(p.width);
+  const int own = int(r.end - r.begin), most = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
+  for (int at = r.lane; at - r.lane < most; at += kRunLanes) {
+    const bool mine = at < own;
+    const int64_t i = r.begin + at;
+    int32_t pixel = 0;
+    S listed = S(0), gs = S(0), gu = S(0), gv = S(0), gz = S(0);
+    if (mine) {
+      pixel = f.pixel[i], listed = f.sigma[i];
+      if (dsigma) gs = dsigma[i];
+      if (duv) gu = duv[i], gv = duv[f.total + i];
+      if (ddepth) gz = ddepth[i];
+    }
+    __syncwarp();  // no load is put off until its number is used: one wait is for all
+    if (mine) {
+      const int32_t y = row_of(pixel), x = pixel - y * p.width;
+      T ddx, ddy;
+      fragment_vjp<Kernel, S, T>(g, near, rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]),
+                                 T(low_pass_of(listed)), T(gs), T(gu), T(gv), T(gz), d, ddx, ddy);
       ax += abs_(ddx), ay += abs_(ddy);
     }
-    d[kShape] = ax, d[kShape + 1] = ay;
   }
-  const S sum = sum_over_run(d, r.lane);
+  d[kShape] = ax, d[kShape + 1] = ay;
+  S sums[kTraceSums];
+  BT_UNROLL
+  for (int c = 0; c < kTraceSums; ++c) sums[c] = plain(d[c]);
+  const S sum = sum_over_run(sums, r.lane);
   if (r.some) partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
 }
 

@@ -98,7 +98,8 @@ template <class T>
 struct Corners {
   typename IndexOf<T>::type index[8];
   T weight[8];
-  T fx, fy, fz;  // position in the cell
+  T fx, fy, fz;                       // position in the cell
+  typename IndexOf<T>::type x, y, z;  // the cell's first corner, y and z times their primes
 };
 template <class T>
 BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
@@ -111,6 +112,7 @@ BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
   const U yz[4] = {y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1};
   const T gx = one - r.fx, gy = one - r.fy, gz = one - r.fz;
   const T wyz[4] = {gy * gz, r.fy * gz, gy * r.fz, r.fy * r.fz};
+  r.x = x0, r.y = y0, r.z = z0;
   for (int i = 0; i < 4; ++i) {
     r.index[2 * i] = (x0 ^ yz[i]) & mask, r.index[2 * i + 1] = (x1 ^ yz[i]) & mask;
     r.weight[2 * i] = gx * wyz[i], r.weight[2 * i + 1] = r.fx * wyz[i];

@@ -10,15 +10,20 @@ constexpr int kThreads = 128;
 template <class S>
 __global__ void __launch_bounds__(kThreads)
     field_forward_kernel(int64_t n, FieldArrays<S> field, const S* __restrict__ x, S* __restrict__ rho) {
-  __shared__ DeviceMlp<S> m;
+  __shared__ WarpMlp<S> m;
+  __shared__ ForwardStage<S> stage[kThreads / kWarp];
   load_mlp(field, threadIdx.x, kThreads, m);
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) store3(rho + 3 * i, evaluate(field, m, load3(x + 3 * i)));
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  Vec3<S> at = {S(0), S(0), S(0)};
+  if (i < n) at = load3(x + 3 * i);
+  const Vec3<S> value = evaluate(field, m, at, i < n, lane, stage[warp]);
+  if (i < n) store3(rho + 3 * i, value);
 }
 
 // Warps take chunks of consecutive points in turn.
 template <class S, bool kExact>
-__global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
+__global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>)
     field_backward_kernel(int64_t n, FieldArrays<S> field, const S* __restrict__ x, const S* __restrict__ drho,
                           S* dtable, ExactSums exact, S* partial, S* dx) {
   BT_DYNAMIC_SHARED(BackwardShared<S>, shared);
@@ -50,7 +55,8 @@ __global__ void __launch_bounds__(kThreads)
     bake_kernel(int64_t n, int64_t warps, FieldArrays<S> field, const S* __restrict__ frames,
                 const S* __restrict__ extent, const int32_t* __restrict__ tiles, const int64_t* __restrict__ first,
                 int width, int height, S* __restrict__ pages, int32_t* bad) {
-  __shared__ DeviceMlp<S> m;
+  __shared__ WarpMlp<S> m;
+  __shared__ ForwardStage<S> stage[kThreads / kWarp];
   load_mlp(field, threadIdx.x, kThreads, m);
   const int64_t warp = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kWarp;
   if (warp >= warps) return;
@@ -60,12 +66,14 @@ __global__ void __launch_bounds__(kThreads)
     (first[mid] <= warp ? low : high) = mid;
   }
   const int32_t* tile = tiles + 5 * low;
-  const int r_u = tile[3], r_v = tile[4], t = int(warp - first[low]) * kWarp + int(threadIdx.x % kWarp);
-  if (t >= r_u * r_v) return;
-  const int i = t % r_u, j = t / r_u;
+  const int r_u = tile[3], r_v = tile[4], lane = threadIdx.x % kWarp;
+  const int t = int(warp - first[low]) * kWarp + lane;
+  const bool active = t < r_u * r_v;
+  const int i = active ? t % r_u : 0, j = active ? t / r_u : 0;
   const Vec3<S> x =
       world_point(frames + low * kFrame, texel_centre(i, r_u, extent[low]), texel_centre(j, r_v, extent[low]));
-  Vec3<S> rho = evaluate(field, m, x);
+  Vec3<S> rho = evaluate(field, m, x, active, lane, stage[threadIdx.x / kWarp]);
+  if (!active) return;
   if (!finite_(rho.x) || !finite_(rho.y) || !finite_(rho.z)) {
     rho = {S(0), S(0), S(0)};
     atomicAdd(bad, 1);

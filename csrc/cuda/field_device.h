@@ -1,105 +1,19 @@
 // The residual field on CUDA: at points, at the fragments of a view (shading), and at the texels of an atlas.
 //
 // Work of one look-up with L = 4 levels: 32 entries of 16 bytes gathered from the table (1 KB of 32-byte sectors at
-// worst; the table of at most 8 MB stays in the L2), 1,500 operations, of which 1,120 belong to the MLP. An H200
-// gathers some 5 TB/s from its L2 and does 60 Tflop/s: 5 look-ups a ns by memory and 40 by arithmetic. The gathers
-// decide, and neighbouring fragments that share cells find them in the L1. So a thread does one look-up, with the
-// weights in shared memory, read by all lanes at once, 4 multiply-adds a load; tensor cores would round to tf32 and
-// gain nothing. The backward pass repeats the look-up, adds 32 times 16 bytes to the table's gradient (one vector
-// reduction each, once per run of fragments in one cell where that halves them) and takes 2,240 more operations.
-//
-// Here stands its device code: core/field.h on rows of 16 registers.
+// worst; the table of at most 8 MB stays in the L2, and neighbouring fragments that share cells find them in the L1),
+// and an MLP of 560 multiply-adds, 1,680 with its gradients. What limits the kernels is the number of instructions that
+// they issue, and how many warps there are to wait for memory. So a warp takes 32 look-ups, gathers with a lane per
+// look-up, hands the features over in shared memory, and does the MLP on tensor cores (warp_mlp.h): 24 steps for what
+// are 256 multiply-adds and 64 loads per lane. The backward pass repeats the look-up and adds 32 times 16 bytes to the
+// table's gradient, one vector reduction each, after sums over neighbouring fragments in one cell.
 #pragma once
 
 #include "cuda/kernels.h"
 #include "cuda/warp.h"
+#include "cuda/warp_mlp.h"
 
 namespace bt::cuda {
-
-// A row of the MLP: registers, or one line of shared memory that is read four numbers at a time.
-template <class S>
-struct alignas(16) Row {
-  S v[kWidth];
-  Row() = default;
-  BT_HD explicit Row(S value) {
-    BT_UNROLL
-    for (int i = 0; i < kWidth; ++i) v[i] = value;
-  }
-};
-template <class S>
-struct RowMask {
-  bool v[kWidth];
-};
-#define BT_ROW_OPERATOR(op)                                \
-  template <class S>                                       \
-  BT_HD Row<S> operator op(Row<S> a, const Row<S>& b) {    \
-    BT_UNROLL                                              \
-    for (int i = 0; i < kWidth; ++i) a.v[i] op## = b.v[i]; \
-    return a;                                              \
-  }
-BT_ROW_OPERATOR(+)
-BT_ROW_OPERATOR(*)
-#undef BT_ROW_OPERATOR
-template <class S>
-BT_HD RowMask<S> operator>(const Row<S>& a, const Row<S>& b) {
-  RowMask<S> m;
-  BT_UNROLL
-  for (int i = 0; i < kWidth; ++i) m.v[i] = a.v[i] > b.v[i];
-  return m;
-}
-template <class S>
-BT_HD Row<S> select(const RowMask<S>& m, const Row<S>& yes, const Row<S>& no) {
-  Row<S> r;
-  BT_UNROLL
-  for (int i = 0; i < kWidth; ++i) r.v[i] = m.v[i] ? yes.v[i] : no.v[i];
-  return r;
-}
-template <class S>
-BT_HD Row<S> relu(Row<S> a) {
-  BT_UNROLL
-  for (int i = 0; i < kWidth; ++i) a.v[i] = bt::relu(a.v[i]);
-  return a;
-}
-template <class S>
-BT_HD void store(S* to, const Row<S>& a) {
-  BT_UNROLL
-  for (int i = 0; i < kWidth; ++i) to[i] = a.v[i];
-}
-template <class S>
-BT_HD S sum(const Row<S>& a) {
-  S r[4] = {a.v[0], a.v[1], a.v[2], a.v[3]};
-  BT_UNROLL
-  for (int i = 4; i < kWidth; ++i) r[i % 4] += a.v[i];
-  return (r[0] + r[2]) + (r[1] + r[3]);
-}
-// The 16 sums are chains enough: one multiply-add each per input.
-template <class S>
-BT_HD Row<S> product(const Row<S>* w, const S* in) {
-  Row<S> a(S(0));
-  BT_UNROLL
-  for (int i = 0; i < kWidth; ++i) {
-    const Row<S> row = w[i];
-    BT_UNROLL
-    for (int o = 0; o < kWidth; ++o) a.v[o] += row.v[o] * in[i];
-  }
-  return a;
-}
-
-template <class S>
-using DeviceMlp = Mlp<S, Row<S>>;
-
-// All threads of the block copy the weights to shared memory; ends with a barrier.
-template <class S>
-__device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, DeviceMlp<S>& m) {
-  const int inputs = f.levels * kFeatures;
-  for (int k = thread; k < kWidth * kWidth; k += threads) {
-    const int i = k / kWidth, o = k % kWidth;
-    m.w1[i].v[o] = m.w1t[o].v[i] = i < inputs ? f.w1[k] : S(0);
-    m.w2[i].v[o] = m.w2t[o].v[i] = f.w2[k];
-    if (o < 3) m.w3[o].v[i] = f.w3[i * 3 + o];
-  }
-  __syncthreads();
-}
 
 template <class S>
 struct alignas(16) Entry {
@@ -114,204 +28,220 @@ __device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec3<S> x) {
   return grid_coordinate(x, load3(f.mid), f.half, f.contract);
 }
 
-// Interpolated features at a grid position; those of missing levels are 0.
+// Interpolated features at a grid position, to memory; those of missing levels and of look-ups that are not active are
+// 0.
 template <class S>
-__device__ void encode(const FieldArrays<S>& f, Vec3<S> c, S (&features)[kInputs]) {
+__device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bool active, S* to) {
   const uint32_t mask = f.hash_mask();
+  Entry<S> features[kMaxLevels];
   BT_UNROLL
   for (int l = 0; l < kMaxLevels; ++l) {
     BT_UNROLL
-    for (int j = 0; j < kFeatures; ++j) features[l * kFeatures + j] = S(0);
-    if (l >= f.levels) continue;
+    for (int j = 0; j < kFeatures; ++j) features[l].v[j] = S(0);
+    if (l >= f.levels || !active) continue;
     Corners<S> at;
     corners(c, f.resolution(l), mask, at);
     BT_UNROLL
     for (int k = 0; k < 8; ++k) {
       const Entry<S> e = entry(f, l, at.index[k]);
       BT_UNROLL
-      for (int j = 0; j < kFeatures; ++j) features[l * kFeatures + j] += at.weight[k] * e.v[j];
+      for (int j = 0; j < kFeatures; ++j) features[l].v[j] += at.weight[k] * e.v[j];
     }
   }
+  BT_UNROLL
+  for (int l = 0; l < kMaxLevels; ++l) *reinterpret_cast<Entry<S>*>(to + l * kFeatures) = features[l];
 }
 
+// Memory of a warp for 32 values of the field. With rows 24 numbers apart the pairs that lanes read as a first factor
+// lie in different banks.
 template <class S>
-__device__ Vec3<S> evaluate(const FieldArrays<S>& f, const DeviceMlp<S>& m, Vec3<S> x) {
-  S features[kInputs];
-  MlpState<S, Row<S>> state;
-  encode(f, grid_position(f, x), features);
-  return mlp(m, features, state);
+struct ForwardStage {
+  enum { kX = 0, kOut = 16, kColumns = 24 };
+  alignas(16) S number[kWarp * kColumns];
+};
+// The residual at a point per lane. All 32 lanes take part; those that are not active get the value at features of 0.
+template <class S>
+__device__ Vec3<S> evaluate(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, bool active, int lane,
+                            ForwardStage<S>& stage) {
+  using Stage = ForwardStage<S>;
+  S* mine = stage.number + lane * Stage::kColumns;
+  encode(f, grid_position(f, x), active, mine + Stage::kX);
+  __syncwarp();
+  const auto row = [&](int p) { return stage.number + p * Stage::kColumns; };
+  const Rows<S> h1 = rectified(layer(load_rows<S>(lane, row), m.w1, lane));
+  const Rows<S> h2 = rectified(layer(h1, m.w2, lane));
+  S rho[2][1][4];
+  product(h2, m.w3, lane, rho);
+  if (lane % 4 < 2) {  // the other lanes hold columns 4 to 7
+    BT_UNROLL
+    for (int i = 0; i < 4; ++i)
+      *reinterpret_cast<Pair<S>*>(row(8 * i + lane / 4) + Stage::kOut +
+                                  lane % 4 * 2) = {{rho[i / 2][0][i % 2 * 2], rho[i / 2][0][i % 2 * 2 + 1]}};
+  }
+  __syncwarp();
+  return load3(mine + Stage::kOut);
 }
 
 // ---- backward, by warps
 
-// What 32 look-ups put side by side for the weights' gradients. Rows are 84 numbers apart: eight lanes that write four
-// numbers each touch all 32 banks.
+// Memory of a warp for 32 look-ups: first what layers were given and their gradients, a row per look-up and rows 72
+// apart, so that a factor's numbers lie in different banks along rows and along columns. Later, in the same place, the
+// gradients of the features, and weights and entries of the corners of a level (two levels take turns). There look-ups
+// 0, 8, 16 and 24 are read together, and every eight of them begin at another bank.
 template <class S>
 struct Stage {
-  enum { kX = 0, kH1 = 16, kG1 = 32, kG2 = 48, kH2 = 64, kD = 80, kColumns = 84 };
-  alignas(16) S row[kWarp][kColumns];
-};
+  enum { kX = 0, kH1 = 16, kG1 = 32, kG2 = 48, kD = 64, kColumns = 72 };
+  enum { kFeatureRows = 648, kCornerRows = 280 };
+  alignas(16) S number[kWarp * kColumns];
+  static_assert(kFeatureRows + 4 * kCornerRows <= kWarp * kColumns, "the second use fits into the memory of the first");
 
-// A lane's share of the weights' gradients: a 4 x 4 patch of w1 (lanes 0 to 15) or of w2, and three numbers of w3. The
-// outer products of 32 look-ups are 560 multiply-adds per lane, two loads of four numbers for sixteen of them.
-template <class S>
-struct WeightSums {
-  S patch[16], last[3];
-  __device__ WeightSums() {
-    BT_UNROLL
-    for (S& p : patch) p = S(0);
-    last[0] = last[1] = last[2] = S(0);
+  __device__ S* row(int p) { return number + p * kColumns; }
+  __device__ S* feature_gradients(int p) { return number + p * 20 + p / 8 * 4; }
+  __device__ S* corner_weights(int turn, int p) {
+    return number + kFeatureRows + turn * kCornerRows + p * 8 + p / 8 * 8;
   }
-  __device__ static int row(int lane) { return lane % 16 / 4 * 4; }
-  __device__ static int column(int lane) { return lane % 4 * 4; }
-
-  __device__ void add(const Stage<S>& stage, int lane) {
-    const int in = (lane < 16 ? Stage<S>::kX : Stage<S>::kH1) + row(lane);
-    const int out = (lane < 16 ? Stage<S>::kG1 : Stage<S>::kG2) + column(lane);
-    for (int p = 0; p < kWarp; ++p) {
-      const Entry<S> a = *reinterpret_cast<const Entry<S>*>(stage.row[p] + in);
-      const Entry<S> b = *reinterpret_cast<const Entry<S>*>(stage.row[p] + out);
-      BT_UNROLL
-      for (int k = 0; k < 16; ++k) patch[k] += a.v[k / 4] * b.v[k % 4];
-    }
-    for (int p = lane / 16; p < kWarp; p += 2) {
-      const S h = stage.row[p][Stage<S>::kH2 + lane % 16];
-      const Entry<S> d = *reinterpret_cast<const Entry<S>*>(stage.row[p] + Stage<S>::kD);
-      for (int c = 0; c < 3; ++c) last[c] += h * d.v[c];
-    }
-  }
-  // Adds to a block's sums [kMlpWeights] in shared memory; the two lanes that share a number of w3 come one after the
-  // other.
-  __device__ void give(S* to, int lane) const {
-    S* matrix = to + (lane < 16 ? 0 : kInputs * kWidth);
-    for (int k = 0; k < 16; ++k) matrix[(row(lane) + k / 4) * kWidth + column(lane) + k % 4] += patch[k];
-    S* w3 = to + 2 * kWidth * kWidth + lane % 16 * 3;
-    for (int half = 0; half < 2; ++half) {
-      if (lane / 16 == half)
-        for (int c = 0; c < 3; ++c) w3[c] += last[c];
-      __syncwarp();
-    }
+  __device__ uint32_t* corner_indices(int turn, int p) {
+    uint32_t* all = reinterpret_cast<uint32_t*>(number + kFeatureRows + 2 * kCornerRows);
+    return all + turn * kCornerRows + p * 8 + p / 8 * 8;
   }
 };
 
-// The cell of a grid position, as a number; up to a resolution of 2^21 every cell has its own.
-template <class S>
-__device__ uint64_t cell_of(Vec3<S> c, S resolution) {
-  const uint64_t x = to_index(floor_(c.x * resolution)), y = to_index(floor_(c.y * resolution));
-  const uint64_t z = to_index(floor_(c.z * resolution));
-  return x | y << 21 | z << 42;
-}
-
-// Adds the table's gradient of 32 look-ups. Where that at least halves the additions, lanes with neighbours in the same
-// cell add up first.
+// Adds the table's gradient of 32 look-ups at a level: four groups of eight lanes, a lane per corner, walk along eight
+// look-ups each and add up those in one cell before they go to memory. `ends`: the look-ups whose successor lies in
+// another cell; none where all lie in one.
 template <class S, bool kExact>
-__device__ void scatter(const FieldArrays<S>& f, Vec3<S> c, const S (&dfeatures)[kInputs], bool active, int lane,
-                        const Adder<S, kExact>& table) {
-  const uint32_t mask = f.hash_mask();
-  BT_UNROLL
-  for (int l = 0; l < kMaxLevels; ++l) {
-    if (l >= f.levels) continue;
-    Corners<S> at;
-    corners(c, f.resolution(l), mask, at);
-    const S resolution = f.resolution(l);
-    const unsigned run = run_of(active ? cell_of(c, resolution) : ~uint64_t(0), lane);
-    const bool first = active && count_below(run, lane) == 0;
-    const unsigned firsts = __ballot_sync(kFullMask, first), all = __ballot_sync(kFullMask, active);
-    const bool together = 2 * __popc(firsts) <= __popc(all) && resolution <= S(1 << 21);
-    const int64_t level = f.first_entry(l);
+__device__ void scatter(Stage<S>& stage, int turn, int level, int64_t first_entry, unsigned actives, unsigned ends,
+                        int lane, const Adder<S, kExact>& table) {
+  const int group = lane / 8 * 8, corner = lane % 8;
+  Entry<S> sum = {};
+  const auto take = [&](int p) {
+    const S weight = stage.corner_weights(turn, p)[corner];
+    const Entry<S> d = *reinterpret_cast<const Entry<S>*>(stage.feature_gradients(p) + level * kFeatures);
     BT_UNROLL
-    for (int half = 0; half < 8; half += 4) {  // 16 numbers at a time: 32 would not fit in registers
-      S value[4 * kFeatures];
+    for (int j = 0; j < kFeatures; ++j) sum.v[j] += weight * d.v[j];
+  };
+  const auto add = [&](int p) { table.add4((first_entry + stage.corner_indices(turn, p)[corner]) * kFeatures, sum.v); };
+  if (!ends) {
+    BT_UNROLL
+    for (int i = 0; i < 8; ++i) take(group + i);
+    for (int other = 8; other < kWarp; other *= 2) {
       BT_UNROLL
-      for (int k = 0; k < 4 * kFeatures; ++k)
-        value[k] = active ? at.weight[half + k / kFeatures] * dfeatures[l * kFeatures + k % kFeatures] : S(0);
-      if (together) sum_over_run(run, lane, value);
-      if (!(together ? first : active)) continue;
-      BT_UNROLL
-      for (int k = 0; k < 4; ++k) table.add4((level + at.index[half + k]) * kFeatures, value + k * kFeatures);
+      for (int j = 0; j < kFeatures; ++j) sum.v[j] += __shfl_xor_sync(kFullMask, sum.v[j], other);
     }
+    if (group == 0 && actives) add(0);
+    return;
+  }
+  ends |= actives & (0x80808080u | ~(actives >> 1));  // and the last of each group and of all
+  BT_UNROLL
+  for (int i = 0; i < 8; ++i) {
+    take(group + i);
+    if (!(ends >> (group + i) & 1u)) continue;
+    add(group + i);
+    sum = {};
   }
 }
 
-// d loss / d x from that of the features.
-template <class S>
-__device__ Vec3<S> position_gradient(const FieldArrays<S>& f, Vec3<S> x, Vec3<S> c, const S (&dfeatures)[kInputs]) {
+// The table's gradient, and d loss / d grid position if asked for, of 32 look-ups whose gradients of the features stand
+// in the stage. Lanes that are not active come after the others; their gradients are 0.
+template <class S, bool kExact>
+__device__ Vec3<S> learn_table(const FieldArrays<S>& f, Vec3<S> c, bool active, int lane, Stage<S>& stage,
+                               const Adder<S, kExact>& table, bool positions) {
   const uint32_t mask = f.hash_mask();
+  const unsigned actives = __ballot_sync(kFullMask, active);
+  const bool followed = lane < kWarp - 1 && (actives >> (lane + 1) & 1u);
   Vec3<S> dc = {S(0), S(0), S(0)};
-  BT_UNROLL
-  for (int l = 0; l < kMaxLevels; ++l) {
-    if (l >= f.levels) continue;
+  BT_UNROLL_BY(1)
+  for (int l = 0; l < f.levels; ++l) {
     Corners<S> at;
-    corners(c, f.resolution(l), mask, at);
-    S d[8];
+    const S resolution = f.resolution(l);
+    const int turn = l % 2;
+    corners(c, resolution, mask, at);
+    S* weights = stage.corner_weights(turn, lane);
+    uint32_t* indices = stage.corner_indices(turn, lane);
     BT_UNROLL
-    for (int k = 0; k < 8; ++k) {
-      const Entry<S> e = entry(f, l, at.index[k]);
-      d[k] = S(0);
+    for (int k = 0; k < 8; ++k) weights[k] = at.weight[k], indices[k] = at.index[k];
+    const bool same = __shfl_sync(kFullMask, at.x, lane + 1) == at.x & __shfl_sync(kFullMask, at.y, lane + 1) == at.y &
+                      __shfl_sync(kFullMask, at.z, lane + 1) == at.z;
+    const unsigned ends = __ballot_sync(kFullMask, active && followed && !same);
+    __syncwarp();
+    if (positions) {
+      const Entry<S> df = *reinterpret_cast<const Entry<S>*>(stage.feature_gradients(lane) + l * kFeatures);
+      S d[8];
       BT_UNROLL
-      for (int j = 0; j < kFeatures; ++j) d[k] += dfeatures[l * kFeatures + j] * e.v[j];
+      for (int k = 0; k < 8; ++k) {
+        const Entry<S> e = entry(f, l, at.index[k]);
+        d[k] = (df.v[0] * e.v[0] + df.v[1] * e.v[1]) + (df.v[2] * e.v[2] + df.v[3] * e.v[3]);
+      }
+      dc = dc + cell_gradient(at.fx, at.fy, at.fz, resolution, d);
     }
-    dc = dc + cell_gradient(at.fx, at.fy, at.fz, f.resolution(l), d);
+    scatter(stage, turn, l, f.first_entry(l), actives, ends, lane, table);
   }
-  return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
+  return dc;
 }
 
-// One backward look-up per lane; all 32 lanes take part, those that are not active add nothing. Returns d loss / d x if
-// asked for.
+// One backward look-up per lane; all 32 lanes take part. Those that are not active come after the others and add
+// nothing. Returns d loss / d x if asked for.
 template <class S, bool kExact>
-__device__ Vec3<S> learn(const FieldArrays<S>& f, const DeviceMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active, int lane,
+__device__ Vec3<S> learn(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active, int lane,
                          Stage<S>& stage, WeightSums<S>& weights, const Adder<S, kExact>& table, bool positions) {
-  S dfeatures[kInputs];
-  S* row = stage.row[lane];
+  using At = Stage<S>;
   const Vec3<S> c = grid_position(f, x);
-  if (active) {
-    S features[kInputs];
-    MlpState<S, Row<S>> state;
-    MlpGradient<Row<S>> g;
-    encode(f, c, features);
-    mlp(m, features, state);
-    const Row<S> d = mlp_vjp(m, state, drho, g);
-    store(dfeatures, d);
+  encode(f, c, active, stage.row(lane) + At::kX);
+  *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kD) = {{drho.x, drho.y, drho.z, S(0)}};
+  __syncwarp();
+  const auto column = [&](int first) { return [&stage, first](int p) { return stage.row(p) + first; }; };
+  const Rows<S> h1 = rectified(layer(load_rows<S>(lane, column(At::kX)), m.w1, lane));
+  store_rows(h1, lane, column(At::kH1));
+  Rows<S> g;
+  {
+    const Rows<S> h2 = rectified(layer(h1, m.w2, lane));
+    Vec3<S> d[4];
     BT_UNROLL
-    for (int i = 0; i < kInputs; ++i) row[Stage<S>::kX + i] = features[i];
-    store(row + Stage<S>::kH1, state.h1);
-    store(row + Stage<S>::kG1, g.g1);
-    store(row + Stage<S>::kG2, g.g2);
-    store(row + Stage<S>::kH2, state.h2);
-    row[Stage<S>::kD] = drho.x, row[Stage<S>::kD + 1] = drho.y, row[Stage<S>::kD + 2] = drho.z;
-    row[Stage<S>::kD + 3] = S(0);
-  } else {
+    for (int i = 0; i < 4; ++i) d[i] = load3(stage.row(8 * i + lane / 4) + At::kD);
+    weights.add_last(h2, d);
     BT_UNROLL
-    for (int i = 0; i < Stage<S>::kColumns; ++i) row[i] = S(0);
-    BT_UNROLL
-    for (int i = 0; i < kInputs; ++i) dfeatures[i] = S(0);
+    for (int k = 0; k < 4; ++k) {
+      const Vec3<S> w = load3(m.output[k / 2 * 8 + lane % 4 * 2 + k % 2]);
+      BT_UNROLL
+      for (int i = 0; i < 4; ++i) g.v[i / 2][k / 2][i % 2 * 2 + k % 2] = dot(w, d[i]);
+    }
+    g = where_open(g, h2);
   }
+  store_rows(g, lane, column(At::kG2));
+  g = where_open(layer(g, m.w2t, lane), h1);
+  store_rows(g, lane, column(At::kG1));
+  g = layer(g, m.w1t, lane);
   __syncwarp();
-  weights.add(stage, lane);
+  weights.add_outer(weights.w1, stage.number + At::kX, stage.number + At::kG1, At::kColumns, lane);
+  weights.add_outer(weights.w2, stage.number + At::kH1, stage.number + At::kG2, At::kColumns, lane);
   __syncwarp();
-  scatter(f, c, dfeatures, active, lane, table);
+  store_rows(g, lane, [&](int p) { return stage.feature_gradients(p); });
+  const Vec3<S> dc = learn_table(f, c, active, lane, stage, table, positions);
+  __syncwarp();  // the next look-ups write where these are read
   if (!positions || !active) return {S(0), S(0), S(0)};
-  return position_gradient(f, x, c, dfeatures);
+  return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
 }
 
 // ---- blocks of a backward pass
 
 template <class S>
-constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 10.5 KB, or 21 KB in double
+constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 9 KB, or 18 KB in double
+template <class S>
+constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // blocks at a time on a multiprocessor
 
 template <class S>
 struct BackwardShared {
-  DeviceMlp<S> mlp;
+  WarpMlp<S> mlp;
   Stage<S> stage[kBackwardWarps<S>];
   int64_t queue[kBackwardWarps<S>][2 * kWarp];
 };
 
 // Sums of the block's warps, in their order, to the block's row of `out`.
 template <class S>
-__device__ void give_weights(BackwardShared<S>& shared, const WeightSums<S>& weights, int warp, int lane, S* out) {
+__device__ void give_weights(BackwardShared<S>& shared, WeightSums<S>& weights, int warp, int lane, S* out) {
   constexpr int kThreads = kBackwardWarps<S> * kWarp;
   static_assert(kMlpWeights <= kWarp * Stage<S>::kColumns, "the sums take the place of the first warp's stage");
-  S* sums = &shared.stage[0].row[0][0];
+  S* sums = shared.stage[0].number;
   __syncthreads();
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) sums[k] = S(0);
   __syncthreads();
@@ -326,9 +256,9 @@ constexpr int kChunk = 8 * kWarp;  // consecutive items that a warp takes at a t
 
 // Blocks of a backward pass over n items. A function of n alone: with it the order of all sums is fixed.
 template <class S>
-int backward_blocks(int64_t n) {
+int backward_blocks(int64_t n, int most = kMostBlocks) {
   const int64_t blocks = ceil_div(n, int64_t(kChunk) * kBackwardWarps<S>);
-  return int(blocks < 1 ? 1 : blocks > kMostBlocks ? kMostBlocks : blocks);
+  return int(blocks < 1 ? 1 : blocks > most ? most : blocks);
 }
 
 // ---- steps around the backward kernels (field_sums.cu)

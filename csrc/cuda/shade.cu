@@ -16,6 +16,9 @@ struct ShadeGradients {
 
 namespace {
 constexpr int kForwardWarps = 4;
+template <class S>
+constexpr int kForwardResident = sizeof(S) == 4 ? 6 : 2;  // blocks at a time on a multiprocessor
+constexpr int64_t kMostForwardBlocks = 6 * 132;           // one round of them on an H100
 
 // Puts the item of every lane that has one at the end of the queue, in the order of the lanes.
 __device__ void put(int64_t* queue, int& count, bool has, int64_t item, int lane) {
@@ -40,31 +43,39 @@ __device__ Vec3<S> fragment_point(const FragmentArrays<S>& f, const S* frames, i
 }
 
 template <class S>
-__global__ void __launch_bounds__(kForwardWarps* kWarp)
+struct ForwardShared {
+  WarpMlp<S> mlp;
+  ForwardStage<S> stage[kForwardWarps];
+  int64_t queue[kForwardWarps][2 * kWarp];
+};
+template <class S>
+__global__ void __launch_bounds__(kForwardWarps* kWarp, kForwardResident<S>)
     forward_kernel(FragmentArrays<S> f, S bound, const S* __restrict__ base, const S* __restrict__ frames,
                    FieldArrays<S> field, S* __restrict__ colors) {
-  __shared__ DeviceMlp<S> m;
-  __shared__ int64_t queues[kForwardWarps][2 * kWarp];
+  __shared__ ForwardShared<S> shared;
   const bool textured = field.levels > 0;
-  if (textured) load_mlp(field, threadIdx.x, kForwardWarps * kWarp, m);
+  if (textured) load_mlp(field, threadIdx.x, kForwardWarps * kWarp, shared.mlp);
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  const int64_t begin = (int64_t(blockIdx.x) * kForwardWarps + warp) * kChunk;
-  const int64_t end = begin + kChunk < f.total ? begin + kChunk : f.total;
-  int64_t* queue = queues[warp];
+  const int64_t step = int64_t(gridDim.x) * kForwardWarps * kChunk;
+  int64_t chunk = (int64_t(blockIdx.x) * kForwardWarps + warp) * kChunk, first = chunk;
+  int64_t* queue = shared.queue[warp];
   int count = 0;
-  for (int64_t first = begin; first < end; first += kWarp) {
+  while (first < f.total) {
     const int64_t i = first + lane;
-    const bool in = i < end, looks_up = in && textured && f.weight[i] >= bound;
+    const bool in = i < f.total, looks_up = in && textured && f.weight[i] >= bound;
     if (in && !looks_up) {
       store3(colors + 3 * i, view_base(load3(base + 3 * int64_t(f.surfel[i]))));
     }
     put(queue, count, looks_up, i, lane);
-    while (count >= kWarp || (count && first + kWarp >= end)) {
-      if (lane < count) {
-        const int64_t j = queue[lane];
-        const Vec3<S> color = view_base(load3(base + 3 * int64_t(f.surfel[j])));
-        store3(colors + 3 * j, shaded(color, evaluate(field, m, fragment_point(f, frames, j))));
-      }
+    first += kWarp;
+    if (first == chunk + kChunk) first = chunk += step;
+    while (count >= kWarp || (count && first >= f.total)) {
+      const bool active = lane < count;
+      const int64_t j = active ? queue[lane] : 0;
+      Vec3<S> x = {S(0), S(0), S(0)};
+      if (active) x = fragment_point(f, frames, j);
+      const Vec3<S> rho = evaluate(field, shared.mlp, x, active, lane, shared.stage[warp]);
+      if (active) store3(colors + 3 * j, shaded(view_base(load3(base + 3 * int64_t(f.surfel[j]))), rho));
       drop(queue, count, lane);
     }
   }
@@ -82,7 +93,7 @@ __device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S,
 
 // kLearn: the field gets gradients, too.
 template <class S, bool kExact, bool kLearn>
-__global__ void __launch_bounds__(kBackwardWarps<S>* kWarp)
+__global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>)
     backward_kernel(FragmentArrays<S> f, S bound, const S* __restrict__ base, const S* __restrict__ frames,
                     FieldArrays<S> field, const S* __restrict__ colors, const S* __restrict__ dcolors,
                     ShadeGradients<S> out, ExactSums exact) {
@@ -151,8 +162,10 @@ template <class S>
 void shade_forward(const ShadeForward<S>& a, Stream stream) {
   if (!a.f.total) return;
   FieldArrays<S> none = {};
-  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(a.f.total, kChunk * kForwardWarps))), dim3(kForwardWarps * kWarp),
-            0, stream, a.f, a.bound, a.base, a.frames, a.field ? *a.field : none, a.colors);
+  const int64_t blocks = ceil_div(a.f.total, kChunk * kForwardWarps);
+  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(blocks < kMostForwardBlocks ? blocks : kMostForwardBlocks)),
+            dim3(kForwardWarps * kWarp), 0, stream, a.f, a.bound, a.base, a.frames, a.field ? *a.field : none,
+            a.colors);
 }
 
 template <class S>
@@ -162,7 +175,8 @@ void shade_backward(const ShadeBackward<S>& a, Stream stream) {
   FieldArrays<S> arrays = {};
   if (learns) arrays = *a.field;
   const ShadeGradients<S> out = {a.dbase, learns ? a.dfield.table : nullptr, a.duv, a.dframes, a.work.mlp};
-  const int blocks = backward_blocks<S>(a.f.total);
+  // without the field a block's threads need few registers and wait for memory: more of them
+  const int blocks = backward_blocks<S>(a.f.total, learns ? kMostBlocks : 4 * kMostBlocks);
   const size_t shared = learns ? sizeof(BackwardShared<S>) : 0;
   const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
   const auto run = [&](auto kernel, const ExactSums& exact) {

@@ -25,17 +25,13 @@ __device__ unsigned run_of(Key key, int lane) {
 // log2(longest run) steps of M shuffles.
 template <int M, class S>
 __device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
-  unsigned above = lane == kWarp - 1 ? 0u : run & (0xfffffffeu << lane);
-  int rank = count_below(run, lane);
-  while (__any_sync(kFullMask, above != 0)) {
-    const int next = __ffs(int(above));  // 1 + the lane whose sum comes after mine; 0: none is left
+  const int above = kWarp - 1 - __clz(int(run)) - lane;  // lanes of my run after me
+  for (int step = 1; __any_sync(kFullMask, above >= step); step *= 2) {
     BT_UNROLL
     for (int m = 0; m < M; ++m) {
-      const S other = __shfl_sync(kFullMask, value[m], next ? next - 1 : lane);
-      if (next) value[m] += other;
+      const S other = __shfl_sync(kFullMask, value[m], lane + step);
+      if (above >= step) value[m] += other;  // the sum of that lane and the step - 1 after it
     }
-    above &= ~__ballot_sync(kFullMask, rank & 1);  // the odd ones have been taken in
-    rank >>= 1;
   }
 }
 

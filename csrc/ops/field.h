@@ -8,7 +8,9 @@
 namespace bt {
 
 constexpr int kMlpWeights = kInputs * kWidth + kWidth * kWidth + kWidth * 3;  // w1, w2, w3, each input-major
-constexpr int kMostBlocks = 1024;  // of a backward pass on CUDA: fixed, so that sums do not depend on the card
+// Blocks of a backward pass on CUDA: fixed, so that sums do not depend on the card. One round of four blocks on each of
+// the 132 multiprocessors of an H100.
+constexpr int kMostBlocks = 528;
 
 // Numbers of ExactRange (cuda/field_device.h), and of all that exact sums take: entries of the table (0 when frozen), 3
 // per surfel (none for points), and their frames.

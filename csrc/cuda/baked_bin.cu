@@ -12,23 +12,16 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int kThreads = 128;
+constexpr int kThreads = kBlock;
 constexpr int32_t kPairsAlone = 32;  // pairs that a thread writes by itself
 constexpr int kRestPerThread = 16;
+constexpr int64_t kLeastBlocks = 1024;  // where there are fewer a block takes fewer surfels,
+constexpr int kLeastOwned = 4;          // but as many as this
 
 __global__ void __launch_bounds__(kThreads) order_counts_kernel(BakedFrame f) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (r == 0) f.memory.total[1] = 0;
   if (r < f.rows) f.memory.ordered_counts[r] = f.memory.counts[f.memory.order[r]];
-}
-
-__device__ int32_t warp_sum_before(int32_t value, int lane) {
-  int32_t sum = value;
-  for (int by = 1; by < kWarp; by *= 2) {
-    const int32_t left = __shfl_up_sync(kFullMask, sum, by);
-    if (lane >= by) sum += left;
-  }
-  return sum - value;
 }
 
 // The counts come from another kernel, and one formula may be rounded in two ways (cmake/cuda.cmake keeps nvcc from
@@ -51,9 +44,72 @@ __device__ int64_t write_pairs(const TileRow& r, uint32_t first_tile, uint32_t r
   return at + (r.right - r.left + 1);
 }
 
-// The surfels in order of depth, one thread each, a warp for the large ones; the last blocks clear what is left over.
+// What a block shares: its large surfels, and the rows of tiles in hand.
+struct LargeSurfels {
+  FootprintRoom area[kThreads];
+  int64_t start[kThreads], end[kThreads];  // places of a surfel's pairs
+  uint32_t id[kThreads], base[kThreads];   // row; first tile of its view
+  int first_row[kThreads];                 // rows of tiles before the surfel's
+  int first_pair[kThreads], last_pair[kThreads];
+  int32_t counted[kThreads];
+  TileRow row[kThreads];
+  int of[kThreads], ty[kThreads], before[kThreads];  // a row's surfel, its number, pairs before it
+  int count, sums[kBlockWarps];
+};
+
+// All threads take a row of tiles each, then the pairs of these rows one after another, so that neighbours write to
+// neighbouring places however wide or many the rows are.
+template <class Key>
+__device__ void write_large(const BakedFrame& f, LargeSurfels& s, Key* keys, int32_t* values) {
+  const int me = threadIdx.x, large = s.count;
+  int rows = 0, mine = 0;
+  if (me < large) mine = footprint_in(s.area[me]).bottom - footprint_in(s.area[me]).top + 1;
+  const int first = block_sum_before(mine, s.sums, rows);
+  if (me < large) s.first_row[me] = first, s.first_pair[me] = s.last_pair[me] = 0;
+  __syncthreads();
+  int done = 0;  // pairs
+  for (int next = 0; next < rows; next += kThreads) {
+    const int taken = min_(rows - next, kThreads);
+    int pairs = 0, width = 0, of = 0, ty = 0;
+    if (me < taken) {
+      of = last_at_most(s.first_row, large, next + me);
+      const Footprint& area = footprint_in(s.area[of]);
+      ty = area.top + (next + me - s.first_row[of]);
+      s.row[me] = tile_row(area, ty, f.width);
+      width = s.row[me].right - s.row[me].left + 1;
+    }
+    const int before = block_sum_before(width, s.sums, pairs);
+    if (me < taken) {
+      s.of[me] = of, s.ty[me] = ty, s.before[me] = before;
+      if (ty == footprint_in(s.area[of]).top) s.first_pair[of] = done + before;
+      if (ty == footprint_in(s.area[of]).bottom) s.last_pair[of] = done + before + width;
+    }
+    __syncthreads();
+    for (int k = me; k < pairs; k += kThreads) {
+      const int at_row = last_at_most(s.before, taken, k), surfel = s.of[at_row];
+      const TileRow& row = s.row[at_row];
+      const int tx = row.left + (k - s.before[at_row]);
+      const int64_t at = s.start[surfel] + (done + k - s.first_pair[surfel]);
+      if (at < s.end[surfel]) {
+        keys[at] = Key(s.base[surfel] + uint32_t(s.ty[at_row] * f.tiles_x + tx));
+        values[at] = int32_t(s.id[surfel] << 8 | part_mask(row, tx));
+      }
+    }
+    __syncthreads();
+    done += pairs;
+  }
+  if (me < large) {
+    const int listed = s.last_pair[me] - s.first_pair[me];
+    note_difference(f, listed, s.counted[me]);
+    for (int64_t at = s.start[me] + listed; at < s.end[me]; ++at) keys[at] = Key(f.tiles);
+  }
+}
+
+// The surfels in order of depth, `owned` per block: one thread each, the whole block for the large ones; the last
+// blocks clear what is left over.
 template <class Kernel, class Key>
-__global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned surfel_blocks) {
+__global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned surfel_blocks, int owned) {
+  __shared__ LargeSurfels large;
   Key* keys = static_cast<Key*>(f.memory.keys);
   int32_t* values = f.memory.values;
   if (blockIdx.x >= surfel_blocks) {
@@ -65,43 +121,30 @@ __global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned 
     for (int64_t k = me; k < 2 * f.tiles; k += stride) f.memory.ranges[k] = 0;
     return;
   }
-  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int lane = threadIdx.x % kWarp;
-  const bool here = r < f.rows;
-  const int32_t count = here ? f.memory.ordered_counts[r] : 0;
-  const uint32_t id = here ? uint32_t(f.memory.order[r]) : 0;
-  const int64_t from = here ? f.memory.offsets[r] : 0;
-  const int tiles_of_view = f.tiles_x * f.tiles_y;
-  if (count > 0 && count <= kPairsAlone) {
-    const int64_t end = min_(from + int64_t(count), f.capacity);
+  if (threadIdx.x == 0) large.count = 0;
+  __syncthreads();
+  const int64_t r = int64_t(blockIdx.x) * owned + threadIdx.x;
+  const int32_t count = int(threadIdx.x) < owned && r < f.rows ? f.memory.ordered_counts[r] : 0;
+  if (count > 0) {
+    const uint32_t id = uint32_t(f.memory.order[r]);
+    const int64_t from = f.memory.offsets[r], end = min_(from + int64_t(count), f.capacity);
     const Footprint area = footprint<Kernel>(f.memory.rows + int64_t(id) * kRow, f.height);
-    const uint32_t base = id / uint32_t(f.n) * tiles_of_view;
-    int64_t at = from;
-    for (int ty = area.top; ty <= area.bottom; ++ty)
-      at = write_pairs(tile_row(area, ty, f.width), base + ty * f.tiles_x, id, at, end, keys, values);
-    note_difference(f, at - from, count);
-    for (; at < end; ++at) keys[at] = Key(f.tiles);
-  }
-  for (unsigned rest = __ballot_sync(kFullMask, count > kPairsAlone); rest; rest &= rest - 1) {
-    const int source = __ffs(int(rest)) - 1;
-    const uint32_t big = __shfl_sync(kFullMask, id, source);
-    const int32_t pairs = __shfl_sync(kFullMask, count, source);
-    const int64_t start = __shfl_sync(kFullMask, from, source), end = min_(start + int64_t(pairs), f.capacity);
-    const Footprint area = footprint<Kernel>(f.memory.rows + int64_t(big) * kRow, f.height);
-    const uint32_t base = big / uint32_t(f.n) * tiles_of_view;
-    int64_t at = start;
-    for (int top = area.top; top <= area.bottom; top += kWarp) {
-      const int ty = top + lane;
-      TileRow row;
-      row.left = 0, row.right = -1;
-      if (ty <= area.bottom) row = tile_row(area, ty, f.width);
-      const int32_t mine = row.right - row.left + 1, before = warp_sum_before(mine, lane);
-      write_pairs(row, base + ty * f.tiles_x, big, at + before, end, keys, values);
-      at += __shfl_sync(kFullMask, before + mine, kWarp - 1);
+    const uint32_t base = id / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y);
+    if (count <= kPairsAlone) {
+      int64_t at = from;
+      for (int ty = area.top; ty <= area.bottom; ++ty)
+        at = write_pairs(tile_row(area, ty, f.width), base + ty * f.tiles_x, id, at, end, keys, values);
+      note_difference(f, at - from, count);
+      for (; at < end; ++at) keys[at] = Key(f.tiles);
+    } else {
+      const int k = atomicAdd(&large.count, 1);
+      footprint_in(large.area[k]) = area;
+      large.start[k] = from, large.end[k] = end, large.counted[k] = count;
+      large.id[k] = id, large.base[k] = base;
     }
-    if (lane == 0) note_difference(f, at - start, pairs);
-    for (at += lane; at < end; at += kWarp) keys[at] = Key(f.tiles);
   }
+  __syncthreads();
+  if (large.count > 0) write_large(f, large, keys, values);
 }
 
 // Where each tile's pairs begin and end: one thread per run of keys as long as 16 bytes.
@@ -136,8 +179,12 @@ void bin(const BakedFrame& f, Stream stream) {
   BT_LAUNCH(order_counts_kernel, dim3(blocks), dim3(kThreads), 0, stream, f);
   exclusive_sum(m.ordered_counts, m.offsets, f.rows, m.scratch, m.scratch_bytes, stream);
   const unsigned rest = unsigned(min_<int64_t>(1024, ceil_div(f.capacity + 2 * f.tiles, kThreads * kRestPerThread)));
+  int owned = kThreads;  // surfels per block
+  while (owned > kLeastOwned && ceil_div(f.rows, owned) < kLeastBlocks) owned /= 2;
+  const unsigned surfel_blocks = unsigned(ceil_div(f.rows, owned));
   with_kernel(f.through_pixel, [&](auto kernel) {
-    BT_LAUNCH((pairs_kernel<decltype(kernel), Key>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
+    BT_LAUNCH((pairs_kernel<decltype(kernel), Key>), dim3(surfel_blocks + rest), dim3(kThreads), 0, stream, f,
+              surfel_blocks, owned);
   });
   sort_pairs(static_cast<const Key*>(m.keys), static_cast<Key*>(m.keys_sorted), m.values, m.values_sorted, f.capacity,
              f.key_bits, m.scratch, m.scratch_bytes, stream);

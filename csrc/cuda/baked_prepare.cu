@@ -11,7 +11,7 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int kThreads = 128;
+constexpr int kThreads = kBlock;
 constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
 
 // The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
@@ -56,8 +56,10 @@ template <class Kernel>
 __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedViews v, BakedFrame f) {
   __shared__ int seen_count;
   __shared__ int seen_list[kThreads];
+  __shared__ FootprintRoom large[kThreads];
+  __shared__ int first_row[kThreads], counted[kThreads], sums[kBlockWarps];
   const int64_t block = int64_t(blockIdx.x) * kThreads, i = block + threadIdx.x;
-  const int view = blockIdx.y, lane = threadIdx.x % kWarp;
+  const int view = blockIdx.y;
   const int64_t first = f.n * view, at = first + i;  // rows of the view; of the surfel
   if (threadIdx.x == 0) seen_count = 0;
   __syncthreads();
@@ -96,7 +98,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
     }
   }
 
-  // Tiles: a large surfel's rows are shared out among the warp.
+  // Tiles: the rows of tiles of the large surfels are shared out among the block.
   int32_t count = 0;
   const int tile_rows = seen ? area.bottom - area.top + 1 : 0;
   const bool shared = tile_rows > kRowsAlone && !area.reach.whole;
@@ -106,19 +108,19 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
       const TileRow r = tile_row(area, ty, v.width);
       count += r.right - r.left + 1;
     }
-  __syncwarp();  // the rows are seen by the whole warp
-  for (unsigned rest = __ballot_sync(kFullMask, shared); rest; rest &= rest - 1) {
-    const int source = __ffs(int(rest)) - 1;
-    const Footprint big =
-        footprint<Kernel>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
-    int32_t sum = 0;
-    for (int ty = big.top + lane; ty <= big.bottom; ty += kWarp) {
-      const TileRow r = tile_row(big, ty, v.width);
-      sum += r.right - r.left + 1;
-    }
-    for (int by = kWarp / 2; by; by /= 2) sum += __shfl_xor_sync(kFullMask, sum, by);
-    if (lane == source) count = sum;
+  if (shared) footprint_in(large[threadIdx.x]) = area;
+  counted[threadIdx.x] = 0;
+  int rows_of_large = 0;
+  first_row[threadIdx.x] = block_sum_before(shared ? tile_rows : 0, sums, rows_of_large);
+  __syncthreads();
+  for (int k = threadIdx.x; k < rows_of_large; k += kThreads) {
+    const int owner = last_at_most(first_row, kThreads, k);
+    const Footprint& of = footprint_in(large[owner]);
+    const TileRow r = tile_row(of, of.top + (k - first_row[owner]), v.width);
+    atomicAdd(&counted[owner], r.right - r.left + 1);
   }
+  __syncthreads();
+  if (shared) count = counted[threadIdx.x];
   seen = seen && count > 0;
   if (i < f.n) {
     f.memory.depth[at] = seen ? sort_key(z) : kNeverSeen;

@@ -136,4 +136,44 @@ BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   return mask;
 }
 
+// Sums of the values of the threads before mine, of the warp or of a block of kBlock threads.
+constexpr int kBlock = 128, kBlockWarps = kBlock / kWarp;
+__device__ inline int warp_sum_before(int value, int lane) {
+  int sum = value;
+  for (int by = 1; by < kWarp; by *= 2) {
+    const int left = __shfl_up_sync(kFullMask, sum, by);
+    if (lane >= by) sum += left;
+  }
+  return sum - value;
+}
+// `sums`: kBlockWarps numbers in shared memory. All threads of the block take part.
+__device__ inline int block_sum_before(int value, int* sums, int& total) {
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  int before = warp_sum_before(value, lane);
+  if (lane == kWarp - 1) sums[warp] = before + value;
+  __syncthreads();
+  total = 0;
+  for (int k = 0; k < kBlockWarps; ++k) {
+    if (k < warp) before += sums[k];
+    total += sums[k];
+  }
+  __syncthreads();
+  return before;
+}
+// The last of `count` > 0 ascending numbers, of which the first is 0, that is at most i.
+BT_HD int last_at_most(const int* numbers, int count, int i) {
+  int low = 0;
+  for (int high = count; high - low > 1;) {
+    const int middle = (low + high) / 2;
+    (numbers[middle] <= i ? low : high) = middle;
+  }
+  return low;
+}
+
+// Room for one footprint per thread in shared memory, where nothing may have a constructor.
+struct alignas(Footprint) FootprintRoom {
+  unsigned char bytes[sizeof(Footprint)];
+};
+__device__ inline Footprint& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint*>(&room); }
+
 }  // namespace bt::cuda

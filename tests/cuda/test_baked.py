@@ -129,6 +129,21 @@ def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: 
     assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
 
 
+@pytest.mark.parametrize("count", [5, 140])
+def test_large_surfels(count: int, device: torch.device, cpu) -> None:
+    """More rows of tiles per surfel, and per block, than the block has threads, between small surfels."""
+    case = random_scene(count, 20, width=90, height=360)
+    case.params["log_scales"][::2] += 3.0
+    case.params["opacity_logits"] -= 4.0  # so that few pixels end before the last surfel
+    scene, camera = scene_of(case), camera_of(case)
+    renderer = BakedRenderer(scene.to(device), camera.width, camera.height, images=("overdraw",))
+    got = renderer.draw([camera])["overdraw"].cpu()
+    assert renderer.workspace.pairs > 40 * count and renderer.workspace.differing == 0
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
+
+
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
 def test_numbers_that_misbehave(case: SceneCase, prefilter: str, device: torch.device, cpu) -> None:

@@ -26,7 +26,7 @@ constexpr int kPixels = 2;           // per thread
 struct DrawArgs {
   const float* rows;
   const float4* normals;
-  const int32_t* pairs;
+  const uint32_t* pairs;
   const int32_t* ranges;
   int width, height, tiles_x, tiles_of_view;
   float near, offset, scale, weight_bound, transmittance_min;
@@ -144,7 +144,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
   int waiting = 0;  // in the queue
   while (wanted) {
     while (waiting < kWarp && next < end) {
-      const uint32_t pair = next + lane < end ? uint32_t(__ldg(a.pairs + next + lane)) : 0;
+      const uint32_t pair = next + lane < end ? __ldg(a.pairs + next + lane) : 0u;
       const unsigned votes = __ballot_sync(kFullMask, (pair & wanted) != 0);
       if (pair & wanted) queue[waiting + __popc(votes & ((1u << lane) - 1))] = pair;
       waiting += __popc(votes);
@@ -207,7 +207,7 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
   if (!f.tiles) return;
   const DrawArgs a = {f.memory.rows,
                       f.memory.normals,
-                      f.memory.values_sorted,
+                      f.memory.pairs,
                       f.rows ? f.memory.ranges : nullptr,
                       f.width,
                       f.height,

@@ -78,9 +78,7 @@ target_compile_definitions(bitymi_cuda PRIVATE BITYMI_ARCHITECTURES="${architect
 target_compile_options(bitymi_cuda PRIVATE --expt-relaxed-constexpr -lineinfo -Xcompiler=-Wall)
 # What one kernel counts another one lists: were products and sums fused in one of them and not in the other, their bounds
 # would differ in the last bit, and now and then by a tile.
-set_source_files_properties(${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/bin.cu
-  ${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/baked_bin.cu ${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/baked_prepare.cu
-  PROPERTIES COMPILE_OPTIONS --fmad=false)
+set_source_files_properties(${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/bin.cu PROPERTIES COMPILE_OPTIONS --fmad=false)
 find_package(CUDAToolkit REQUIRED)
 nanobind_add_module(_cuda NB_STATIC NOMINSIZE ${cuda_bindings})
 target_include_directories(_cuda PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)

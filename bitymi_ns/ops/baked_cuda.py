@@ -167,16 +167,11 @@ class Workspace:
         assert self.memory is not None
         return int(self.memory[:8].view(torch.int64))
 
-    @property
-    def differing(self) -> int:
-        """By how many pairs the lists of the latest frame, which had surfels, differ from what was counted for them: 0,
-        else the kernels were compiled wrongly. Waits for the device."""
-        assert self.memory is not None
-        return int(self.memory[8:16].view(torch.int64))
-
     def settle(self) -> bool:
-        """Whether the latest frame fitted; the next `fit` makes room for as many pairs and a quarter more, not for more
-        than that, since the sort runs over the whole capacity. Waits for the device."""
+        """Whether the latest frame fitted; the next `fit` makes room for as many pairs and a quarter more.
+
+        Waits for the device.
+        """
         pairs = self.pairs
         fitted = pairs <= self.capacity
         self.capacity = pairs + pairs // 4 + 1

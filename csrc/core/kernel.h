@@ -36,6 +36,12 @@ BT_HD MaskOf<T> in_support(const Planes<T>& p) {
   return within(p, T(kSupport2));
 }
 
+// Whether the plane lies in front of the camera there, behind `near`.
+template <class S, class T>
+BT_HD MaskOf<T> in_front(const S* g, S near, T W) {
+  return (W > T(S(0))) & (T(g[kW0] * g[kZ]) > T(near) * W);
+}
+
 // Where a ray meets a surfel's plane.
 template <class T>
 struct Hit {
@@ -49,7 +55,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const Planes<T> p = planes(g, dx, dy);
   Hit<T> h;
-  h.ok = (p.W > zero) & (T(g[kW0] * g[kZ]) > T(near) * p.W);
+  h.ok = in_front(g, near, p.W);
   h.inv = one / select(h.ok, p.W, one);
   h.u = select(h.ok, p.U * h.inv, zero);
   h.v = select(h.ok, p.V * h.inv, zero);
@@ -78,6 +84,21 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
     most = select(low, blur, kernel);
   }
   f.sigma = min_(T(S(kAlphaMax)), T(g[kOpacity]) * most);
+  return f;
+}
+
+// `fragment` without the low pass, where it is known that the pixel lies within the level set and in_front.
+template <class T>
+BT_HD T inverse_(T x) {
+  return T(1.0f) / x;
+}
+template <class S, class T>
+BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
+  const T inv = inverse_(p.W);
+  const T rest = T(S(1)) - (p.U * p.U + p.V * p.V) * (inv * inv) * T(S(1.0 / kSupport2));
+  Fragment<T> f;
+  f.u = p.U * inv, f.v = p.V * inv, f.depth = T(g[kW0] * g[kZ]) * inv, f.low_pass = T(S(0));
+  f.sigma = min_(T(S(kAlphaMax)), T(g[kOpacity]) * power_(max_(rest, T(S(1e-30))), T(g[kBeta])));
   return f;
 }
 

@@ -1,17 +1,14 @@
 // The forward-only renderer of a baked scene on the device.
 //
-//   prepare   one thread per surfel: projection, level set, number of tiles; then, for the visible ones alone, the view
-//             colour and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
-//   bin       surfels are sorted by depth (32-bit keys, in place of one sort of all pairs by tile and depth, whose keys
-//             are three times as wide and ten times as many); each then writes its (tile, surfel) pairs at its place,
-//             and a stable sort by tile alone, 16-bit keys where they fit, leaves every tile's list front to back.
+//   prepare   one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
+//             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
+//   bin       pairs of surfel and tile are listed as they are found, numbered within their tile, and moved to their
+//             tile's list; each tile then sorts its own list front to back (ties by the surfel's number).
 //   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the
-//   8 x 4
-//             parts of the tile that its surfel reaches, so a warp looks at those alone.
+//             8 x 4 parts of the tile that its surfel reaches, so a warp looks at those alone.
 //
-// Nothing is allocated and nothing waits: counts stay on the device, and the second sort runs over the whole capacity,
-// whose unused rest has the largest key. When the pairs do not fit, `total` says how many there are; the image then
-// lacks surfels and the frame is to be drawn again with more capacity.
+// Nothing is allocated and nothing waits: counts stay on the device. When the pairs do not fit, `total` says how many
+// there are; the image then lacks surfels and the frame is to be drawn again with more capacity.
 #pragma once
 
 #include <cstddef>
@@ -87,8 +84,7 @@ enum BakedStage { kPrepare = 1, kBin = 2, kDraw = 4 };
 constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair holds 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 
-// Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64); the next 8 by how many
-// pairs the lists differ from what was counted, 0 unless a compiler rounds one formula in two ways.
+// Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64).
 size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals);
 
 // A frame of all views: the stages (a sum of BakedStage); one needs what those before it left in `memory`.

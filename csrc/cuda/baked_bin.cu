@@ -1,172 +1,162 @@
 // Second stage of the baked renderer: every tile's surfels front to back, and the host's side of a frame.
 //
-// Two sorts instead of one: n keys of 32 bits (depth), then all pairs by 16 bits (tile), in two passes of 6 bytes each
-// way. One sort of the pairs by tile and depth would take six passes of 12 bytes.
+// No sort runs over all surfels or all pairs, and tiles are found once. A block lists the pairs of its surfels, at a
+// place in the list that it draws from one counter; each pair draws its number within its tile from the tile's counter.
+// Every tile then takes its range of the lists, the pairs move there, and each tile's list is sorted for itself
+// (baked_sort.cu). Where ranges lie and in which order pairs came has no influence on the image.
 #include <stdexcept>
 #include <string>
 
 #include "cuda/baked_stages.h"
-#include "cuda/primitives.h"
 #include "cuda/workspace.h"
 
 namespace bt::cuda {
 
 namespace {
-constexpr int kThreads = 128;
-constexpr int32_t kPairsAlone = 32;  // pairs that a thread writes by itself
-constexpr int kRestPerThread = 16;
+constexpr int kThreads = 128, kWarps = kThreads / kWarp;
+constexpr int64_t kLeastBlocks = 1024;  // where there are fewer a block takes fewer surfels,
+constexpr int kLeastOwned = 4;          // but as many as this
+constexpr int kMoved = 4;               // pairs that a thread moves
 
-__global__ void __launch_bounds__(kThreads) order_counts_kernel(BakedFrame f) {
-  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (r == 0) f.memory.total[1] = 0;
-  if (r < f.rows) f.memory.ordered_counts[r] = f.memory.counts[f.memory.order[r]];
-}
-
-__device__ int32_t warp_sum_before(int32_t value, int lane) {
-  int32_t sum = value;
+// Sums of the values of the threads before mine.
+__device__ int warp_sum_before(int value, int lane) {
+  int sum = value;
   for (int by = 1; by < kWarp; by *= 2) {
-    const int32_t left = __shfl_up_sync(kFullMask, sum, by);
+    const int left = __shfl_up_sync(kFullMask, sum, by);
     if (lane >= by) sum += left;
   }
   return sum - value;
 }
-
-// The counts come from another kernel, and one formula may be rounded in two ways (cmake/cuda.cmake keeps nvcc from
-// it). Whatever was counted: nobody writes beyond the places of his surfel, none of these stays unwritten, and the
-// difference is noted.
-__device__ void note_difference(const BakedFrame& f, int64_t listed, int64_t counted) {
-  const int64_t difference = listed < counted ? counted - listed : listed - counted;
-  if (difference)
-    atomicAdd(reinterpret_cast<unsigned long long*>(f.memory.total + 1), static_cast<unsigned long long>(difference));
+// `sums`: kWarps numbers in shared memory. All threads of the block take part; it ends with a barrier.
+__device__ int block_sum_before(int value, int* sums, int& total) {
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  int before = warp_sum_before(value, lane);
+  if (lane == kWarp - 1) sums[warp] = before + value;
+  __syncthreads();
+  total = 0;
+  for (int k = 0; k < kWarps; ++k) {
+    if (k < warp) before += sums[k];
+    total += sums[k];
+  }
+  __syncthreads();
+  return before;
+}
+// The last of `count` > 0 ascending numbers, of which the first is 0, that is at most i.
+__device__ int last_at_most(const int* numbers, int count, int i) {
+  int low = 0;
+  for (int high = count; high - low > 1;) {
+    const int middle = (low + high) / 2;
+    (numbers[middle] <= i ? low : high) = middle;
+  }
+  return low;
 }
 
-// Writes the pairs of one row of tiles from `at` on, never beyond `end`; the place after the last, were there no end.
-template <class Key>
-__device__ int64_t write_pairs(const TileRow& r, uint32_t first_tile, uint32_t row, int64_t at, int64_t end, Key* keys,
-                               int32_t* values) {
-  for (int tx = r.left; tx <= r.right && at + (tx - r.left) < end; ++tx) {
-    keys[at + (tx - r.left)] = Key(first_tile + tx);
-    values[at + (tx - r.left)] = int32_t(row << 8 | part_mask(r, tx));
-  }
-  return at + (r.right - r.left + 1);
-}
+// Room for a footprint in shared memory, where nothing may have a constructor.
+struct alignas(Footprint) FootprintRoom {
+  unsigned char bytes[sizeof(Footprint)];
+};
+__device__ Footprint& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint*>(&room); }
 
-// The surfels in order of depth, one thread each, a warp for the large ones; the last blocks clear what is left over.
-template <class Kernel, class Key>
-__global__ void __launch_bounds__(kThreads) pairs_kernel(BakedFrame f, unsigned surfel_blocks) {
-  Key* keys = static_cast<Key*>(f.memory.keys);
-  int32_t* values = f.memory.values;
-  if (blockIdx.x >= surfel_blocks) {
-    const int64_t total = f.memory.offsets[f.rows - 1] + f.memory.ordered_counts[f.rows - 1];
-    const int64_t me = int64_t(blockIdx.x - surfel_blocks) * kThreads + threadIdx.x;
-    const int64_t stride = int64_t(gridDim.x - surfel_blocks) * kThreads;
-    if (me == 0) *f.memory.total = total;
-    for (int64_t k = total + me; k < f.capacity; k += stride) keys[k] = Key(f.tiles);
-    for (int64_t k = me; k < 2 * f.tiles; k += stride) f.memory.ranges[k] = 0;
-    return;
-  }
-  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int lane = threadIdx.x % kWarp;
-  const bool here = r < f.rows;
-  const int32_t count = here ? f.memory.ordered_counts[r] : 0;
-  const uint32_t id = here ? uint32_t(f.memory.order[r]) : 0;
-  const int64_t from = here ? f.memory.offsets[r] : 0;
-  const int tiles_of_view = f.tiles_x * f.tiles_y;
-  if (count > 0 && count <= kPairsAlone) {
-    const int64_t end = min_(from + int64_t(count), f.capacity);
-    const Footprint area = footprint<Kernel>(f.memory.rows + int64_t(id) * kRow, f.height);
-    const uint32_t base = id / uint32_t(f.n) * tiles_of_view;
-    int64_t at = from;
-    for (int ty = area.top; ty <= area.bottom; ++ty)
-      at = write_pairs(tile_row(area, ty, f.width), base + ty * f.tiles_x, id, at, end, keys, values);
-    note_difference(f, at - from, count);
-    for (; at < end; ++at) keys[at] = Key(f.tiles);
-  }
-  for (unsigned rest = __ballot_sync(kFullMask, count > kPairsAlone); rest; rest &= rest - 1) {
-    const int source = __ffs(int(rest)) - 1;
-    const uint32_t big = __shfl_sync(kFullMask, id, source);
-    const int32_t pairs = __shfl_sync(kFullMask, count, source);
-    const int64_t start = __shfl_sync(kFullMask, from, source), end = min_(start + int64_t(pairs), f.capacity);
-    const Footprint area = footprint<Kernel>(f.memory.rows + int64_t(big) * kRow, f.height);
-    const uint32_t base = big / uint32_t(f.n) * tiles_of_view;
-    int64_t at = start;
-    for (int top = area.top; top <= area.bottom; top += kWarp) {
-      const int ty = top + lane;
-      TileRow row;
-      row.left = 0, row.right = -1;
-      if (ty <= area.bottom) row = tile_row(area, ty, f.width);
-      const int32_t mine = row.right - row.left + 1, before = warp_sum_before(mine, lane);
-      write_pairs(row, base + ty * f.tiles_x, big, at + before, end, keys, values);
-      at += __shfl_sync(kFullMask, before + mine, kWarp - 1);
-    }
-    if (lane == 0) note_difference(f, at - start, pairs);
-    for (at += lane; at < end; at += kWarp) keys[at] = Key(f.tiles);
-  }
-}
-
-// Where each tile's pairs begin and end: one thread per run of keys as long as 16 bytes.
-template <class Key>
-__global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
-  constexpr int kKeys = 16 / sizeof(Key);
-  const Key* keys = static_cast<const Key*>(f.memory.keys_sorted);
-  const int64_t used = min_(*f.memory.total, f.capacity);
-  const int64_t begin = (int64_t(blockIdx.x) * kThreads + threadIdx.x) * kKeys;
-  if (begin >= used) return;
-  Key mine[kKeys];
-  memcpy(mine, __builtin_assume_aligned(keys + begin, 16), sizeof mine);
-  int64_t before = begin ? int64_t(keys[begin - 1]) : -1;
-  for (int k = 0; k < kKeys; ++k) {
-    const int64_t at = begin + k;
-    if (at >= used) break;
-    const int64_t tile = mine[k];
-    if (tile != before) {
-      if (before >= 0) f.memory.ranges[2 * before + 1] = int32_t(at);
-      if (tile < f.tiles) f.memory.ranges[2 * tile] = int32_t(at);
-    }
-    if (at == used - 1 && tile < f.tiles) f.memory.ranges[2 * tile + 1] = int32_t(at + 1);
-    before = tile;
-  }
-}
-
-template <class Key>
-void bin(const BakedFrame& f, Stream stream) {
+// Threads take a surfel each, then a row of tiles each, then a pair each, so that all are busy and neighbours write to
+// neighbouring places however many rows a surfel has and however wide they are. A block takes `owned` surfels.
+template <class Kernel>
+__global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int owned) {
+  __shared__ FootprintRoom area[kThreads];
+  __shared__ int first_row[kThreads];  // rows of tiles before a surfel's
+  __shared__ TileRow row[kThreads];
+  __shared__ uint32_t row_id[kThreads], row_tile[kThreads];  // a row's surfel and the tile at its left end
+  __shared__ int first_pair[kThreads];                       // pairs before a row's
+  __shared__ int sums[kWarps];
+  __shared__ int64_t place;
   const BakedMemory& m = f.memory;
-  sort_pairs(m.depth, m.depth_sorted, m.unsorted, m.order, f.rows, 32, m.scratch, m.scratch_bytes, stream);
-  const unsigned blocks = unsigned(ceil_div(f.rows, kThreads));
-  BT_LAUNCH(order_counts_kernel, dim3(blocks), dim3(kThreads), 0, stream, f);
-  exclusive_sum(m.ordered_counts, m.offsets, f.rows, m.scratch, m.scratch_bytes, stream);
-  const unsigned rest = unsigned(min_<int64_t>(1024, ceil_div(f.capacity + 2 * f.tiles, kThreads * kRestPerThread)));
-  with_kernel(f.through_pixel, [&](auto kernel) {
-    BT_LAUNCH((pairs_kernel<decltype(kernel), Key>), dim3(blocks + rest), dim3(kThreads), 0, stream, f, blocks);
-  });
-  sort_pairs(static_cast<const Key*>(m.keys), static_cast<Key*>(m.keys_sorted), m.values, m.values_sorted, f.capacity,
-             f.key_bits, m.scratch, m.scratch_bytes, stream);
-  const unsigned runs = unsigned(ceil_div(f.capacity, kThreads * int64_t(16 / sizeof(Key))));
-  BT_LAUNCH(ranges_kernel<Key>, dim3(runs), dim3(kThreads), 0, stream, f);
+  const int me = threadIdx.x;
+  const int64_t first = int64_t(blockIdx.x) * owned, r = first + me;
+  int mine = 0, rows = 0;
+  if (me < owned && r < f.rows && m.depth[r] != kNeverSeen) {
+    const Footprint of = footprint<Kernel>(m.rows + r * kRow, f.height);
+    footprint_in(area[me]) = of;
+    mine = of.bottom - of.top + 1;
+  }
+  first_row[me] = block_sum_before(mine, sums, rows);
+  __syncthreads();
+  for (int next = 0; next < rows; next += kThreads) {
+    const int taken = min_(rows - next, kThreads);
+    int pairs = 0, width = 0;
+    if (me < taken) {
+      const int surfel = last_at_most(first_row, owned, next + me);
+      const Footprint& of = footprint_in(area[surfel]);
+      const int ty = of.top + (next + me - first_row[surfel]);
+      const TileRow mine = tile_row(of, ty, f.width);
+      width = mine.right - mine.left + 1;
+      row[me] = mine;
+      row_id[me] = uint32_t(first + surfel);
+      row_tile[me] =
+          row_id[me] / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x + mine.left);
+    }
+    first_pair[me] = block_sum_before(width, sums, pairs);
+    if (me == 0 && pairs > 0)
+      place =
+          int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(m.total), static_cast<unsigned long long>(pairs)));
+    __syncthreads();
+    for (int k = me; k < pairs; k += kThreads) {
+      const int64_t at = place + k;
+      if (at >= f.capacity) break;
+      const int of = last_at_most(first_pair, taken, k), right = k - first_pair[of];
+      const uint32_t tile = row_tile[of] + uint32_t(right);
+      const int32_t number = atomicAdd(m.ranges + 2 * int64_t(tile) + 1, 1);
+      m.listed_tile[at] = tile;
+      m.listed_pair[at] = row_id[of] << 8 | part_mask(row[of], row[of].left + right);
+      m.listed_number[at] = number;
+    }
+    __syncthreads();
+  }
+}
+
+// From the number of a tile's pairs to where they begin and end.
+__global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
+  const int64_t tile = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int lane = threadIdx.x % kWarp;
+  int32_t* range = f.memory.ranges + 2 * tile;
+  const int count = tile < f.tiles ? range[1] : 0;
+  const int before = warp_sum_before(count, lane);
+  int32_t begin = 0;
+  if (lane == kWarp - 1) begin = atomicAdd(f.memory.given, before + count);
+  begin = __shfl_sync(kFullMask, begin, kWarp - 1) + before;
+  if (tile < f.tiles) range[0] = begin, range[1] = begin + count;
+}
+
+__global__ void __launch_bounds__(kThreads) places_kernel(BakedFrame f) {
+  const BakedMemory& m = f.memory;
+  const int64_t listed = min_(*m.total, f.capacity);
+  const int64_t from = int64_t(blockIdx.x) * (kThreads * kMoved) + threadIdx.x;
+  uint32_t pair[kMoved];
+  int64_t to[kMoved];
+  BT_UNROLL
+  for (int k = 0; k < kMoved; ++k) {
+    const int64_t at = from + k * kThreads;
+    if (at >= listed) continue;
+    pair[k] = m.listed_pair[at];
+    to[k] = int64_t(m.ranges[2 * int64_t(m.listed_tile[at])]) + m.listed_number[at];
+  }
+  BT_UNROLL
+  for (int k = 0; k < kMoved; ++k)
+    if (from + k * kThreads < listed) m.pairs[to[k]] = pair[k];
 }
 
 // Cuts the working memory into its arrays; the bytes needed. With a null base only the bytes count.
 int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   Arena arena(base);
   BakedMemory& m = f.memory;
-  m.total = arena.take<int64_t>(2);
+  m.total = arena.take<int64_t>(2), m.given = reinterpret_cast<int32_t*>(m.total + 1);
   m.ranges = arena.take<int32_t>(2 * f.tiles);
+  m.cleared = arena.used();
   m.rows = arena.take<float>(f.rows * kRow);
   m.normals = normals ? arena.take<float4>(f.rows) : nullptr;
-  m.depth = arena.take<uint32_t>(f.rows), m.depth_sorted = arena.take<uint32_t>(f.rows);
-  m.unsorted = arena.take<int32_t>(f.rows), m.order = arena.take<int32_t>(f.rows);
-  m.counts = arena.take<int32_t>(f.rows), m.ordered_counts = arena.take<int32_t>(f.rows);
-  m.offsets = arena.take<int64_t>(f.rows);
-  const int64_t key_bytes = f.capacity * (f.wide ? 4 : 2);
-  m.keys = arena.take<char>(key_bytes), m.keys_sorted = arena.take<char>(key_bytes);
-  m.values = arena.take<int32_t>(f.capacity), m.values_sorted = arena.take<int32_t>(f.capacity);
-  m.scratch_bytes = 1;
-  if (f.rows) {
-    const int64_t pairs =
-        f.wide ? sort_workspace<uint32_t>(f.capacity, f.key_bits) : sort_workspace<uint16_t>(f.capacity, f.key_bits);
-    m.scratch_bytes = max_(max_(sort_workspace<uint32_t>(f.rows, 32), scan_workspace(f.rows)), pairs);
-  }
-  m.scratch = arena.take<char>(m.scratch_bytes);
+  m.depth = arena.take<uint32_t>(f.rows);
+  m.pairs = arena.take<uint32_t>(f.capacity);
+  m.keys = arena.take<uint64_t>(f.capacity), m.merged = arena.take<uint64_t>(f.capacity);
+  m.listed_tile = reinterpret_cast<uint32_t*>(m.keys), m.listed_pair = reinterpret_cast<uint32_t*>(m.merged);
+  m.listed_number = reinterpret_cast<int32_t*>(m.listed_tile + f.capacity);
   return arena.used();
 }
 
@@ -177,8 +167,6 @@ BakedFrame frame_of(int64_t surfels, const BakedViews& v, int64_t capacity) {
   f.tiles_x = tiles_across(v.width), f.tiles_y = tiles_across(v.height);
   f.tiles = int64_t(f.tiles_x) * f.tiles_y * v.count;
   f.capacity = ceil_div(max_<int64_t>(capacity, 1), 8) * 8;
-  while (f.tiles >> f.key_bits) ++f.key_bits;
-  f.wide = f.key_bits > 16;
   if (f.rows > kMostRows)
     throw std::invalid_argument("surfels times views is " + std::to_string(f.rows) + ", at most " +
                                 std::to_string(kMostRows) + " are drawn in one call: draw fewer views at once");
@@ -190,7 +178,19 @@ BakedFrame frame_of(int64_t surfels, const BakedViews& v, int64_t capacity) {
 }
 }  // namespace
 
-void baked_bin(const BakedFrame& f, Stream stream) { f.wide ? bin<uint32_t>(f, stream) : bin<uint16_t>(f, stream); }
+void baked_bin(const BakedFrame& f, Stream stream) {
+  fill_zero(reinterpret_cast<char*>(f.memory.total), f.memory.cleared, stream);
+  int owned = kThreads;
+  while (owned > kLeastOwned && ceil_div(f.rows, owned) < kLeastBlocks) owned /= 2;
+  const dim3 blocks(unsigned(ceil_div(f.rows, owned)));
+  with_kernel(f.through_pixel, [&](auto kernel) {
+    BT_LAUNCH(pairs_kernel<decltype(kernel)>, blocks, dim3(kThreads), 0, stream, f, owned);
+  });
+  BT_LAUNCH(ranges_kernel, dim3(unsigned(ceil_div(f.tiles, kThreads))), dim3(kThreads), 0, stream, f);
+  const unsigned moves = unsigned(ceil_div(f.capacity, kThreads * kMoved));
+  BT_LAUNCH(places_kernel, dim3(moves), dim3(kThreads), 0, stream, f);
+  baked_sort(f, stream);
+}
 
 size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals) {
   BakedFrame f = frame_of(surfels, views, capacity);

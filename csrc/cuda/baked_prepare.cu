@@ -1,6 +1,6 @@
 // First stage of the baked renderer: the surfels that a view sees, each as the row that the later stages read.
 //
-// One thread per surfel, 44 bytes in and 104 out where it is visible. View colours (196 bytes of parameters per surfel
+// One thread per surfel, 44 bytes in and 100 out where it is visible. View colours (196 bytes of parameters per surfel
 // with seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next
 // to each other: a block packs them.
 #include "core/shading.h"
@@ -12,7 +12,6 @@ namespace bt::cuda {
 
 namespace {
 constexpr int kThreads = 128;
-constexpr int kRowsAlone = 8;  // rows of tiles that a thread counts by itself
 
 // The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
@@ -57,15 +56,13 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
   __shared__ int seen_count;
   __shared__ int seen_list[kThreads];
   const int64_t block = int64_t(blockIdx.x) * kThreads, i = block + threadIdx.x;
-  const int view = blockIdx.y, lane = threadIdx.x % kWarp;
+  const int view = blockIdx.y;
   const int64_t first = f.n * view, at = first + i;  // rows of the view; of the surfel
   if (threadIdx.x == 0) seen_count = 0;
   __syncthreads();
 
   float row[kGeom];
   bool seen = false;
-  Footprint area;
-  area.top = 0, area.bottom = -1, area.reach.whole = false;
   float z = 0;
   if (i < f.n) {
     const Surfels<float>& in = s.geometry;
@@ -80,7 +77,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
         level = level_set(geom);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
-      area = footprint<Kernel>(row, v.height);
+      const Footprint area = footprint<Kernel>(row, v.height);
       const Reach<float>& e = area.reach;
       const Interval<float> x = columns_of(e);
       const float pad = e.ellipse ? area.pad : 0;
@@ -95,36 +92,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
       if (f.memory.normals) f.memory.normals[at] = make_float4(geom[kNx], geom[kNy], geom[kNz], 0);
     }
   }
-
-  // Tiles: a large surfel's rows are shared out among the warp.
-  int32_t count = 0;
-  const int tile_rows = seen ? area.bottom - area.top + 1 : 0;
-  const bool shared = tile_rows > kRowsAlone && !area.reach.whole;
-  if (seen && area.reach.whole) count = f.tiles_x * f.tiles_y;
-  if (seen && !shared && !area.reach.whole)
-    for (int ty = area.top; ty <= area.bottom; ++ty) {
-      const TileRow r = tile_row(area, ty, v.width);
-      count += r.right - r.left + 1;
-    }
-  __syncwarp();  // the rows are seen by the whole warp
-  for (unsigned rest = __ballot_sync(kFullMask, shared); rest; rest &= rest - 1) {
-    const int source = __ffs(int(rest)) - 1;
-    const Footprint big =
-        footprint<Kernel>(f.memory.rows + (first + block + (threadIdx.x - lane) + source) * kRow, v.height);
-    int32_t sum = 0;
-    for (int ty = big.top + lane; ty <= big.bottom; ty += kWarp) {
-      const TileRow r = tile_row(big, ty, v.width);
-      sum += r.right - r.left + 1;
-    }
-    for (int by = kWarp / 2; by; by /= 2) sum += __shfl_xor_sync(kFullMask, sum, by);
-    if (lane == source) count = sum;
-  }
-  seen = seen && count > 0;
-  if (i < f.n) {
-    f.memory.depth[at] = seen ? sort_key(z) : kNeverSeen;
-    f.memory.unsorted[at] = int32_t(at);
-    f.memory.counts[at] = count;
-  }
+  if (i < f.n) f.memory.depth[at] = seen ? sort_key(z) : kNeverSeen;
 
   if (seen) seen_list[atomicAdd(&seen_count, 1)] = threadIdx.x;
   __syncthreads();

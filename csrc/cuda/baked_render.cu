@@ -26,7 +26,7 @@ constexpr int kPixels = 2;           // per thread
 struct DrawArgs {
   const float* rows;
   const float4* normals;
-  const int32_t* pairs;
+  const uint32_t* pairs;
   const int32_t* ranges;
   int width, height, tiles_x, tiles_of_view;
   float near, offset, scale, weight_bound, transmittance_min;
@@ -47,49 +47,79 @@ struct Row {
   uint32_t id;
 };
 
-// A row under a thread's pixel. With LowPassKernel, kBlur says whether the low pass shows; PixelKernel is for the rows
-// that it filters alone.
-template <bool kMaps, class Kernel, bool kBlur>
-__device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel& p) {
-  bool reached = p.transmittance > 0;
-  if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
-    const Planes<float> at = planes(s.g, dx, dy);
-    bool inside = within(at, s.r2) && at.W > 0;
+// A pixel's fragment of a row and its weight; whether the pixel blends it. With LowPassKernel, kBlur says whether
+// the low pass shows; PixelKernel is for the rows that it filters alone.
+template <class Kernel, bool kBlur>
+__device__ __forceinline__ bool cover(const DrawArgs& a, const Row& s, float dx, float dy, float& transmittance,
+                                      Fragment<Fast>& f, float& weight) {
+  if (Kernel::kPixel) {
+    if (!(transmittance > 0)) return false;
+    f = fragment<Kernel, true>(s.g, a.near, Fast(dx), Fast(dy));
+  } else {  // the planes alone say for most pixels that the surfel is not there
+    const Planes<Fast> at = planes(s.g, Fast(dx), Fast(dy));
+    bool inside = within(at, Fast(s.r2)) & in_front(s.g, a.near, at.W);
     if (kBlur) inside = inside || dx * dx + dy * dy < s.blur2;
-    reached = reached && inside;
+    if (!inside || !(transmittance > 0)) return false;
+    if (kBlur)
+      f = fragment<Kernel, true>(s.g, a.near, Fast(dx), Fast(dy));
+    else
+      f = fragment_within(s.g, at);
   }
-  if (!reached) return;
-  const Fragment<Fast> f = fragment<Kernel, kBlur>(s.g, a.near, Fast(dx), Fast(dy));
   const float sigma = f.sigma.v;
-  const auto [weight, behind] = bt::blend(sigma, p.transmittance);
-  const Verdict<float> v = judge(true, sigma, behind, a.transmittance_min);
-  if (v.ends) p.transmittance = -p.transmittance;
-  if (!v.takes) return;
-  p.transmittance = behind;
+  const Blend<float> b = bt::blend(sigma, transmittance);
+  const Verdict<float> v = judge(true, sigma, b.behind, a.transmittance_min);
+  if (v.ends) transmittance = -transmittance;
+  if (v.takes) transmittance = b.behind, weight = b.weight;
+  return v.takes;
+}
+
+// Adds a row's fragments to the thread's pixels. The texels of all are on their way before one is used.
+template <bool kMaps>
+__device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
+                                    const float (&weight)[kPixels], const Fragment<Fast> (&f)[kPixels],
+                                    Pixel (&p)[kPixels]) {
   const float4 c = s.rest[0];
-  float red = s.red, green = s.green, blue = c.x;
-  if (weight >= a.weight_bound && c.y != 0) {
+  Vec3<Fast> color[kPixels];
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) color[j] = {Fast(s.red), Fast(s.green), Fast(c.x)};
+  bool textured[kPixels], any = false;
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) any |= textured[j] = weight[j] >= a.weight_bound;
+  if (any && c.y != 0) {
     const float4 t = s.rest[1];
     if (c.y > 0) {
-      const float x = t.x + texel_position_scaled(f.u.v, t.z, c.y), y = t.y + texel_position_scaled(f.v.v, t.w, c.y);
       uint64_t page;
       const float handle[2] = {c.z, c.w};
       memcpy(&page, handle, sizeof page);
-      const float4 texel = fetch_texel(page, x, y);
-      red = shaded(red + a.offset, a.scale * texel.x);
-      green = shaded(green + a.offset, a.scale * texel.y);
-      blue = shaded(blue + a.offset, a.scale * texel.z);
+      float4 texel[kPixels];
+      BT_UNROLL
+      for (int j = 0; j < kPixels; ++j)
+        if (textured[j])
+          texel[j] = fetch_texel(page, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
+                                 t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
+      BT_UNROLL
+      for (int j = 0; j < kPixels; ++j)
+        if (textured[j])
+          color[j] = {shaded(color[j].x + Fast(a.offset), Fast(a.scale * texel[j].x)),
+                      shaded(color[j].y + Fast(a.offset), Fast(a.scale * texel[j].y)),
+                      shaded(color[j].z + Fast(a.offset), Fast(a.scale * texel[j].z))};
     } else {
-      red = t.x, green = t.y, blue = t.z;
+      BT_UNROLL
+      for (int j = 0; j < kPixels; ++j)
+        if (textured[j]) color[j] = {Fast(t.x), Fast(t.y), Fast(t.z)};
     }
   }
-  p.red += weight * red, p.green += weight * green, p.blue += weight * blue;
-  if (kMaps) {
-    p.beta += weight * s.g[kBeta];
-    const float4 n = a.normals ? a.normals[s.id] : make_float4(0, 0, 0, 0);
-    p.depth += weight * f.depth.v;
-    p.nx += weight * n.x, p.ny += weight * n.y, p.nz += weight * n.z;
-    ++p.count;
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) {
+    const float w = weight[j];
+    p[j].red += w * color[j].x.v, p[j].green += w * color[j].y.v, p[j].blue += w * color[j].z.v;
+    if (kMaps && taken[j]) {
+      p[j].beta += w * s.g[kBeta];
+      const float4 n = a.normals ? a.normals[s.id] : make_float4(0, 0, 0, 0);
+      p[j].depth += w * f[j].depth.v;
+      p[j].nx += w * n.x, p[j].ny += w * n.y, p[j].nz += w * n.z;
+      ++p[j].count;
+    }
   }
 }
 
@@ -128,6 +158,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
   const int in_view = int(tile % unsigned(a.tiles_of_view));
   const int x = in_view % a.tiles_x * kTile + (warp & 1) * 8 + (lane & 7);
   const int y = in_view / a.tiles_x * kTile + (warp >> 1) * 8 + (lane >> 3);
+  const float px = pixel_centre<float>(x), py = pixel_centre<float>(y);
   float4* stage = staged[warp];
   uint32_t* queue = queues[warp];
   Pixel p[kPixels];
@@ -144,61 +175,77 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
   int waiting = 0;  // in the queue
   while (wanted) {
     while (waiting < kWarp && next < end) {
-      const uint32_t pair = next + lane < end ? uint32_t(__ldg(a.pairs + next + lane)) : 0;
+      const uint32_t pair = next + lane < end ? __ldg(a.pairs + next + lane) : 0u;
       const unsigned votes = __ballot_sync(kFullMask, (pair & wanted) != 0);
       if (pair & wanted) queue[waiting + __popc(votes & ((1u << lane) - 1))] = pair;
       waiting += __popc(votes);
       next += kWarp;
     }
     __syncwarp();
-    const int taken = min_(waiting, kWarp);
-    if (taken == 0) break;
+    const int in_hand = min_(waiting, kWarp);
+    if (in_hand == 0) break;
     // three loads in flight: six at once would not fit the registers
     BT_UNROLL_BY(3)
     for (int k = 0; k < kRowQuads; ++k) {
       const int quad = k * kWarp + lane, r = quad / kRowQuads;
-      if (r < taken)
+      if (r < in_hand)
         stage[quad] =
             __ldg(reinterpret_cast<const float4*>(a.rows) + int64_t(queue[r] >> 8) * kRowQuads + quad % kRowQuads);
     }
     __syncwarp();
+    const uint32_t mine = lane < in_hand ? queue[lane] : 0;
+    unsigned reached[kPixels];  // rows by the pixels of the warp, the next one in the lowest bit
+    for (int j = 0; j < kPixels; ++j) reached[j] = __ballot_sync(kFullMask, (mine & part[j]) != 0);
     const float4* q = stage;
-    for (int k = 0; k < taken; ++k, q += kRowQuads) {
-      if (k % kLook == kLook - 1 && !__any_sync(kFullMask, p[0].transmittance > 0 || p[1].transmittance > 0)) break;
-      const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
-      const uint32_t pair = queue[k];
-      const float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
-      const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
-                     q3.x,
-                     q3.y,
-                     q3.z,
-                     q3.w,
-                     q + 4,
-                     pair >> 8};
-      const float dx = pixel_centre<float>(x) - s.g[kCx], dy = pixel_centre<float>(y) - s.g[kCy];
-      BT_UNROLL
+    for (int look = 0; look < in_hand; look += kLook) {
+      bool open = false;
       for (int j = 0; j < kPixels; ++j) {
-        if (!(pair & part[j])) continue;
-        const float below = dy + kBandRows * j;
-        if (filtered<Kernel>(s.g))
-          blend<kMaps, Kernel, true>(a, s, dx, below, p[j]);
-        else if (s.blur2 > 0)
-          blend<kMaps, LowPassKernel, true>(a, s, dx, below, p[j]);
-        else
-          blend<kMaps, LowPassKernel, false>(a, s, dx, below, p[j]);
+        if (!__any_sync(kFullMask, p[j].transmittance > 0)) reached[j] = 0;
+        open |= reached[j] != 0;
+      }
+      if (!open) break;
+      for (int k = look; k < min_(look + kLook, in_hand); ++k, q += kRowQuads) {
+        const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
+        const float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
+        const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
+                       q3.x,
+                       q3.y,
+                       q3.z,
+                       q3.w,
+                       q + 4,
+                       kMaps ? queue[k] >> 8 : 0};
+        const float dx = px - s.g[kCx], dy = py - s.g[kCy];
+        bool taken[kPixels], any = false;
+        float weight[kPixels];
+        Fragment<Fast> f[kPixels] = {};
+        BT_UNROLL
+        for (int j = 0; j < kPixels; ++j) {
+          const float below = j ? dy + kBandRows * j : dy;
+          taken[j] = false, weight[j] = 0;
+          if (!(reached[j] & 1)) continue;
+          if (filtered<Kernel>(s.g))
+            taken[j] = cover<Kernel, true>(a, s, dx, below, p[j].transmittance, f[j], weight[j]);
+          else if (s.blur2 > 0)
+            taken[j] = cover<LowPassKernel, true>(a, s, dx, below, p[j].transmittance, f[j], weight[j]);
+          else
+            taken[j] = cover<LowPassKernel, false>(a, s, dx, below, p[j].transmittance, f[j], weight[j]);
+        }
+        for (int j = 0; j < kPixels; ++j) reached[j] >>= 1;
+        for (int j = 0; j < kPixels; ++j) any |= taken[j];
+        if (any) add<kMaps>(a, s, taken, weight, f, p);
       }
     }
     wanted = 0;
     for (int j = 0; j < kPixels; ++j) wanted |= __any_sync(kFullMask, p[j].transmittance > 0) ? part[j] : 0;
-    waiting -= taken;
+    waiting -= in_hand;
     const uint32_t moved = lane < waiting ? queue[kWarp + lane] : 0;
     __syncwarp();
     if (lane < waiting) queue[lane] = moved;
   }
   const int64_t view = tile / unsigned(a.tiles_of_view);
   for (int j = 0; j < kPixels; ++j) {
-    const int row = y + kBandRows * j;
-    if (x < a.width && row < a.height) write<kMaps>(a, p[j], (view * a.height + row) * a.width + x);
+    const int column = int(px), row = int(py) + kBandRows * j;  // not x and y, which would be kept for this alone
+    if (column < a.width && row < a.height) write<kMaps>(a, p[j], (view * a.height + row) * a.width + column);
   }
 }
 }  // namespace
@@ -207,7 +254,7 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
   if (!f.tiles) return;
   const DrawArgs a = {f.memory.rows,
                       f.memory.normals,
-                      f.memory.values_sorted,
+                      f.memory.pairs,
                       f.rows ? f.memory.ranges : nullptr,
                       f.width,
                       f.height,
@@ -216,7 +263,7 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
                       s.near,
                       s.offset,
                       s.scale,
-                      s.weight_bound,
+                      max_(s.weight_bound, 1e-30f),  // above the weight of a pixel without a fragment
                       s.transmittance_min,
                       images};
   const dim3 grid(static_cast<unsigned>(f.tiles));

@@ -23,31 +23,31 @@ enum RowColumn {
 static_assert(kRow == 24 && kR2 == 12);
 
 struct BakedMemory {
-  int64_t* total;                                       // [2] pairs of surfel and tile; by how many the lists differ
-  float* rows;                                          // [rows, kRow]
-  float4* normals;                                      // [rows], null: not wanted
-  uint32_t *depth, *depth_sorted;                       // [rows]
-  int32_t *unsorted, *order, *counts, *ordered_counts;  // [rows] row numbers, the same by depth; tiles of a row
-  int64_t* offsets;                                     // [rows]
-  void *keys, *keys_sorted;                             // [capacity] tile of a pair, uint16 or uint32
-  int32_t *values, *values_sorted;                      // [capacity] row << 8 | mask
-  int32_t* ranges;                                      // [tiles, 2]
-  void* scratch;                                        // of the sorts and the sum
-  int64_t scratch_bytes;
+  int64_t* total;           // pairs of surfel and tile
+  int32_t* given;           // places of lists that tiles have taken
+  int32_t* ranges;          // [tiles, 2] where a tile's list begins and ends; before that a 0 and its pairs
+  int64_t cleared;          // bytes from `total` on that a frame begins with as zeros: the three above
+  float* rows;              // [rows, kRow]
+  float4* normals;          // [rows], null: not wanted
+  uint32_t* depth;          // [rows] keys in the order of depth
+  uint32_t* pairs;          // [capacity] row << 8 | mask, tile by tile
+  uint64_t *keys, *merged;  // [capacity] of lists that are too long for shared memory
+  // [capacity] pairs as they come, in the memory of these: tile, row << 8 | mask, and which of the tile's pairs it is
+  uint32_t *listed_tile, *listed_pair;
+  int32_t* listed_number;
 };
 
 struct BakedFrame {
   int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs
   int width, height, tiles_x, tiles_y;
   int64_t tiles;       // of all views
-  int key_bits;        // tile numbers and the key of unused room
-  bool wide;           // keys of 32 bits
   bool through_pixel;  // as in BakedScene
   BakedMemory memory;
 };
 
 void baked_prepare(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
 void baked_bin(const BakedFrame& frame, Stream stream);
+void baked_sort(const BakedFrame& frame, Stream stream);  // the end of baked_bin
 void baked_draw(const BakedScene& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
 
 // The pixels that a surfel can touch, by tile.

@@ -97,6 +97,35 @@ def check(
     return float((got.rgb.cpu() - want.rgb).abs().max())
 
 
+def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, views: int) -> list[Tensor]:
+    """The surfels that each tile lists after a frame, numbered through all views.
+
+    They must be front to back, those of one depth by their number, each once; the lists must not overlap and hold all
+    pairs that fit.
+    """
+    memory, at = renderer.workspace.memory.cpu(), 256
+    tiles, rows, capacity = -(-width // 16) * -(-height // 16) * views, surfels * views, renderer.workspace.capacity
+
+    def take(count: int) -> Tensor:
+        nonlocal at
+        values = memory[at : at + 4 * count].view(torch.int32)
+        at += -(-4 * count // 256) * 256
+        return values
+
+    ranges = take(2 * tiles).view(tiles, 2)
+    take(24 * rows)
+    depth, pairs = take(rows).long() & 0xFFFFFFFF, take(-(-capacity // 8) * 8).long() & 0xFFFFFFFF
+    order = ranges[ranges[:, 0].argsort(stable=True)]
+    order = order[order[:, 0] < order[:, 1]]
+    assert order[0, 0] == 0 and torch.equal(order[1:, 0], order[:-1, 1])
+    assert order[-1, 1] == min(renderer.workspace.pairs, len(pairs))
+    lists = [pairs[begin:end] >> 8 for begin, end in ranges.tolist()]
+    for rows_of_tile in lists:
+        keys = depth[rows_of_tile] * 2**24 + rows_of_tile
+        assert (keys.diff() > 0).all()
+    return lists
+
+
 def test_golden_textured_scene(device: torch.device, cpu) -> None:
     golden = load_golden("textured")
     params = {name: value.float() for name, value in golden.params.items()}
@@ -127,6 +156,21 @@ def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: 
     with cpu():
         want = scene.render(camera, maps=True).overdraw
     assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
+
+
+@pytest.mark.parametrize("count", [5, 140])
+def test_large_surfels(count: int, device: torch.device, cpu) -> None:
+    """More rows of tiles per surfel, and per block, than the block has threads, between small surfels."""
+    case = random_scene(count, 20, width=90, height=360)
+    case.params["log_scales"][::2] += 3.0
+    case.params["opacity_logits"] -= 4.0  # so that few pixels end before the last surfel
+    scene, camera = scene_of(case), camera_of(case)
+    renderer = BakedRenderer(scene.to(device), camera.width, camera.height, images=("overdraw",))
+    got = renderer.draw([camera])["overdraw"].cpu()
+    assert renderer.workspace.pairs > 40 * count
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
 
 
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
@@ -271,6 +315,7 @@ def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu) -> 
     small = renderer.workspace.capacity
     renderer.draw([camera], check=False)
     assert not renderer.complete() and renderer.workspace.pairs > small
+    lists_of(renderer, 12, camera.width, camera.height, 1)
     rgb = renderer.draw([camera])["rgb"].clone()
     assert renderer.complete() and renderer.workspace.capacity > renderer.workspace.pairs
     again = renderer.draw([camera])["rgb"]
@@ -314,36 +359,34 @@ def test_sizes(width: int, height: int, device: torch.device, cpu) -> None:
     check(scene_of(case), camera_of(case), device, cpu)
 
 
-@pytest.mark.parametrize("fewer", ["listed", "counted"])
-def test_lists_that_differ_from_the_counts_stay_in_their_places(fewer: str, device: torch.device) -> None:
-    """Were a surfel's tiles counted for an image that is wider, or less wide, than that for which they are listed."""
-    case = random_scene(60, 4, 160, 160)
-    case.params["log_scales"][:8] += 3.0  # more tiles than a thread writes by itself
-    case.params["opacity_logits"] -= 3.0
-    scene = scene_of(case).to(device)
-    large, small = (BakedRenderer(scene, size, size, images=("rgb", "overdraw")) for size in (160, 145))
-    for renderer in (large, small):
-        renderer._fit(8_000)
-        renderer._viewmats.copy_(case.viewmat)
-        renderer._Ks.copy_(case.K)
-        renderer.run()
-        assert renderer.complete() and renderer.workspace.differing == 0
-    whole = {name: image.clone() for name, image in small.images.items()}
-    counted, listed = (large, small) if fewer == "listed" else (small, large)
-    listed.workspace = counted.workspace
-    listed.run(Stage.BIN)
-    listed.run(Stage.DRAW)
-    assert listed.workspace.differing > 0
-    assert all(image.isfinite().all() for image in listed.images.values())
-    if fewer == "listed":  # all pairs are there, and places without one are not drawn
-        assert all(torch.equal(small.images[name], image) for name, image in whole.items())
-    else:
-        missing = large.images["overdraw"][:, :145, :145].sum() - whole["overdraw"].sum()
-        assert missing < 0
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("count", [1, 31, 33, 129, 300, 600, 1024, 1025, 3000])
+def test_lists_of_all_lengths_are_in_order(count: int, views: int, device: torch.device, cpu) -> None:
+    """Up to several runs of what a block sorts at once, with ties in depth, beside tiles without a surfel."""
+    surfels = make_surfels(count, seed=30)
+    surfels["means"] *= 0.05  # in the middle
+    surfels["means"][count // 2 :, 2] = surfels["means"][0, 2]
+    surfels["log_scales"] += 1.0
+    surfels["opacity_logits"] = surfels["opacity_logits"] - 3.0
+    scene = BakedScene(surfels, "sv", torch.zeros(count, 5, dtype=torch.int32), None, transmittance_min=0.0)
+    camera = front(170, 20)
+    renderer = BakedRenderer(scene.to(device), 170, 20, views, images=("rgb", "overdraw"))
+    images = renderer.draw([camera] * views)
+    lists = lists_of(renderer, count, 170, 20, views)
+    lengths = [len(each) for each in lists]
+    assert max(lengths) > 0.9 * count and min(lengths) == 0
+    with cpu():
+        want = scene.render(camera, maps=True)
+    for view in range(views):
+        off = (images["rgb"][view].cpu() - want.rgb).abs()
+        assert off.max() < most(device, 1e-4, FLIP) and (off < 1e-4).double().mean() > 0.999
+        assert ((images["overdraw"][view].cpu() != want.overdraw).double().mean()) < 2e-3
+        per_view = len(lists) // views
+        assert [len(each) for each in lists[view * per_view : (view + 1) * per_view]] == lengths[:per_view]
 
 
-def test_many_tiles_need_wide_keys(device: torch.device) -> None:
-    """Above 65,535 tiles keys have 32 bits; the tiles that a narrower image has as well must get the same lists."""
+def test_many_tiles(device: torch.device) -> None:
+    """The tiles that a narrower image has as well must get the same lists."""
     case = random_scene(30, 9, 1_000, 20)
     scene, ranges = scene_of(case).to(device), []
     for width in (1_000, 600_000):

@@ -110,7 +110,7 @@ def orders(results: Path, data: Path) -> dict[str, list[Step]]:
     }
 
 
-BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), repr(_cuda.bc7_way()))"
+BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
 PROFILED = ("baked", "training")
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 

@@ -33,7 +33,7 @@ class Stage(IntFlag):
 def draws_blocks(device: torch.device) -> bool:
     """Whether the texture unit of a CUDA device decodes BC7 blocks, which is found out by drawing some."""
     with on_device(device):
-        return module(device).bc7_way() != ""
+        return module(device).draws_bc7()
 
 
 def decoded(blocks: Tensor) -> Tensor:

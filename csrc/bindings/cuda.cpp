@@ -98,7 +98,7 @@ void bind_baked(nb::module_& m) {
              new (to) AtlasTexture(TexelFormat(t.format), t.layers, t.height, t.width, t.texels);
            })
       .def_prop_ro("handles", &AtlasTexture::handles);
-  m.def("bc7_way", &bc7_way, "How the current device draws BC7 blocks; empty when it does not.");
+  m.def("draws_bc7", &draws_bc7, "Whether the current device draws BC7 blocks; tried once.");
   bind_class<BakedScene>(m, "BakedScene", kCard, "A baked scene as the kernels read it.");
   bind_operation(m, "baked_frame", &baked_frame);
   m.def(

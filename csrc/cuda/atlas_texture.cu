@@ -15,50 +15,32 @@ namespace bt::cuda {
 #if defined(__CUDACC__)
 
 namespace {
-// Ways to a texture of BC7 blocks. What the rows of a copy into an array of blocks are is not written down, and drivers
-// may lack one or the other: `bc7_way` tries them.
-enum class Way { kRowsOfTexels, kRowsOfBlocks, kView, kViewOfElements };
-constexpr const char* kWays[] = {"array, rows of texels", "array, rows of blocks", "view", "view of elements"};
-
-// The first array and texture of a page; `page` is set as soon as there is something to free.
-cudaTextureObject_t make_page(TexelFormat format, Way way, int height, int width, const char* texels,
-                              cudaArray_t& page) {
+// The array and the texture of a page; `page` is set as soon as there is something to free.
+cudaTextureObject_t make_page(TexelFormat format, int height, int width, const char* texels, cudaArray_t& page) {
   const bool blocks = format == TexelFormat::kBc7, half = format == TexelFormat::kHalf;
-  const bool view = blocks && (way == Way::kView || way == Way::kViewOfElements);
-  const cudaChannelFormatDesc channels = view ? cudaCreateChannelDesc<uint4>()
-                                         : blocks
+  const cudaChannelFormatDesc channels = blocks
                                              ? cudaCreateChannelDesc<cudaChannelFormatKindUnsignedBlockCompressed7>()
-                                         : half ? cudaCreateChannelDescHalf4()
-                                                : cudaCreateChannelDesc<uchar4>();
+                                             : (half ? cudaCreateChannelDescHalf4() : cudaCreateChannelDesc<uchar4>());
   // a row of blocks is four rows of texels
   const size_t row = blocks ? size_t(width) / 4 * 16 : size_t(width) * (half ? 8 : 4);
   const size_t rows = blocks ? height / 4 : height;
-  check(cudaMallocArray(&page, &channels, view ? width / 4 : width, view ? height / 4 : height),
-        "memory for a page of the atlas");
-  if (blocks && way == Way::kRowsOfTexels) {
-    cudaMemcpy3DParms copy = {};
-    copy.srcPtr = make_cudaPitchedPtr(const_cast<char*>(texels), row, width, rows);
-    copy.dstArray = page;
-    copy.extent = make_cudaExtent(width, height, 1);
-    copy.kind = cudaMemcpyHostToDevice;
-    check(cudaMemcpy3D(&copy), "copy of the atlas");
-  } else {
-    check(cudaMemcpy2DToArray(page, 0, 0, texels, row, row, rows, cudaMemcpyHostToDevice), "copy of the atlas");
-  }
+  check(cudaMallocArray(&page, &channels, width, height), "memory for a page of the atlas");
+  cudaMemcpy3DParms copy = {};
+  copy.srcPtr = make_cudaPitchedPtr(const_cast<char*>(texels), row, width, rows);
+  copy.dstArray = page;
+  copy.extent = make_cudaExtent(width, height, 1);  // of an array of blocks: in texels (measured; not written down)
+  copy.kind = cudaMemcpyHostToDevice;
+  check(cudaMemcpy3D(&copy), "copy of the atlas");
   cudaResourceDesc resource = {};
   resource.resType = cudaResourceTypeArray;
   resource.res.array.array = page;
   cudaTextureDesc sampling = {};
   sampling.addressMode[0] = sampling.addressMode[1] = cudaAddressModeClamp;
   sampling.filterMode = cudaFilterModeLinear;
-  const bool as_stored = half || (blocks && way == Way::kViewOfElements);
-  sampling.readMode = as_stored ? cudaReadModeElementType : cudaReadModeNormalizedFloat;
+  sampling.readMode = half ? cudaReadModeElementType : cudaReadModeNormalizedFloat;
   sampling.normalizedCoords = 0;
-  cudaResourceViewDesc as_blocks = {};
-  as_blocks.format = cudaResViewFormatUnsignedBlockCompressed7;
-  as_blocks.width = width, as_blocks.height = height;
   cudaTextureObject_t texture = 0;
-  check(cudaCreateTextureObject(&texture, &resource, &sampling, view ? &as_blocks : nullptr), "texture of the atlas");
+  check(cudaCreateTextureObject(&texture, &resource, &sampling, nullptr), "texture of the atlas");
   return texture;
 }
 
@@ -77,8 +59,10 @@ void probe_block(int block, unsigned char* to) {
 __global__ void probe_kernel(uint64_t texture, float4* to) {
   to[blockIdx.x * kProbeX + threadIdx.x] = fetch_texel(texture, 2.0f * threadIdx.x + 2, 2.0f * blockIdx.x + 2);
 }
-void probe(Way way) {                                                 // throws when it does not work
-  std::vector<unsigned char> blocks(4 * kProbeWidth * kProbeHeight);  // more than are read, however rows are understood
+constexpr float kStep = 1.0f / 0xff;  // of 8 bits
+void probe() {                        // throws when it does not work
+  // more than is read, should a driver take the copy's rows for rows of blocks
+  std::vector<unsigned char> blocks(4 * kProbeWidth * kProbeHeight);
   for (int i = 0; i < kProbeAcross * kProbeHeight / 4; ++i) probe_block(i, blocks.data() + 16 * i);
   struct Owned {
     cudaArray_t page = nullptr;
@@ -91,7 +75,7 @@ void probe(Way way) {                                                 // throws 
     }
   } owned;
   const char* texels = reinterpret_cast<const char*>(blocks.data());
-  owned.texture = make_page(TexelFormat::kBc7, way, kProbeHeight, kProbeWidth, texels, owned.page);
+  owned.texture = make_page(TexelFormat::kBc7, kProbeHeight, kProbeWidth, texels, owned.page);
   check(cudaMalloc(&owned.found, kProbeX * kProbeY * sizeof(float4)), "memory for a probe");
   BT_LAUNCH(probe_kernel, dim3(kProbeY), dim3(kProbeX), 0, nullptr, owned.texture, owned.found);
   float4 found[kProbeY][kProbeX];
@@ -100,41 +84,33 @@ void probe(Way way) {                                                 // throws 
     for (int i = 0; i < kProbeX; ++i) {
       const int x = 2 * i + 2, y = 2 * j + 2;  // the middle of four texels
       float red = 0;
-      for (int k = 0; k < 4; ++k) red += probe_red((y - k / 2) / 4 * kProbeAcross + (x - k % 2) / 4) / (4 * 255.0f);
+      for (int k = 0; k < 4; ++k) red += probe_red((y - k / 2) / 4 * kProbeAcross + (x - k % 2) / 4) * kStep / 4;
       const float4 c = found[j][i];
-      const float off = fmaxf(fmaxf(fabsf(c.x - red), fabsf(c.y - (1 + 1 / 255.0f - red))),
-                              fmaxf(fabsf(c.z - 1 / 255.0f), fabsf(c.w - 1)));
-      if (!(off < 1.5f / 255)) throw std::runtime_error("the texture unit decodes other colours");
+      const float off =
+          fmaxf(fmaxf(fabsf(c.x - red), fabsf(c.y - (1 + kStep - red))), fmaxf(fabsf(c.z - kStep), fabsf(c.w - 1)));
+      if (!(off < 1.5f * kStep)) throw std::runtime_error("the texture unit decodes other colours");
     }
 }
-int found_way() {  // of the current device, asked once; -1: none
-  static std::map<int, int> known;
+}  // namespace
+
+bool draws_bc7() {
+  static std::map<int, bool> known;
   int device = 0;
   check(cudaGetDevice(&device), "current device");
   const auto at = known.find(device);
   if (at != known.end()) return at->second;
-  int found = -1;
-  for (int way = 0; way < int(sizeof kWays / sizeof *kWays) && found < 0; ++way) {
-    try {
-      probe(Way(way));
-      found = way;
-    } catch (const std::runtime_error&) {
-      cudaGetLastError();  // what was found here is no error of a later call
-    }
+  try {
+    probe();
+    return known[device] = true;
+  } catch (const std::runtime_error&) {
+    cudaGetLastError();  // what was found here is no error of a later call
+    return known[device] = false;
   }
-  return known[device] = found;
-}
-}  // namespace
-
-std::string bc7_way() {
-  const int way = found_way();
-  return way < 0 ? "" : kWays[way];
 }
 
 AtlasTexture::AtlasTexture(TexelFormat format, int layers, int height, int width, const void* texels) {
   const bool blocks = format == TexelFormat::kBc7;
-  const int way = blocks ? found_way() : 0;
-  if (way < 0) throw std::runtime_error("this card draws no BC7 textures: decode the blocks first");
+  if (blocks && !draws_bc7()) throw std::runtime_error("this card draws no BC7 textures: decode the blocks first");
   const size_t bytes = size_t(height) * width * (blocks ? 1 : format == TexelFormat::kHalf ? 8 : 4);
   check(cudaGetDevice(&device_), "current device");
   try {
@@ -143,7 +119,7 @@ AtlasTexture::AtlasTexture(TexelFormat format, int layers, int height, int width
       cudaArray_t page = nullptr;
       const char* from = static_cast<const char*>(texels) + bytes * layer;
       try {
-        handles_.push_back(make_page(format, Way(way), height, width, from, page));
+        handles_.push_back(make_page(format, height, width, from, page));
       } catch (...) {
         pages_.back() = page;
         throw;
@@ -173,7 +149,7 @@ void AtlasTexture::release() {
 
 #else
 
-std::string bc7_way() { return ""; }
+bool draws_bc7() { return false; }
 
 namespace {
 struct Page {

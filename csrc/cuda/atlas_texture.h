@@ -2,7 +2,6 @@
 #pragma once
 
 #include <cstdint>
-#include <string>
 #include <vector>
 
 #include "cuda/device.h"
@@ -11,9 +10,8 @@ namespace bt::cuda {
 
 enum class TexelFormat { kBc7, kUint8, kHalf };
 
-// How the current device draws BC7 blocks, found out by drawing some; empty when it does not. The first call waits for
-// the device.
-std::string bc7_way();
+// Whether the current device draws BC7 blocks, found out by drawing some. The first call waits for the device.
+bool draws_bc7();
 
 // One texture per page: a handle is 64 bits, the same in a whole warp, and pages are as large as they like. Memory is
 // allocated here, once, and freed by the destructor. Throws std::runtime_error when the device refuses.

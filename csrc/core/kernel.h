@@ -30,16 +30,22 @@ BT_HD MaskOf<T> within(const Planes<T>& p, T r2) {
   return p.U * p.U + p.V * p.V < r2 * p.W * p.W;
 }
 
+// The same, and in front of the camera.
+template <class T>
+BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
+  return p.U * p.U + p.V * p.V < r2 * p.W * abs_(p.W);
+}
+
 // Whether the kernel is above 0 there, in front of the camera or behind it.
 template <class T>
 BT_HD MaskOf<T> in_support(const Planes<T>& p) {
   return within(p, T(kSupport2));
 }
 
-// Whether the plane lies in front of the camera there, behind `near`.
+// Whether the plane lies behind `near` there, where it is in front of the camera.
 template <class S, class T>
-BT_HD MaskOf<T> in_front(const S* g, S near, T W) {
-  return (W > T(S(0))) & (T(g[kW0] * g[kZ]) > T(near) * W);
+BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
+  return T(g[kW0] * g[kZ]) > T(near) * W;
 }
 
 // Where a ray meets a surfel's plane.
@@ -55,7 +61,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const Planes<T> p = planes(g, dx, dy);
   Hit<T> h;
-  h.ok = in_front(g, near, p.W);
+  h.ok = (p.W > zero) & behind_near(g, near, p.W);
   h.inv = one / select(h.ok, p.W, one);
   h.u = select(h.ok, p.U * h.inv, zero);
   h.v = select(h.ok, p.V * h.inv, zero);
@@ -87,7 +93,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   return f;
 }
 
-// `fragment` without the low pass, where it is known that the pixel lies within the level set and in_front.
+// `fragment` without the low pass, where it is known that the pixel lies within_in_front and behind_near.
 template <class T>
 BT_HD T inverse_(T x) {
   return T(1.0f) / x;

@@ -57,7 +57,7 @@ __device__ __forceinline__ bool cover(const DrawArgs& a, const Row& s, float dx,
     f = fragment<Kernel, true>(s.g, a.near, Fast(dx), Fast(dy));
   } else {  // the planes alone say for most pixels that the surfel is not there
     const Planes<Fast> at = planes(s.g, Fast(dx), Fast(dy));
-    bool inside = within(at, Fast(s.r2)) & in_front(s.g, a.near, at.W);
+    bool inside = within_in_front(at, Fast(s.r2)) & behind_near(s.g, a.near, at.W);
     if (kBlur) inside = inside || dx * dx + dy * dy < s.blur2;
     if (!inside || !(transmittance > 0)) return false;
     if (kBlur)
@@ -217,7 +217,7 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
         bool taken[kPixels], any = false;
         float weight[kPixels];
-        Fragment<Fast> f[kPixels] = {};
+        Fragment<Fast> f[kPixels];  // of those taken
         BT_UNROLL
         for (int j = 0; j < kPixels; ++j) {
           const float below = j ? dy + kBandRows * j : dy;

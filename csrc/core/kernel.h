@@ -48,6 +48,11 @@ BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
   return T(g[kW0] * g[kZ]) > T(near) * W;
 }
 
+template <class T>
+BT_HD T inverse_(T x) {
+  return T(1.0f) / x;
+}
+
 // Where a ray meets a surfel's plane.
 template <class T>
 struct Hit {
@@ -62,7 +67,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const Planes<T> p = planes(g, dx, dy);
   Hit<T> h;
   h.ok = (p.W > zero) & behind_near(g, near, p.W);
-  h.inv = one / select(h.ok, p.W, one);
+  h.inv = inverse_(select(h.ok, p.W, one));
   h.u = select(h.ok, p.U * h.inv, zero);
   h.v = select(h.ok, p.V * h.inv, zero);
   h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / kSupport2));
@@ -94,10 +99,6 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
 }
 
 // `fragment` without the low pass, where it is known that the pixel lies within_in_front and behind_near.
-template <class T>
-BT_HD T inverse_(T x) {
-  return T(1.0f) / x;
-}
 template <class S, class T>
 BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
   const T inv = inverse_(p.W);

@@ -30,16 +30,27 @@ BT_HD MaskOf<T> within(const Planes<T>& p, T r2) {
   return p.U * p.U + p.V * p.V < r2 * p.W * p.W;
 }
 
+// The same, and in front of the camera.
+template <class T>
+BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
+  return p.U * p.U + p.V * p.V < r2 * p.W * abs_(p.W);
+}
+
 // Whether the kernel is above 0 there, in front of the camera or behind it.
 template <class T>
 BT_HD MaskOf<T> in_support(const Planes<T>& p) {
   return within(p, T(kSupport2));
 }
 
-// Whether the plane lies in front of the camera there, behind `near`.
+// Whether the plane lies behind `near` there, where it is in front of the camera.
 template <class S, class T>
-BT_HD MaskOf<T> in_front(const S* g, S near, T W) {
-  return (W > T(S(0))) & (T(g[kW0] * g[kZ]) > T(near) * W);
+BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
+  return T(g[kW0] * g[kZ]) > T(near) * W;
+}
+
+template <class T>
+BT_HD T inverse_(T x) {
+  return T(1.0f) / x;
 }
 
 // Where a ray meets a surfel's plane.
@@ -55,8 +66,8 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const Planes<T> p = planes(g, dx, dy);
   Hit<T> h;
-  h.ok = in_front(g, near, p.W);
-  h.inv = one / select(h.ok, p.W, one);
+  h.ok = (p.W > zero) & behind_near(g, near, p.W);
+  h.inv = inverse_(select(h.ok, p.W, one));
   h.u = select(h.ok, p.U * h.inv, zero);
   h.v = select(h.ok, p.V * h.inv, zero);
   h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / kSupport2));
@@ -87,11 +98,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   return f;
 }
 
-// `fragment` without the low pass, where it is known that the pixel lies within the level set and in_front.
-template <class T>
-BT_HD T inverse_(T x) {
-  return T(1.0f) / x;
-}
+// `fragment` without the low pass, where it is known that the pixel lies within_in_front and behind_near.
 template <class S, class T>
 BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
   const T inv = inverse_(p.W);

@@ -3,11 +3,11 @@
 // A warp draws 8 x 8 pixels, two per thread (four rows apart), and works for itself: no barrier of the block, no
 // waiting for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names
 // one of its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread
-// reads the same row (a broadcast, four loads of 16 bytes) for both its pixels. The three planes cost three
-// multiply-adds for the second pixel. On scenes like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of
-// its 8 parts, and 6 of 10 pixels that are looked at blend it: the masks leave little to reject. A hit costs one
-// reciprocal, one logarithm, one exponential and, where the weight is above the bound, one texture fetch. Bound by
-// issue of arithmetic, then by the texture unit; memory traffic is 96 bytes per row and warp, mostly from L2.
+// reads the same row (a broadcast, four loads of 16 bytes) for both its pixels, which it works on together. On scenes
+// like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of its 8 parts, and 6 of 10 pixels that are
+// looked at blend it: the masks leave little to reject. A hit costs one reciprocal, one logarithm, one exponential and,
+// where the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by the texture unit;
+// memory traffic is 96 bytes per row and warp, mostly from L2.
 #include "core/kernel.h"
 #include "core/shading.h"
 #include "core/texel.h"
@@ -47,33 +47,8 @@ struct Row {
   uint32_t id;
 };
 
-// A pixel's fragment of a row and its weight; whether the pixel blends it. With LowPassKernel, kBlur says whether
-// the low pass shows; PixelKernel is for the rows that it filters alone.
-template <class Kernel, bool kBlur>
-__device__ __forceinline__ bool cover(const DrawArgs& a, const Row& s, float dx, float dy, float& transmittance,
-                                      Fragment<Fast>& f, float& weight) {
-  if (Kernel::kPixel) {
-    if (!(transmittance > 0)) return false;
-    f = fragment<Kernel, true>(s.g, a.near, Fast(dx), Fast(dy));
-  } else {  // the planes alone say for most pixels that the surfel is not there
-    const Planes<Fast> at = planes(s.g, Fast(dx), Fast(dy));
-    bool inside = within(at, Fast(s.r2)) & in_front(s.g, a.near, at.W);
-    if (kBlur) inside = inside || dx * dx + dy * dy < s.blur2;
-    if (!inside || !(transmittance > 0)) return false;
-    if (kBlur)
-      f = fragment<Kernel, true>(s.g, a.near, Fast(dx), Fast(dy));
-    else
-      f = fragment_within(s.g, at);
-  }
-  const float sigma = f.sigma.v;
-  const Blend<float> b = bt::blend(sigma, transmittance);
-  const Verdict<float> v = judge(true, sigma, b.behind, a.transmittance_min);
-  if (v.ends) transmittance = -transmittance;
-  if (v.takes) transmittance = b.behind, weight = b.weight;
-  return v.takes;
-}
-
-// Adds a row's fragments to the thread's pixels. The texels of all are on their way before one is used.
+// Adds a row's fragments to the thread's pixels, with weight 0 to those that do not take it. The texels of all are on
+// their way before one is used.
 template <bool kMaps>
 __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
                                     const float (&weight)[kPixels], const Fragment<Fast> (&f)[kPixels],
@@ -121,6 +96,47 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
       ++p[j].count;
     }
   }
+}
+
+// A row under the thread's pixels, of which the first is dx, dy from the projected centre. Both are worked on together,
+// so that one does not wait for the other's steps. With LowPassKernel, kBlur says whether the low pass shows;
+// PixelKernel is for the rows that it filters alone.
+template <bool kMaps, class Kernel, bool kBlur>
+__device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
+  Planes<Fast> at[kPixels];
+  Fast y[kPixels];
+  bool taken[kPixels], any = false;
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) {
+    y[j] = Fast(j ? dy + kBandRows * j : dy);
+    taken[j] = p[j].transmittance > 0;
+    if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
+      at[j] = planes(s.g, Fast(dx), y[j]);
+      bool inside = within_in_front(at[j], Fast(s.r2)) & behind_near(s.g, a.near, at[j].W);
+      if (kBlur) inside |= dx * dx + y[j].v * y[j].v < s.blur2;
+      taken[j] &= inside;
+    }
+    any |= taken[j];
+  }
+  if (!any) return;
+  Fragment<Fast> f[kPixels];
+  float weight[kPixels];
+  any = false;
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) {
+    if (Kernel::kPixel || kBlur)
+      f[j] = fragment<Kernel, true>(s.g, a.near, Fast(dx), y[j]);
+    else
+      f[j] = fragment_within(s.g, at[j]);
+    const float sigma = f[j].sigma.v;
+    const Blend<float> b = bt::blend(sigma, p[j].transmittance);
+    const Verdict<float> v = judge(taken[j], sigma, b.behind, a.transmittance_min);
+    p[j].transmittance = v.takes ? b.behind : v.ends ? -p[j].transmittance : p[j].transmittance;
+    weight[j] = v.takes ? b.weight : 0;
+    taken[j] = v.takes;
+    any |= taken[j];
+  }
+  if (any) add<kMaps>(a, s, taken, weight, f, p);
 }
 
 // Rounded as the image of floats would be: the product for itself.
@@ -193,17 +209,9 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
             __ldg(reinterpret_cast<const float4*>(a.rows) + int64_t(queue[r] >> 8) * kRowQuads + quad % kRowQuads);
     }
     __syncwarp();
-    const uint32_t mine = lane < in_hand ? queue[lane] : 0;
-    unsigned reached[kPixels];  // rows by the pixels of the warp, the next one in the lowest bit
-    for (int j = 0; j < kPixels; ++j) reached[j] = __ballot_sync(kFullMask, (mine & part[j]) != 0);
     const float4* q = stage;
     for (int look = 0; look < in_hand; look += kLook) {
-      bool open = false;
-      for (int j = 0; j < kPixels; ++j) {
-        if (!__any_sync(kFullMask, p[j].transmittance > 0)) reached[j] = 0;
-        open |= reached[j] != 0;
-      }
-      if (!open) break;
+      if (!__any_sync(kFullMask, p[0].transmittance > 0 || p[1].transmittance > 0)) break;
       for (int k = look; k < min_(look + kLook, in_hand); ++k, q += kRowQuads) {
         const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
         const float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
@@ -215,24 +223,12 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
                        q + 4,
                        kMaps ? queue[k] >> 8 : 0};
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
-        bool taken[kPixels], any = false;
-        float weight[kPixels];
-        Fragment<Fast> f[kPixels] = {};
-        BT_UNROLL
-        for (int j = 0; j < kPixels; ++j) {
-          const float below = j ? dy + kBandRows * j : dy;
-          taken[j] = false, weight[j] = 0;
-          if (!(reached[j] & 1)) continue;
-          if (filtered<Kernel>(s.g))
-            taken[j] = cover<Kernel, true>(a, s, dx, below, p[j].transmittance, f[j], weight[j]);
-          else if (s.blur2 > 0)
-            taken[j] = cover<LowPassKernel, true>(a, s, dx, below, p[j].transmittance, f[j], weight[j]);
-          else
-            taken[j] = cover<LowPassKernel, false>(a, s, dx, below, p[j].transmittance, f[j], weight[j]);
-        }
-        for (int j = 0; j < kPixels; ++j) reached[j] >>= 1;
-        for (int j = 0; j < kPixels; ++j) any |= taken[j];
-        if (any) add<kMaps>(a, s, taken, weight, f, p);
+        if (filtered<Kernel>(s.g))
+          blend<kMaps, Kernel, true>(a, s, dx, dy, p);
+        else if (s.blur2 > 0)
+          blend<kMaps, LowPassKernel, true>(a, s, dx, dy, p);
+        else
+          blend<kMaps, LowPassKernel, false>(a, s, dx, dy, p);
       }
     }
     wanted = 0;

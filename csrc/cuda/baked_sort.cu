@@ -1,15 +1,17 @@
 // The last step of the baked renderer's second stage: every tile's list front to back.
 //
-// A block takes a tile. Each of its warps sorts a part of the list in registers (a bitonic network), the parts meet in
-// shared memory, and every key finds its place as its number in its own part and how many keys of the others are below
-// it. Lists longer than that room are sorted in runs, which are merged two by two through global memory. Keys hold the
-// depth and the surfel's row, so no two are alike and the order does not depend on who wrote first.
+// A warp sorts a short list in registers (a bitonic network). A longer one is sorted by the block: each warp sorts a
+// part, the parts meet in shared memory, and every key finds its place as its number in its own part and how many keys
+// of the others are below it. Lists longer than that room are sorted in runs, which are merged two by two through
+// global memory. Keys hold the depth and the surfel's row, so no two are alike and the order does not depend on who
+// wrote first.
 #include "cuda/baked_stages.h"
 
 namespace bt::cuda {
 
 namespace {
-constexpr int kThreads = 128;
+constexpr int kThreads = 128, kTiles = kThreads / kWarp;  // of a block
+constexpr int kMostOfWarp = 4 * kWarp;                    // keys that a warp sorts by itself
 constexpr int kMostPerLane = 8;
 constexpr int kRun = kThreads * kMostPerLane;  // keys that a block sorts at once
 
@@ -84,9 +86,7 @@ __device__ void sort_run(int n, Key* shared, Get get, Put put) {
 }
 template <class Get, class Put>
 __device__ void sort_run(int n, Key* shared, Get get, Put put) {
-  if (n <= kThreads)
-    sort_run<1>(n, shared, get, put);
-  else if (n <= 2 * kThreads)
+  if (n <= 2 * kThreads)
     sort_run<2>(n, shared, get, put);
   else if (n <= 4 * kThreads)
     sort_run<4>(n, shared, get, put);
@@ -94,22 +94,33 @@ __device__ void sort_run(int n, Key* shared, Get get, Put put) {
     sort_run<kMostPerLane>(n, shared, get, put);
 }
 
-__global__ void __launch_bounds__(kThreads, 10) sort_kernel(BakedFrame f) {
-  __shared__ Key shared[kRun];
-  const BakedMemory& m = f.memory;
-  const int begin = m.ranges[2 * int64_t(blockIdx.x)], n = m.ranges[2 * int64_t(blockIdx.x) + 1] - begin;
+__device__ Key key_of(const BakedMemory& m, uint32_t pair) { return Key(m.depth[pair >> 8]) << 32 | pair; }
+
+// Sorts n <= kWarp * K pairs within a warp.
+template <int K>
+__device__ void sort_short(const BakedMemory& m, uint32_t* pairs, int n) {
   if (n < 2) return;
+  const int lane = threadIdx.x % kWarp;
+  Key key[K];
+  BT_UNROLL
+  for (int k = 0; k < K; ++k) key[k] = k * kWarp + lane < n ? key_of(m, pairs[k * kWarp + lane]) : kNone;
+  sort_warp<K>(key, lane);
+  BT_UNROLL
+  for (int k = 0; k < K; ++k)
+    if (lane * K + k < n) pairs[lane * K + k] = uint32_t(key[k]);
+}
+
+// Sorts the list from `begin` on within a block.
+__device__ void sort_long(const BakedMemory& m, int begin, int n, Key* shared) {
   uint32_t* pairs = m.pairs + begin;
-  const uint32_t* depth = m.depth;
-  const auto key_of = [&](uint32_t pair) { return Key(depth[pair >> 8]) << 32 | pair; };
   if (n <= kRun) {
-    sort_run(n, shared, [&](int i) { return key_of(pairs[i]); }, [&](int i, Key key) { pairs[i] = uint32_t(key); });
+    sort_run(n, shared, [&](int i) { return key_of(m, pairs[i]); }, [&](int i, Key key) { pairs[i] = uint32_t(key); });
     return;
   }
   Key *keys = m.keys + begin, *merged = m.merged + begin;
   for (int run = 0; run < n; run += kRun) {
     sort_run(
-        min_(kRun, n - run), shared, [&](int i) { return key_of(pairs[run + i]); },
+        min_(kRun, n - run), shared, [&](int i) { return key_of(m, pairs[run + i]); },
         [&](int i, Key key) { keys[run + i] = key; });
     __syncthreads();
   }
@@ -126,10 +137,33 @@ __global__ void __launch_bounds__(kThreads, 10) sort_kernel(BakedFrame f) {
   }
   for (int i = threadIdx.x; i < n; i += kThreads) pairs[i] = uint32_t(keys[i]);
 }
+
+__global__ void __launch_bounds__(kThreads, 10) sort_kernel(BakedFrame f) {
+  __shared__ Key shared[kRun];
+  const BakedMemory& m = f.memory;
+  const int64_t first = int64_t(blockIdx.x) * kTiles;
+  const auto range_of = [&](int64_t tile, int& begin) {
+    begin = tile < f.tiles ? m.ranges[2 * tile] : 0;
+    return tile < f.tiles ? m.ranges[2 * tile + 1] - begin : 0;
+  };
+  int begin = 0, n = range_of(first + threadIdx.x / kWarp, begin);
+  if (n <= kWarp)
+    sort_short<1>(m, m.pairs + begin, n);
+  else if (n <= 2 * kWarp)
+    sort_short<2>(m, m.pairs + begin, n);
+  else if (n <= kMostOfWarp)
+    sort_short<4>(m, m.pairs + begin, n);
+  for (int64_t tile = first; tile < first + kTiles; ++tile) {
+    n = range_of(tile, begin);
+    if (n <= kMostOfWarp) continue;
+    sort_long(m, begin, n, shared);
+    __syncthreads();
+  }
+}
 }  // namespace
 
 void baked_sort(const BakedFrame& f, Stream stream) {
-  BT_LAUNCH(sort_kernel, dim3(unsigned(f.tiles)), dim3(kThreads), 0, stream, f);
+  BT_LAUNCH(sort_kernel, dim3(unsigned(ceil_div(f.tiles, kTiles))), dim3(kThreads), 0, stream, f);
 }
 
 }  // namespace bt::cuda

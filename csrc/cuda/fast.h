@@ -14,10 +14,12 @@ struct Fast {
   Fast() = default;
   BT_HD explicit Fast(float value) : v(value) {}
 #if defined(__CUDACC__)
-  // In place of those of core/common.h, of which these alone take one instruction. Here, so that floats do not see them.
+  // In place of those of core/common.h, of which these take one instruction, or none. Here, so that floats do not see
+  // them.
   friend __device__ __forceinline__ Fast clamp_(Fast x, Fast low, Fast high) {
     return Fast(fminf(fmaxf(x.v, low.v), high.v));
   }
+  friend __device__ __forceinline__ Fast abs_(Fast x) { return Fast(fabsf(x.v)); }
   friend __device__ __forceinline__ Fast relu(Fast x) {  // NaN stays NaN
 #if __CUDA_ARCH__ >= 800
     float y;

@@ -13,7 +13,7 @@ from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
 
 FOLDER = ".bitymi"
-VERSION = 1
+VERSION = 2
 """Raised where the same photographs and options give other poses than before, so that kept ones are found anew."""
 
 

@@ -15,7 +15,7 @@ import pycolmap
 
 from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, work_folder
-from bitymi_ns.capture.frame import local_positions, settle
+from bitymi_ns.capture.frame import local_positions, settle, write_frame
 from bitymi_ns.capture.photos import Photo, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS
 from bitymi_ns.capture.report import write_report
@@ -236,8 +236,12 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     """Settle the model in its world and write it with its report; what was needed on the way there goes."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
-    frame = settle(model, {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None})
-    values |= {"metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
+    frame = settle(
+        model,
+        {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None},
+        {n: p.exif.up for n, p in by_used.items() if p.exif.up is not None},
+    )
+    values |= {"up": frame.up, "metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
     values["cameras"] = [
         {
             "model": c.model_name,
@@ -253,7 +257,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         sparse = result / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(sparse)
-        write_file(result / "frame.json", (json.dumps(frame.values(), indent=2) + "\n").encode())
+        write_frame(result, frame)
         write_report(result, values, model)
         kept = {"images": str(images.resolve()), **{key: values[key] for key in keys}}
         write_file(result / "poses.json", json.dumps(kept).encode())

@@ -51,6 +51,7 @@ class Source:
         reduction: the photographs are so many times smaller than those of the model.
         reduced: folder of photographs that are that much smaller already; None = they are made so when they are read.
         left_out: photographs that the model lacks, with reasons where they are known.
+        report: folder of the report on how the poses were found; None = there is none.
     """
 
     folder: Path
@@ -59,6 +60,7 @@ class Source:
     reduction: int = 1
     reduced: Path | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    report: Path | None = None
 
     @property
     def read(self) -> Path:

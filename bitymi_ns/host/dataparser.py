@@ -22,6 +22,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
 from bitymi_ns.host import finding, holdout
 from bitymi_ns.host.colmap_model import read_model
@@ -167,6 +168,7 @@ class BitymiDataParser(DataParser):
 
     Attributes:
         downscale_factor: set by nerfstudio where photographs are not needed, so that none is opened; else None.
+        poses_report: folder of the report on how the poses were found, once the views are read; None = there is none.
     """
 
     config: BitymiDataParserConfig
@@ -174,6 +176,7 @@ class BitymiDataParser(DataParser):
     def __init__(self, config: BitymiDataParserConfig) -> None:
         super().__init__(config)
         self.downscale_factor: int | None = None
+        self.poses_report: Path | None = None
 
     @cached_property
     def splits(self) -> dict[str, DataparserOutputs]:
@@ -181,6 +184,7 @@ class BitymiDataParser(DataParser):
         found = self.config.find()
         if found.format == "blender":
             return self._blender(found)
+        self.poses_report = None if read_frame(found.folder) is None else found.folder
         outputs, lists = self._colmap(found) if found.format in WITH_MODEL else self._transforms(found)
         split = self._holdout(outputs.image_filenames, lists, found)
         say(split.told(outputs.image_filenames))
@@ -226,6 +230,7 @@ class BitymiDataParser(DataParser):
         """All views of a COLMAP model, and the lists of photographs beside it."""
         look = self.downscale_factor is None
         source = self.config.source(found, look)
+        self.poses_report = source.report or self.poses_report
         model = read_model(source.folder)
         self._tell(found, source.told(model))
         if look:

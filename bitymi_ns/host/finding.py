@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from bitymi_ns.capture.recognise import Found
@@ -35,4 +36,5 @@ def source_of(found: Found, masks_path: Path | None, reduction: int) -> Source:
     )
     if masks is None and found.format == "photographs" and (found.path / "masks").is_dir():
         masks = found.path / "masks"
-    return find_source(poses.model, poses.images, Path(), masks, reduction, poses.left_out, look=False)
+    source = find_source(poses.model, poses.images, Path(), masks, reduction, poses.left_out, look=False)
+    return replace(source, report=poses.report)

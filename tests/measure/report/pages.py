@@ -7,7 +7,7 @@ from typing import Any
 from bitymi_ns.measure.report.page import Content, to_page
 
 EMPTY: dict[str, Any] = {
-    "title": "", "intro": "", "summary": [], "quality": [], "training": None, "everything": None, "plots": [],
+    "title": "", "intro": "", "summary": [], "quality": [], "training": None, "everything": None, "poses": [], "plots": [],
     "knobs": [], "paper": [], "views": [], "worst": [], "gallery": [], "notes": [],
 }  # fmt: skip
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.bundle import Bundle, Check, check_field, check_view_color
+from bitymi_ns.bundle import Bundle, Check, check_field, check_place, check_view_color
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
-from bitymi_ns.host.export import held_out_psnr, load_trained
+from bitymi_ns.host.export import held_out_psnr, load_trained, world_of
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -31,7 +31,8 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     model, datamanager = pipeline.model, pipeline.datamanager
     cameras = datamanager.undistorted_train_cameras()
     train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
-    checks = [check_view_color(bundle, model.scene.surfels, train)]
+    checks = [check_place(bundle.info.world, world_of(datamanager))]
+    checks.append(check_view_color(bundle, model.scene.surfels, train))
     if model.scene.field is not None:
         checks.append(check_field(bundle, model.scene.field.cpu(), train))
     if len(datamanager.eval_dataset):

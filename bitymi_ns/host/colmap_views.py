@@ -215,9 +215,9 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
     c2w = np.stack([_camera_to_world(image.qvec, image.tvec) for image in model.images])
     if place.auto_scale_poses:
         check_spread(c2w[:, :3, 3], str(source.folder))
-    poses, transform = auto_orient_and_center_poses(
-        torch.from_numpy(c2w.astype(np.float32)), method=place.orientation_method, center_method=place.center_method
-    )
+    there = torch.from_numpy(c2w.astype(np.float32))
+    _, transform = auto_orient_and_center_poses(there, place.orientation_method, place.center_method)
+    poses = transform @ there  # nerfstudio 1.1.5 turns two of its own the wrong way round with pca
     scale = place.scale_factor
     if place.auto_scale_poses:
         scale /= float(poses[:, :3, 3].abs().max())

@@ -135,9 +135,7 @@ class Shading:
         geometry = None if mode == "plain" else self.field.geometry
         args = (geometry, () if mode == "plain" else tuple(params), bound, mode == "move")
         colors = ops.shade(fragments, *leaves, *args)
-        (
-            colors * torch.cos(torch.arange(colors.numel(), device=device).double()).view_as(colors).to(colors)
-        ).sum().backward()
+        (colors * torch.cos(torch.arange(colors.numel(), device=device).double()).view_as(colors).to(colors)).sum().backward()
         grads = [t.grad for t in (*leaves, fragments.uv, *params)]
         return [t.detach().cpu().double() for t in (colors, *grads) if t is not None]
 

@@ -129,7 +129,7 @@ def _up(
 
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
-    """AccelerationVector (tag 8) of Apple's maker note, in g: towards the left side of the phone as seen from its front,
+    """AccelerationVector (tag 8) of Apple's maker note in g: towards the left side of the phone as its front is seen,
     towards its bottom, and into its face; of a phone that is held still it points away from the ground.
 
     The note is an IFD of big-endian numbers after 14 bytes, "Apple iOS", its version and "MM"; places count from its

@@ -32,7 +32,7 @@ SOURCES = ("gps", "gravity", "cameras")
 SAME_UP = np.cos(np.radians(10.0))
 """Cosine of the angle up to which two photographs have the same up."""
 STEEPEST = np.cos(np.radians(45.0))
-"""Cosine of the angle up to which GPS positions are taken to be tilted; beyond it the accelerometers are not believed."""
+"""Cosine of the angle up to which GPS positions may be tilted; beyond it the accelerometers are not believed."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
+from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import finding, holdout
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import (
@@ -63,6 +64,7 @@ USED_BY: dict[str, tuple[str, ...]] = {
     "scale_factor": ("nerfstudio", *WITH_MODEL, "blender"),
     "load_3D_points": ("nerfstudio", *WITH_MODEL),
     "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL),
+    "sfm": ("photographs", "video"),
 }
 """Formats that an option is for, where that is not all of them."""
 
@@ -110,6 +112,8 @@ class BitymiDataParserConfig(DataParserConfig):
     """What becomes the origin: the middle of the cameras, or what they look at."""
     auto_scale_poses: bool = True
     """Scale the capture so that the cameras fit into a box from -1 to 1."""
+    sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
+    """How the poses of photographs and videos are found."""
 
     def settle(self) -> None:
         """Replace the name of a list of photographs by what is in it, so that config.yml stands on its own."""
@@ -160,7 +164,7 @@ class BitymiDataParserConfig(DataParserConfig):
         reduction = self.downscale_factor or 1
         if found.format == "colmap":
             return find_source(found.path, found.folder, self.images_path, self.masks_path, reduction, look=look)
-        return finding.source_of(found, self.masks_path, reduction)
+        return finding.source_of(found, self.masks_path, reduction, self.sfm)
 
 
 class BitymiDataParser(DataParser):

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from bitymi_ns.capture.recognise import Found
+from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host.colmap_views import Source, find_source
 from bitymi_ns.host.errors import fail, say
 
 
-def source_of(found: Found, masks_path: Path | None, reduction: int) -> Source:
+def source_of(found: Found, masks_path: Path | None, reduction: int, settings: SfmSettings) -> Source:
     """The COLMAP model of a folder of photographs or of a video, found now or by an earlier run.
 
     Args:
         found: photographs, or a video.
         masks_path: folder of masks, seen from the capture; None = `masks` beside the photographs, if there is one.
         reduction: train on photographs that are so many times smaller.
+        settings: how the poses are found.
 
     Raises:
         InputError: no poses can be found; says what to photograph differently.
@@ -27,7 +29,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int) -> Source:
     masks = None if masks_path is None else found.folder / masks_path
     try:
         with rich_progress() as progress:
-            poses = find_poses(found.path, SfmOptions(masks=masks), progress)
+            poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress)
     except CaptureError as error:
         fail(str(error), error)
     say(

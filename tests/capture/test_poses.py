@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
+from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, SfmSettings, find_poses, triangulate
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.photos import Photo
-from bitymi_ns.capture.poses import by_camera, camera_group
+from bitymi_ns.capture.poses import by_camera, camera_group, make_job
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import View, render
 from bitymi_ns.sample.room import Room
@@ -230,3 +231,32 @@ def test_a_focal_length_is_known_only_if_all_photographs_state_it() -> None:
 def test_options_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(CaptureError, match=f"{name} is .*: give a number of at least"):
         SfmOptions(**{name: value})
+
+
+OTHER = {
+    "matching": "sequential",
+    "mapper": "global",
+    "camera_model": "OPENCV",
+    "focal_length": 321.0,
+    "max_image_size": 800,
+    "max_features": 1234,
+    "frames": 30,
+}
+"""Another value of every setting."""
+
+
+def test_every_setting_is_part_of_the_key(copied: Copy, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, keys = copied("keys"), []
+    monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: keys.append(arguments[-2].name))
+    assert OTHER.keys() == {field.name for field in fields(SfmSettings)}
+    for options in [{}, {}, *({name: value} for name, value in OTHER.items())]:
+        find_poses(folder, SfmOptions(**options))
+    assert keys[0] == keys[1] and len(set(keys)) == 1 + len(OTHER)
+
+
+def test_every_setting_reaches_the_job(tmp_path: Path) -> None:
+    photos = [photo("a.jpg", focal_length=350.0)]
+    job = make_job(photos, tmp_path, {"a.jpg": "a.jpg"}, None, SfmOptions(**OTHER), tmp_path, sequence=False)
+    assert (job.matching, job.mapper, job.max_image_size, job.max_features) == ("sequential", "global", 800, 1234)
+    (camera,) = job.cameras
+    assert camera.model == "OPENCV" and camera.params[:2] == [321.0, 321.0] and not job.opencv_if_better

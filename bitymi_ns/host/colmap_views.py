@@ -16,12 +16,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
-from PIL import Image
 
+from bitymi_ns.capture.prepare import mask_of
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
-from bitymi_ns.host.images import THREADS
+from bitymi_ns.host.images import THREADS, of_header
 from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.poses import check_spread
 
@@ -164,21 +164,17 @@ def _masks(photographs: Path, capture: Path, given: Path | None, reduction: int)
 
 
 def mask_files(source: Source, model: Model) -> list[Path] | None:
-    """The masks of the model's images: NAME.png, or NAME.jpg.png as COLMAP has them."""
+    """The masks of the model's images; see `mask_of`."""
     if source.masks is None:
         return None
-    files, missing = [], []
-    for image in model.images:
-        plain = source.masks / image.name
-        fitting = [f for f in (plain.with_suffix(".png"), plain.with_name(f"{plain.name}.png")) if f.is_file()]
-        files += fitting[:1]
-        missing += [] if fitting else [image.name]
+    found = {image.name: mask_of(source.masks, image.name) for image in model.images}
+    missing = [name for name, file in found.items() if file is None]
     if missing:
         fail(
             f"{source.masks} has no mask of {listed(missing)}, but of others. Give every photograph a mask of its name "
             "with .png (a white picture lets all pixels count), or move the folder away."
         )
-    return files
+    return [file for file in found.values() if file is not None]
 
 
 def tell_left_out(source: Source, model: Model) -> None:
@@ -309,9 +305,5 @@ def _lenses(source: Source, model: Model, files: Sequence[Path], look: bool, ann
 
 
 def _size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a photograph, of which only the header is read; None where there is none to read."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return None  # what is wrong is said where it is read
+    """Width and height of a photograph; None where there is none to read."""
+    return of_header(path, lambda image: image.size, None)

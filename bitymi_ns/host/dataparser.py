@@ -257,7 +257,10 @@ class BitymiDataParser(DataParser):
         return {"val": splits[there[0]], "test": splits[there[-1]], **splits}
 
     def _tell(self, found: Found, what: str) -> None:
-        say(f"Reading {what}. {found.how_to_choose()}".rstrip())
+        text = f"Reading {what}. {found.how_to_choose()}"
+        if found.format == "instant-ngp" and self.config.format == "auto":  # by a guess: both use one name
+            text = f"{text.rstrip()} If nerfstudio wrote it: `bitymi-data --format nerfstudio`."
+        say(text.rstrip())
 
     def _holdout(self, names: Sequence[Path], lists: Lists, found: Found) -> holdout.Split:
         config = self.config

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from bitymi_ns.capture.cache import read_from
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host.colmap_views import Source, find_source
@@ -30,6 +31,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
     try:
         with rich_progress() as progress:
             poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress)
+        read_from(poses.report.parent)
     except CaptureError as error:
         fail(str(error), error)
     say(

@@ -187,7 +187,7 @@ def tell_left_out(source: Source, model: Model) -> None:
     if unused:
         named = [f"{name} ({source.left_out[name]})" if name in source.left_out else name for name in unused]
         warn(
-            f"{len(unused)} of {len(names | used)} photographs have no pose in the model and are left out: "
+            f"{len(unused)} of {len(used) + len(unused)} photographs have no pose in the model and are left out: "
             f"{listed(named)}."
         )
 

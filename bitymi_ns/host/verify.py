@@ -31,8 +31,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     model, datamanager = pipeline.model, pipeline.datamanager
     cameras = datamanager.undistorted_train_cameras()
     train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
-    checks = [check_place(bundle.info.world, world_of(datamanager))]
-    checks.append(check_view_color(bundle, model.scene.surfels, train))
+    checks = [check_view_color(bundle, model.scene.surfels, train)]
     if model.scene.field is not None:
         checks.append(check_field(bundle, model.scene.field.cpu(), train))
     if len(datamanager.eval_dataset):
@@ -44,7 +43,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         detail += "" if stated is None else f" (stated {stated:.2f})"
         detail += f"; against the photographs {photos:+.3f} dB"
         checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
-    return checks
+    return [*checks, check_place(bundle.info.world, world_of(datamanager))]
 
 
 def find_run(run: Path) -> tuple[Path, int | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
@@ -18,13 +19,15 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, T
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (2, 1)
+VERSION = (2, 2)
 """The newest version that is read. Lean view colours are version 2, which readers of version 1 refuse."""
-FULL_VERSION = (1, 2)
+FULL_VERSION = (1, 3)
 """Version of a bundle whose surfels have all parameters."""
 _DIGEST_SINCE = {1: 2, 2: 1}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
+UNIT_LENGTH = 1e-3
+"""By how much the length of a direction may differ from 1."""
 _MOST_PROBLEMS = 3  # in one message
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -61,6 +64,7 @@ def _only(value: float) -> Any:
 Positive = Annotated[float, Field(gt=0, le=1e12)]
 Side = Annotated[int, Field(ge=1, le=1 << 20)]
 Coordinate = Annotated[float, Field(ge=-LIMITS["means"][0], le=LIMITS["means"][0])]
+Cosine = Annotated[float, Field(ge=-2, le=2)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
@@ -122,10 +126,25 @@ class Render(Part):
 
 
 class Place(Part):
-    """How the scene lies in the capture's own frame: x_scene = scale * (transform @ [x_capture, 1])."""
+    """How the scene lies in the capture's own frame, x_scene = scale * (transform @ [x_capture, 1]), and in the real
+    world, as far as that is known: since versions 1.3 and 2.2."""
 
     transform: tuple[Row, Row, Row]
     scale: Positive
+    up: tuple[Cosine, Cosine, Cosine] | None = None
+    """Unit vector of the scene that points away from the ground."""
+    up_from: Annotated[str, Field(pattern=r"^[a-z][a-z_-]{0,39}$")] | None = None
+    """Where it comes from: gps, gravity, or cameras, which were held upright as a rule."""
+    metres_per_unit: Positive | None = None
+    """Length of a unit of the scene."""
+
+    @model_validator(mode="after")
+    def _up_is_a_direction(self) -> Place:
+        if (self.up is None) != (self.up_from is None):
+            raise PydanticCustomError("up", "must have up and up_from, or neither")
+        if self.up is not None and not abs(math.hypot(*self.up) - 1) <= UNIT_LENGTH:
+            raise PydanticCustomError("up", "up must have the length 1")
+        return self
 
 
 class Bounds(Part):

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,8 +17,9 @@ from bitymi_ns.bake.plan import Field, kernel_parameters
 from bitymi_ns.bake.subject import Subject
 from bitymi_ns.bake.visibility import visibility
 from bitymi_ns.bake.ways import way_of
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
 from bitymi_ns.bundle.read import Bundle, assemble, enough_memory, read_file, read_manifest
+from bitymi_ns.bundle.write import World
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 
@@ -46,7 +48,7 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
     except BundleError as error:
         return None, [Check(MANIFEST, False, str(error))]
     signed = "" if info.digest else ", without a digest (of an earlier version)"
-    checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{signed}")]
+    checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{signed}{_real_world(info.world)}")]
     files: dict[str, bytearray] = {}
     for name, entry in info.files.items():
         try:
@@ -64,6 +66,29 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
     return bundle, [*checks, _tiles(bundle), _statements(bundle)]
+
+
+def _real_world(place: Place) -> str:
+    """What is stated of up and of lengths."""
+    text = "" if place.up is None else f", up ({', '.join(f'{x:.3f}' for x in place.up)}) by {place.up_from}"
+    return text + ("" if place.metres_per_unit is None else f", {place.metres_per_unit:.4g} m per unit")
+
+
+def check_place(stated: Place, world: World) -> Check:
+    """Compares what a bundle states of its place in the capture's frame and in the real world with that of its run.
+
+    Args:
+        stated: of bundle.json; an earlier version states neither up nor lengths.
+        world: of the run.
+    """
+    wrong = []
+    for key, found in world.described().items():
+        value = getattr(stated, key)
+        if value is None and key not in ("transform", "scale"):
+            continue
+        same = value == found if isinstance(found, str) else np.allclose(value, found, rtol=1e-4, atol=1e-5)
+        wrong += [] if same else [f"{key} is {value}, that of the run {found}"]
+    return Check("place of the scene", not wrong, "; ".join(wrong) or "as the run has it")
 
 
 def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Check:

@@ -49,15 +49,34 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class World:
-    """How the scene's frame lies in the capture's own: x_scene = scale * (transform @ [x_capture, 1]).
+    """How the scene's frame lies in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and how that
+    lies in the real world.
 
     Attributes:
         transform: [3, 4] (the dataparser's transform).
         scale: the dataparser's scale.
+        up: [3] direction of the capture's own frame that points away from the ground; None = it is not known.
+        up_from: where `up` comes from, a word.
+        metres_per_unit: length of a unit of the capture's own frame; None = it is not known.
     """
 
     transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])
     scale: float = 1.0
+    up: npt.ArrayLike | None = None
+    up_from: str = ""
+    metres_per_unit: float | None = None
+
+    def described(self) -> dict[str, Any]:
+        """`manifest.Place`: up and length in the scene's own frame."""
+        transform = np.asarray(self.transform, dtype=np.float64)[:3]
+        place: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
+        if self.up is not None:
+            up = transform[:, :3] @ np.asarray(self.up, dtype=np.float64)
+            place |= {"up": up / np.linalg.norm(up), "up_from": self.up_from}
+        if self.metres_per_unit is not None:
+            stretch = abs(float(np.linalg.det(transform[:, :3]))) ** (1 / 3) * float(self.scale)
+            place["metres_per_unit"] = float(self.metres_per_unit) / stretch
+        return place
 
 
 def export(
@@ -174,7 +193,7 @@ def _describe(
             "prefilter": scene.prefilter,
             "background": list(background),
         },
-        "world": {"transform": np.asarray(world.transform, dtype=np.float64)[:3], "scale": float(world.scale)},
+        "world": world.described(),
         "bounds": {
             "min": [0.0] * 3 if empty else means.amin(0),
             "max": [0.0] * 3 if empty else means.amax(0),

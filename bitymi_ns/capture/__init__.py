@@ -7,14 +7,14 @@ command line and those who only recognise a capture need not wait for.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
+from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions, SfmSettings
 from bitymi_ns.progress import Progress
 
 if TYPE_CHECKING:
     from bitymi_ns.capture.known import KnownView, triangulate
     from bitymi_ns.capture.poses import find_poses
 
-__all__ = ["CaptureError", "KnownView", "Poses", "Progress", "SfmOptions", "find_poses", "triangulate"]
+__all__ = ["CaptureError", "KnownView", "Poses", "Progress", "SfmOptions", "SfmSettings", "find_poses", "triangulate"]
 
 _LATER = {"KnownView": "known", "triangulate": "known", "find_poses": "poses"}
 

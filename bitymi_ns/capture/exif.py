@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ SAME_ASPECT = 0.02
 """Relative difference up to which two aspects count as one: sizes are rounded to whole blocks of pixels."""
 FOCAL_RANGE = (0.3, 15.0)
 """Focal lengths that can be meant, in units of the longer side."""
+STILL = 0.1
+"""By how much of g the length of an acceleration may differ from that of a phone that is held still."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,8 @@ class Exif:
     """Latitude and longitude in degrees, altitude in metres."""
     time: str = ""
     """When it was taken, sortable; empty where it is not known."""
+    up: tuple[float, float, float] | None = None
+    """Unit vector away from the ground, in the upright photograph's axes (x right, y down, z forward)."""
 
 
 def read_exif(image: Image.Image) -> Exif:
@@ -55,6 +60,7 @@ def read_exif(image: Image.Image) -> Exif:
         doubt=doubt,
         position=_position(gps),
         time=f"{time}.{fraction}" if time and fraction else time,
+        up=_up(image, tags, detail),
     )
 
 
@@ -97,6 +103,51 @@ def number(value: object) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return found if math.isfinite(found) and found > 0 else None
+
+
+def _up(
+    image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
+) -> tuple[float, float, float] | None:
+    """Away from the ground by a phone's accelerometer; None where there is none, or it is not to be believed: the phone
+    was moved, or the orientation that the photograph is shown in is another."""
+    note = detail.get(ExifTags.Base.MakerNote)
+    if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
+        return None
+    found = apple_acceleration(note)
+    if found is None or not abs(math.hypot(*found) - 1) <= STILL:
+        return None
+    left, bottom, into = (value / math.hypot(*found) for value in found)
+    # the sensor's rows run from the top of the phone to its bottom, its columns from the right to the left
+    turns = {1: (bottom, left), 3: (-bottom, -left), 6: (-left, bottom), 8: (left, -bottom)}
+    # HEIC is turned as it is opened
+    orientation = image.info.get("original_orientation") or tags.get(ExifTags.Base.Orientation, 1)
+    if orientation not in turns:
+        return None
+    x, y = turns[orientation]
+    upright = y < 0 and abs(x) <= -y  # nearer to the top of the picture than to another side
+    return (x, y, into) if upright or math.hypot(x, y) < 0.5 else None
+
+
+def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
+    """AccelerationVector (tag 8) of Apple's maker note in g: towards the left side of the phone as its front is seen,
+    towards its bottom, and into its face; of a phone that is held still it points away from the ground.
+
+    The note is an IFD of big-endian numbers after 14 bytes, "Apple iOS", its version and "MM"; places count from its
+    start.
+    """
+    if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
+        return None
+    try:
+        (entries,) = struct.unpack_from(">H", note, 14)
+        for i in range(entries):
+            tag, kind, count, place = struct.unpack_from(">HHII", note, 16 + 12 * i)
+            if (tag, kind, count) == (8, 10, 3):  # signed rationals
+                parts = struct.unpack_from(">6i", note, place)
+                x, y, z = (parts[j] / parts[j + 1] for j in (0, 2, 4))
+                return x, y, z
+    except (struct.error, ZeroDivisionError):
+        pass
+    return None
 
 
 def _position(gps: Mapping[int, object]) -> tuple[float, float, float] | None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 import pycolmap
+
+from bitymi_ns.files import write_file
 
 EARTH = 6378137.0
 """Equatorial radius in metres, WGS 84."""
@@ -19,12 +24,23 @@ SAME_SHAPE = 0.5
 """The largest error of the alignment, relative to the spread, at which it is believed."""
 
 
+FILE = "frame.json"
+"""The frame of a model, beside its report."""
+UP = (0.0, 0.0, 1.0)
+"""Up in the world of a settled model."""
+SOURCES = ("gps", "gravity", "cameras")
+SAME_UP = np.cos(np.radians(10.0))
+"""Cosine of the angle up to which two photographs have the same up."""
+STEEPEST = np.cos(np.radians(45.0))
+"""Cosine of the angle up to which GPS positions may be tilted; beyond it the accelerometers are not believed."""
+
+
 @dataclass(frozen=True)
 class WorldFrame:
     """How the world of a model lies in the real one."""
 
     up: str
-    """Where up comes from: "gps" or "cameras"; it is +z either way."""
+    """Where up comes from, one of SOURCES; it is +z in any case."""
     metres_per_unit: float | None
     """1 where GPS gave the scale; None where it is not known."""
     gps_origin: tuple[float, float, float] | None
@@ -36,8 +52,21 @@ class WorldFrame:
     transform: list[list[float]]
     """[3,4] from the world as COLMAP left it to this one, scale included."""
 
-    def values(self) -> dict[str, object]:
-        return asdict(self)
+
+def write_frame(folder: Path, frame: WorldFrame) -> None:
+    """Write frame.json."""
+    write_file(folder / FILE, (json.dumps(asdict(frame), indent=2) + "\n").encode())
+
+
+def read_frame(folder: Path) -> WorldFrame | None:
+    """The frame.json in a folder; None where there is none, or another program's."""
+    try:
+        frame = WorldFrame(**json.loads((folder / FILE).read_text("utf8")))
+    except (OSError, ValueError, TypeError):
+        return None
+    length = frame.metres_per_unit
+    known = length is None or (isinstance(length, (int, float)) and 0 < length < math.inf)
+    return frame if known and frame.up in SOURCES else None
 
 
 def local_positions(
@@ -67,19 +96,72 @@ def local_positions(
     return local, (float(middle[0]), float(middle[1]), float(middle[2]))
 
 
-def settle(model: pycolmap.Reconstruction, places: Mapping[str, tuple[float, float, float]]) -> WorldFrame:
-    """Move a model into a world with z up, by GPS where that is enough, else by the cameras; changed in place."""
+def settle(
+    model: pycolmap.Reconstruction,
+    places: Mapping[str, tuple[float, float, float]],
+    ups: Mapping[str, tuple[float, float, float]] | None = None,
+) -> WorldFrame:
+    """Move a model into a world with z up; changed in place.
+
+    Up is that of the phones' accelerometers where most of them agree, else by GPS where that is enough, else by the
+    cameras. Scale and north are by GPS where that is enough.
+
+    Args:
+        model: cameras and points.
+        places: latitude, longitude and altitude by name.
+        ups: unit vectors away from the ground by name, in the cameras' axes (x right, y down, z forward).
+    """
+    up = _by_gravity(model, ups or {})
     local, origin = local_positions(places)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
     names = [name for name in centers if name in local]
     found = _by_gps(np.array([centers[n] for n in names]), np.array([local[n] for n in names])) if names else None
     if found is not None:
         similarity, error = found
+        source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
+        if by_phones is not None and by_phones @ UP > STEEPEST:
+            turn = pycolmap.Rotation3d(_smallest_turn(by_phones, np.array(UP)))
+            source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
+            error = _error(similarity, centers, local, names)
         model.transform(similarity)
-        return WorldFrame("gps", 1.0, origin, error, len(local), similarity.matrix().tolist())
-    similarity = _by_cameras(model, np.array(list(centers.values())))
+        return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist())
+    similarity = _by_up(model, np.array(list(centers.values())), _of_cameras(model) if up is None else up)
     model.transform(similarity)
-    return WorldFrame("cameras", None, None, None, len(local), similarity.matrix().tolist())
+    source = "cameras" if up is None else "gravity"
+    return WorldFrame(source, None, None, None, len(local), similarity.matrix().tolist())
+
+
+def _error(
+    similarity: pycolmap.Sim3d, centers: Mapping[str, np.ndarray], local: Mapping[str, list[float]], names: list[str]
+) -> float:
+    """Median distance in metres between cameras and their GPS positions."""
+    moved = similarity * np.array([centers[name] for name in names])
+    return float(np.median(np.linalg.norm(moved - np.array([local[name] for name in names]), axis=1)))
+
+
+def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
+    """Up in the model's world [3], of the photographs that know it; None unless three or more, and most, agree."""
+    found = [
+        image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name])
+        for image in model.images.values()
+        if image.has_pose and image.name in ups
+    ]
+    if len(found) < 3:
+        return None
+    directions = np.array(found)
+    agreeing = directions @ directions.T > SAME_UP  # [n, n]
+    most = agreeing[np.argmax(agreeing.sum(axis=1))]
+    if most.sum() < 3 or most.mean() <= 0.5:
+        return None
+    up = directions[most].mean(axis=0)
+    return up / np.linalg.norm(up)
+
+
+def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The rotation [3,3] by the smallest angle that takes one unit vector to another, which is not its opposite."""
+    axis, cosine = np.cross(start, end), float(start @ end)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
 def _by_gps(centers: np.ndarray, places: np.ndarray) -> tuple[pycolmap.Sim3d, float] | None:
@@ -102,13 +184,18 @@ def _by_gps(centers: np.ndarray, places: np.ndarray) -> tuple[pycolmap.Sim3d, fl
     return (similarity, error) if error < SAME_SHAPE * spread[0] else None
 
 
-def _by_cameras(model: pycolmap.Reconstruction, centers: np.ndarray) -> pycolmap.Sim3d:
-    """Up is the cameras' mean up; the origin is the middle of the cameras, and their mean distance from it is 1."""
+def _of_cameras(model: pycolmap.Reconstruction) -> np.ndarray:
+    """The cameras' mean up [3]."""
     turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
     up = -np.mean([turn[1] for turn in turns], axis=0)
     if np.linalg.norm(up) < 0.1:  # they look all ways, or are turned all ways
         up = -turns[0][1]
-    up /= np.linalg.norm(up)
+    return up / np.linalg.norm(up)
+
+
+def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray) -> pycolmap.Sim3d:
+    """Takes `up` to z; the origin is the middle of the cameras, and their mean distance from it is 1."""
+    turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
     side = np.mean([turn[0] for turn in turns], axis=0)
     side -= up * (up @ side)
     if np.linalg.norm(side) < 1e-3:

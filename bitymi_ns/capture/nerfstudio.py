@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.types import Poses
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
@@ -43,9 +44,8 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
         shutil.copytree(poses.model, new / "sparse" / "0")
         model.export_PLY(new / CLOUD)
         (new / "transforms.json").write_text(json.dumps(transforms(model), indent=2, ensure_ascii=False) + "\n", "utf8")
-        for path in poses.report.iterdir():
-            if path.is_file() and path.name != "poses.json":
-                shutil.copyfile(path, new / path.name)
+        for name in FILES:
+            shutil.copyfile(poses.report / name, new / name)
 
 
 def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
 from bitymi_ns.capture.recognise import is_photograph
@@ -107,13 +107,14 @@ def read_photo(folder: Path, name: str) -> Photo:
         with Image.open(path) as image:
             exif = read_exif(image)
             orientation = image.getexif().get(0x0112, 1)
-            transposed = orientation in (5, 6, 7, 8)
-            width, height = image.size[::-1] if transposed else image.size
-            frames = getattr(image, "n_frames", 1)
+            width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
             mode = image.mode
             if image.format == "JPEG":
                 image.draft("L", (SHARPNESS_SIZE, SHARPNESS_SIZE))  # decodes at a half, a quarter or an eighth
-            grey = ImageOps.exif_transpose(image.convert("L") if not mode.startswith("I;16") else _from_16_bits(image))
+            grey = ImageOps.exif_transpose(eight_bits(image).convert("L"))
+            if image.format != "JPEG":  # Pillow turns TIFF by itself, so that its size is that of the upright picture
+                width, height = grey.size
+            frames = getattr(image, "n_frames", 1)
     except CaptureError:
         raise
     except Image.DecompressionBombError as error:
@@ -129,8 +130,31 @@ def read_photo(folder: Path, name: str) -> Photo:
     return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail))
 
 
-def _from_16_bits(image: Image.Image) -> Image.Image:
-    return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+def eight_bits(image: Image.Image) -> Image.Image:
+    """The image, of which deep grey modes are scaled to 8 bits; it can still be turned by EXIF.
+
+    Raises:
+        ValueError: its values are none of such a file.
+    """
+    if not image.mode.startswith(("I", "F")):
+        return image
+    values = np.asarray(image, dtype=np.float64)
+    low, high = float(values.min()), float(values.max())
+    if image.mode.startswith("I;16") or image.format == "PNG":
+        whites = (65535.0,)
+    else:  # TIFF and the like, which do not say what white is
+        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
+    white = next((white for white in whites if high <= white), None)
+    if white is None or not low >= 0.0:  # also NaN
+        raise ValueError(
+            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
+            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
+        )
+    grey = Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
+    turn = Image.Exif()
+    turn[ExifTags.Base.Orientation] = image.getexif().get(ExifTags.Base.Orientation, 1)
+    grey.info["exif"] = turn.tobytes()
+    return grey
 
 
 def _first_line(error: BaseException) -> str:
@@ -159,6 +183,4 @@ def sharpness(grey: np.ndarray) -> float:
 def upright(photo: Photo) -> Image.Image:
     """The photograph as an upright RGB image of 8 bits."""
     with Image.open(photo.path) as image:
-        if image.mode.startswith("I;16"):
-            return ImageOps.exif_transpose(_from_16_bits(image)).convert("RGB")
-        return ImageOps.exif_transpose(image).convert("RGB")
+        return ImageOps.exif_transpose(eight_bits(image)).convert("RGB")

@@ -14,8 +14,8 @@ from pathlib import Path
 import pycolmap
 
 from bitymi_ns.capture import prepare
-from bitymi_ns.capture.cache import content_key, work_folder
-from bitymi_ns.capture.frame import local_positions, settle
+from bitymi_ns.capture.cache import content_key, take_place, work_folder
+from bitymi_ns.capture.frame import local_positions, settle, write_frame
 from bitymi_ns.capture.photos import Photo, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS
 from bitymi_ns.capture.report import write_report
@@ -59,7 +59,9 @@ def find_poses(source: Path, options: SfmOptions | None = None, progress: Progre
         if finished is not None:
             return finished
         with explained(work, CaptureError):
-            return _find(source, folder, names, masks, options, work, tell)
+            found = _find(source, folder, names, masks, options, work, tell)
+            take_place(work, source, content_key(inputs, "contents"))
+            return found
 
 
 def _what(source: Path) -> tuple[Path, Path, list[str]]:
@@ -124,7 +126,7 @@ def _find(
     seconds["reading photographs"] = time.monotonic() - read
     if len(photos) < LEAST:
         raise CaptureError(_too_few_left(source, folder, photos, left_out, twins, video))
-    photos = _ordered(photos)
+    photos = ordered(photos)
     started = time.monotonic()
     images, used = prepare.upright_photos(photos, folder, work, tell)
     job = make_job(photos, images, used, masks, options, work, sequence=video)
@@ -162,7 +164,7 @@ def _too_few_left(
     return f"of the photographs in {folder}, only {len(photos)} can be used ({some}{more}). Copy or export them again"
 
 
-def _ordered(photos: list[Photo]) -> list[Photo]:
+def ordered(photos: list[Photo]) -> list[Photo]:
     """By the times at which they were taken, if all have one and not all the same; else by name, as they are."""
     times = {photo.exif.time for photo in photos}
     return sorted(photos, key=lambda photo: photo.exif.time) if "" not in times and len(times) > 1 else photos
@@ -236,15 +238,21 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     """Settle the model in its world and write it with its report; what was needed on the way there goes."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
-    frame = settle(model, {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None})
-    values |= {"metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
+    frame = settle(
+        model,
+        {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None},
+        {n: p.exif.up for n, p in by_used.items() if p.exif.up is not None},
+    )
+    values |= {"up": frame.up, "metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
+    known = {job.names[plain] for group in job.cameras if group.prior for plain in group.names}
+    stated = {image.camera_id for image in model.images.values() if image.name in known}  # a model's file has no priors
     values["cameras"] = [
         {
             "model": c.model_name,
             "width": c.width,
             "height": c.height,
             "params": c.params.tolist(),
-            "prior": c.has_prior_focal_length,
+            "prior": c.camera_id in stated,
         }
         for c in model.cameras.values()
     ]
@@ -253,7 +261,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         sparse = result / "sparse" / "0"
         sparse.mkdir(parents=True)
         model.write_binary(sparse)
-        write_file(result / "frame.json", (json.dumps(frame.values(), indent=2) + "\n").encode())
+        write_frame(result, frame)
         write_report(result, values, model)
         kept = {"images": str(images.resolve()), **{key: values[key] for key in keys}}
         write_file(result / "poses.json", json.dumps(kept).encode())

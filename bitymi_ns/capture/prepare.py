@@ -14,6 +14,8 @@ from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
+COPY = ".jpg"
+"""What the name of an upright copy has at its end, after that of the photograph."""
 
 
 def upright_photos(
@@ -31,7 +33,7 @@ def upright_photos(
     """
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
-    names = {photo.name: photo.name if photo.plain else f"{photo.name}.jpg" for photo in photos}
+    names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
     target = work / "images"
     if not target.is_dir():
         with complete_folder(target) as new:
@@ -63,10 +65,12 @@ def mask_folder(source: Path, photo_folder: Path, given: Path | None) -> Path | 
 
 def mask_of(masks: Path, name: str) -> Path | None:
     """The mask of a photograph: NAME.png after the whole name, as COLMAP has it, or the same name with any suffix of an
-    image, as nerfstudio has it."""
+    image, as nerfstudio has it. That of an upright copy is that of the photograph."""
     stem = str(PurePosixPath(name).with_suffix(""))
     candidates = [f"{name}.png", *(stem + suffix for suffix in (".png", *PHOTOGRAPHS))]
-    return next((masks / c for c in candidates if (masks / c).is_file()), None)
+    found = next((masks / c for c in candidates if (masks / c).is_file()), None)
+    is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
+    return mask_of(masks, stem) if is_copy else found
 
 
 def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, work: Path) -> Path:

@@ -6,27 +6,33 @@ import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pycolmap
 
 from bitymi_ns.files import write_file
 
+if TYPE_CHECKING:  # those who read reports need not wait for it
+    import pycolmap
+
+VALUES, PAGE, PICTURE = "report.json", "report.md", "cameras.png"
+FILES = (VALUES, PAGE, PICTURE, "frame.json")
+"""The files of a report; the last one is written by frame.py."""
 MOST_POINTS = 20_000
 """Points drawn; more are a blot."""
 
 
 def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
-    """Write report.json, report.md and cameras.png.
+    """Write all of it but the frame.
 
     Args:
         folder: an existing folder.
         values: see `poses._values`.
         model: cameras and points, z up.
     """
-    write_file(folder / "report.json", (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())
-    write_file(folder / "report.md", _page(values).encode())
-    _draw(folder / "cameras.png", model, values.get("metres_per_unit") is not None)
+    write_file(folder / VALUES, (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())
+    write_file(folder / PAGE, _page(values).encode())
+    _draw(folder / PICTURE, model, values.get("metres_per_unit") is not None)
 
 
 def _page(values: Mapping[str, object]) -> str:
@@ -42,9 +48,9 @@ def _page(values: Mapping[str, object]) -> str:
         f"| mean track length | {values['track_length']:.2f} photographs per point |",
         f"| points | {values['points']} |",
         f"| median parallax | {values['parallax_degrees']:.1f} degrees |",
-        f"| up, scale | {_frame_text(values)} |",
+        f"| up, scale | {frame_text(values)} |",
         "",
-        "![cameras and points, from above and from the side](cameras.png)",
+        f"![cameras and points, from above and from the side]({PICTURE})",
         "",
     ]
     for title, entries in (("Left out", values["left_out"]), ("Notes", values["notes"])):
@@ -69,10 +75,14 @@ def _cell(text: object) -> str:
     return str(text).replace("|", "\\|").replace("\n", " ")
 
 
-def _frame_text(values: Mapping[str, object]) -> str:
-    if values["metres_per_unit"] is None:
-        return "up by the cameras, scale not known"
-    return f"by GPS (median error {values['gps_error']:.1f} m): z up, metres"
+def frame_text(values: Mapping[str, Any]) -> str:
+    """Where up and scale come from, of `up`, `metres_per_unit` and `gps_error`."""
+    metres, error = values.get("metres_per_unit") is not None, values.get("gps_error")
+    up = values.get("up") or ("gps" if metres else "cameras")  # earlier reports do not say
+    text = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
+    if not metres:
+        return f"{text}, scale not known"
+    return f"{text}, metres by GPS{'' if error is None else f' (median error {error:.1f} m)'}"
 
 
 def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:

@@ -12,7 +12,7 @@ class CaptureError(ValueError):
 
 
 @dataclass(frozen=True)
-class SfmOptions:
+class SfmSettings:
     """How poses are found. All of it decides the result, and so is part of the key under which that is kept."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -29,11 +29,21 @@ class SfmOptions:
     the photographs."""
     max_features: int = 8192
     """Most features per photograph."""
+    frames: int | None = None
+    """Number of frames to take of a video; None = by how much the camera moves."""
+
+
+@dataclass(frozen=True)
+class SfmOptions(SfmSettings):
+    """The settings, and where the masks are.
+
+    Raises:
+        CaptureError: one is out of its range.
+    """
+
     masks: Path | None = None
     """Folder of masks; features are found where they are not black. None = the folder `masks` beside the photographs,
     if there is one."""
-    frames: int | None = None
-    """Number of frames to take of a video; None = by how much the camera moves."""
 
     def __post_init__(self) -> None:
         least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}

@@ -16,12 +16,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
-from PIL import Image
 
+from bitymi_ns.capture.prepare import mask_of
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
-from bitymi_ns.host.images import THREADS
+from bitymi_ns.host.images import THREADS, of_header
 from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.poses import check_spread
 
@@ -51,6 +51,7 @@ class Source:
         reduction: the photographs are so many times smaller than those of the model.
         reduced: folder of photographs that are that much smaller already; None = they are made so when they are read.
         left_out: photographs that the model lacks, with reasons where they are known.
+        report: folder of the report on how the poses were found; None = there is none.
     """
 
     folder: Path
@@ -59,6 +60,7 @@ class Source:
     reduction: int = 1
     reduced: Path | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    report: Path | None = None
 
     @property
     def read(self) -> Path:
@@ -162,21 +164,17 @@ def _masks(photographs: Path, capture: Path, given: Path | None, reduction: int)
 
 
 def mask_files(source: Source, model: Model) -> list[Path] | None:
-    """The masks of the model's images: NAME.png, or NAME.jpg.png as COLMAP has them."""
+    """The masks of the model's images; see `mask_of`."""
     if source.masks is None:
         return None
-    files, missing = [], []
-    for image in model.images:
-        plain = source.masks / image.name
-        fitting = [f for f in (plain.with_suffix(".png"), plain.with_name(f"{plain.name}.png")) if f.is_file()]
-        files += fitting[:1]
-        missing += [] if fitting else [image.name]
+    found = {image.name: mask_of(source.masks, image.name) for image in model.images}
+    missing = [name for name, file in found.items() if file is None]
     if missing:
         fail(
             f"{source.masks} has no mask of {listed(missing)}, but of others. Give every photograph a mask of its name "
             "with .png (a white picture lets all pixels count), or move the folder away."
         )
-    return files
+    return [file for file in found.values() if file is not None]
 
 
 def tell_left_out(source: Source, model: Model) -> None:
@@ -189,7 +187,7 @@ def tell_left_out(source: Source, model: Model) -> None:
     if unused:
         named = [f"{name} ({source.left_out[name]})" if name in source.left_out else name for name in unused]
         warn(
-            f"{len(unused)} of {len(names | used)} photographs have no pose in the model and are left out: "
+            f"{len(unused)} of {len(used) + len(unused)} photographs have no pose in the model and are left out: "
             f"{listed(named)}."
         )
 
@@ -213,9 +211,9 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
     c2w = np.stack([_camera_to_world(image.qvec, image.tvec) for image in model.images])
     if place.auto_scale_poses:
         check_spread(c2w[:, :3, 3], str(source.folder))
-    poses, transform = auto_orient_and_center_poses(
-        torch.from_numpy(c2w.astype(np.float32)), method=place.orientation_method, center_method=place.center_method
-    )
+    there = torch.from_numpy(c2w.astype(np.float32))
+    _, transform = auto_orient_and_center_poses(there, place.orientation_method, place.center_method)
+    poses = transform @ there  # nerfstudio 1.1.5 turns two of its own the wrong way round with pca
     scale = place.scale_factor
     if place.auto_scale_poses:
         scale /= float(poses[:, :3, 3].abs().max())
@@ -307,9 +305,5 @@ def _lenses(source: Source, model: Model, files: Sequence[Path], look: bool, ann
 
 
 def _size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a photograph, of which only the header is read; None where there is none to read."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return None  # what is wrong is said where it is read
+    """Width and height of a photograph; None where there is none to read."""
+    return of_header(path, lambda image: image.size, None)

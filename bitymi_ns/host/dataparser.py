@@ -22,7 +22,9 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
+from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import finding, holdout
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import (
@@ -62,6 +64,7 @@ USED_BY: dict[str, tuple[str, ...]] = {
     "scale_factor": ("nerfstudio", *WITH_MODEL, "blender"),
     "load_3D_points": ("nerfstudio", *WITH_MODEL),
     "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL),
+    "sfm": ("photographs", "video"),
 }
 """Formats that an option is for, where that is not all of them."""
 
@@ -109,6 +112,8 @@ class BitymiDataParserConfig(DataParserConfig):
     """What becomes the origin: the middle of the cameras, or what they look at."""
     auto_scale_poses: bool = True
     """Scale the capture so that the cameras fit into a box from -1 to 1."""
+    sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
+    """How the poses of photographs and videos are found."""
 
     def settle(self) -> None:
         """Replace the name of a list of photographs by what is in it, so that config.yml stands on its own."""
@@ -159,7 +164,7 @@ class BitymiDataParserConfig(DataParserConfig):
         reduction = self.downscale_factor or 1
         if found.format == "colmap":
             return find_source(found.path, found.folder, self.images_path, self.masks_path, reduction, look=look)
-        return finding.source_of(found, self.masks_path, reduction)
+        return finding.source_of(found, self.masks_path, reduction, self.sfm)
 
 
 class BitymiDataParser(DataParser):
@@ -167,6 +172,7 @@ class BitymiDataParser(DataParser):
 
     Attributes:
         downscale_factor: set by nerfstudio where photographs are not needed, so that none is opened; else None.
+        poses_report: folder of the report on how the poses were found, once the views are read; None = there is none.
     """
 
     config: BitymiDataParserConfig
@@ -174,6 +180,7 @@ class BitymiDataParser(DataParser):
     def __init__(self, config: BitymiDataParserConfig) -> None:
         super().__init__(config)
         self.downscale_factor: int | None = None
+        self.poses_report: Path | None = None
 
     @cached_property
     def splits(self) -> dict[str, DataparserOutputs]:
@@ -181,6 +188,7 @@ class BitymiDataParser(DataParser):
         found = self.config.find()
         if found.format == "blender":
             return self._blender(found)
+        self.poses_report = None if read_frame(found.folder) is None else found.folder
         outputs, lists = self._colmap(found) if found.format in WITH_MODEL else self._transforms(found)
         split = self._holdout(outputs.image_filenames, lists, found)
         say(split.told(outputs.image_filenames))
@@ -226,6 +234,7 @@ class BitymiDataParser(DataParser):
         """All views of a COLMAP model, and the lists of photographs beside it."""
         look = self.downscale_factor is None
         source = self.config.source(found, look)
+        self.poses_report = source.report or self.poses_report
         model = read_model(source.folder)
         self._tell(found, source.told(model))
         if look:
@@ -248,7 +257,10 @@ class BitymiDataParser(DataParser):
         return {"val": splits[there[0]], "test": splits[there[-1]], **splits}
 
     def _tell(self, found: Found, what: str) -> None:
-        say(f"Reading {what}. {found.how_to_choose()}".rstrip())
+        text = f"Reading {what}. {found.how_to_choose()}"
+        if found.format == "instant-ngp" and self.config.format == "auto":  # by a guess: both use one name
+            text = f"{text.rstrip()} If nerfstudio wrote it: `bitymi-data --format nerfstudio`."
+        say(text.rstrip())
 
     def _holdout(self, names: Sequence[Path], lists: Lists, found: Found) -> holdout.Split:
         config = self.config

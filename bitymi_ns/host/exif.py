@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
 from PIL.ExifTags import IFD, Base
 
 from bitymi_ns.capture.exif import number
-from bitymi_ns.host.images import THREADS
+from bitymi_ns.host.images import THREADS, of_header
 from bitymi_ns.train.exposure import exif_stops
 
 TAGS = (Base.ExposureTime, Base.FNumber, Base.ISOSpeedRatings)
@@ -41,11 +40,7 @@ def _given(settings: Settings) -> tuple[bool, ...]:
 
 def _settings(path: Path) -> Settings | None:
     """Shutter time, f-number and ISO, 0 for what is not stated; None where the time is not, or nothing can be read."""
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif().get_ifd(IFD.Exif)
-    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError):
-        return None  # what is wrong is said where the picture is read
+    exif = of_header(path, lambda image: image.getexif().get_ifd(IFD.Exif), {})
     values = [_number(exif.get(tag)) for tag in TAGS]
     return (values[0], values[1], values[2]) if values[0] else None
 

@@ -30,6 +30,7 @@ from bitymi_ns.bake.statistics import FineTuning, HeldOut, Percentiles
 from bitymi_ns.bundle import BundleError, export, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, SURFELS, Manifest, dump
 from bitymi_ns.bundle.write import World
+from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
@@ -108,7 +109,6 @@ class ExportAtlas(BakeOptions):
     def _run(self, options: BakeOptions, tune: TuneOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
-        outputs = datamanager.train_dataparser_outputs
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         finetunes = self.finetune_steps != 0 and not self.exact and model.scene.field is not None
@@ -137,7 +137,7 @@ class ExportAtlas(BakeOptions):
             baked,
             self.output_dir,
             background=background,
-            world=World(np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)),
+            world=world_of(datamanager),
             statistics={"options": asdict(options), "method": config.method_name},
             extra_files={"preview.png": preview(model, datamanager, views)},
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
@@ -186,6 +186,15 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
             "give the config.yml of a bitymi training run"
         )
     return config, pipeline
+
+
+def world_of(datamanager: Any) -> World:
+    """Where the scene lies in the capture's own frame, and that in the real world where its poses were found here."""
+    outputs = datamanager.train_dataparser_outputs
+    report = getattr(datamanager.dataparser, "poses_report", None)
+    frame = None if report is None else read_frame(report)
+    transform, scale = np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)
+    return World(transform, scale) if frame is None else World(transform, scale, UP, frame.up, frame.metres_per_unit)
 
 
 @torch.no_grad()

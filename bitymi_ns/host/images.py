@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
+from bitymi_ns.capture.photos import eight_bits
 from bitymi_ns.host.errors import fail, listed, warn
 
+T = TypeVar("T")
 ORIENTATION = 0x0112
 """The EXIF tag that asks viewers to turn a photograph; 1 = as it is stored."""
 MOST_PIXELS = 1_000_000_000
@@ -21,6 +23,21 @@ MOST_PIXELS = 1_000_000_000
 THREADS = 4
 FINGERPRINT = 64
 """Pixels across, and down, that decide whether two photographs are the same."""
+
+
+def of_header(path: Path, look: Callable[[Image.Image], T], otherwise: T) -> T:
+    """What a look at a photograph's header says, its pixels unread.
+
+    Args:
+        path: of the file.
+        look: gets the opened file.
+        otherwise: the result where there is nothing to read; what is wrong with a file is said where it is read.
+    """
+    try:
+        with Image.open(path) as image:
+            return look(image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return otherwise
 
 
 def allow_large_photographs() -> None:
@@ -69,7 +86,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
                 fail(wrong_size(path, file.size, stored))
             if wanted is not None:
                 file.draft(None, wanted)
-            return _eight_bits(file).convert("RGBA" if has_transparency(file) else "RGB")
+            return eight_bits(file).convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -91,25 +108,6 @@ def read_mask(path: Path) -> Image.Image:
         fail(f"the mask {path} cannot be read: {error}. Replace it, or remove the masks from the capture.", error)
 
 
-def _eight_bits(image: Image.Image) -> Image.Image:
-    """The image, of which deep grey modes are scaled to 8 bits."""
-    if not image.mode.startswith(("I", "F")):
-        return image
-    values = np.asarray(image, dtype=np.float64)
-    low, high = float(values.min()), float(values.max())
-    if image.mode.startswith("I;16") or image.format == "PNG":
-        whites = (65535.0,)
-    else:  # TIFF and the like, which do not say what white is
-        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
-    white = next((white for white in whites if high <= white), None)
-    if white is None or not low >= 0.0:  # also NaN
-        raise ValueError(
-            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
-            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
-        )
-    return Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
-
-
 def _not_black(image: Image.Image) -> npt.NDArray[np.bool_]:
     if image.mode.startswith(("I", "F")):
         return np.asarray(image) != 0
@@ -123,22 +121,18 @@ def has_transparency(image: Image.Image) -> bool:
 
 def file_has_transparency(path: Path) -> bool:
     """The same for a file, of which only the header is read; False when there is none to read."""
-    try:
-        with Image.open(path) as image:
-            return has_transparency(image)
-    except (OSError, SyntaxError, ValueError):
-        return False
+    return of_header(path, has_transparency, False)
 
 
 def orientation(path: Path) -> int:
     """How the file asks viewers to turn it, by its EXIF tag; 1 = not at all, also where there is none to read."""
-    try:
-        with Image.open(path) as image:
-            if image.format == "PNG" and "exif" not in image.info:
-                return 1  # else PIL would decode the whole image in search of it
-            value = image.getexif().get(ORIENTATION, 1)
-    except (OSError, SyntaxError, ValueError):
-        return 1
+
+    def look(image: Image.Image) -> int:
+        if image.format == "PNG" and "exif" not in image.info:
+            return 1  # else PIL would decode the whole image in search of it
+        return image.getexif().get(ORIENTATION, 1)
+
+    value = of_header(path, look, 1)
     return value if value in range(1, 9) else 1
 
 

@@ -1,15 +1,19 @@
-"""The folder of a training run: one process at a time trains into it."""
+"""The folder of a training run: one process at a time trains into it, and it keeps how the poses were found."""
 
 from __future__ import annotations
 
 import atexit
+import shutil
 from pathlib import Path
 
 from bitymi_ns import files
+from bitymi_ns.capture.report import FILES
 from bitymi_ns.host.errors import fail, warn
 
 LOCK = ".lock"
 """Name of the file that lies in a run folder while a process trains into it."""
+POSES = "poses"
+"""Folder in that of the run for the report on how the poses were found, where they were found by this package."""
 
 
 def take(folder: Path) -> None:
@@ -52,6 +56,24 @@ def check_unused(folder: Path, checkpoints: Path) -> None:
 def leave(folder: Path) -> None:
     """Let other processes train into the folder."""
     files.release(folder / LOCK)
+
+
+def keep_poses_report(folder: Path, report: Path | None) -> None:
+    """Copy the report on how the poses were found to POSES, so that it stays when the photographs go.
+
+    Args:
+        folder: the run's.
+        report: folder of the report; None = the capture came with its poses.
+    """
+    there = [] if report is None else [report / name for name in FILES if (report / name).is_file()]
+    if not there:
+        return
+    try:
+        with files.complete_folder(folder / POSES, tell=warn) as new:
+            for file in there:
+                shutil.copyfile(file, new / file.name)
+    except OSError as error:
+        warn(f"How the poses were found is not kept with the run: {files.reason(error, folder)}.")
 
 
 def check_space(folder: Path, needed: int) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.bundle import Bundle, Check, check_field, check_view_color
+from bitymi_ns.bundle import Bundle, Check, check_field, check_place, check_view_color
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
-from bitymi_ns.host.export import held_out_psnr, load_trained
+from bitymi_ns.host.export import held_out_psnr, load_trained, world_of
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -43,7 +43,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         detail += "" if stated is None else f" (stated {stated:.2f})"
         detail += f"; against the photographs {photos:+.3f} dB"
         checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
-    return checks
+    return [*checks, check_place(bundle.info.world, world_of(datamanager))]
 
 
 def find_run(run: Path) -> tuple[Path, int | None]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import pytest
 from hypothesis import given
@@ -79,3 +80,51 @@ def test_position_time_and_camera_are_read() -> None:
 def test_a_position_of_zeros_is_none() -> None:
     zeros = {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)}
     assert with_exif(lambda exif: exif.get_ifd(ExifTags.IFD.GPSInfo).update(zeros)).position is None
+
+
+def apple_note(*acceleration: float, first: int = 3) -> bytes:
+    """A maker note as phones write it: another entry, the acceleration, and where each is stored."""
+    entries = struct.pack(">HHII", first, 7, 4, 0) + struct.pack(">HHII", 8, 10, 3, 14 + 2 + 2 * 12 + 4)
+    parts = [part for value in acceleration for part in (round(value * 10_000), 10_000)]
+    return b"Apple iOS\0\0\1MM" + struct.pack(">H", 2) + entries + struct.pack(">I6i", 0, *parts)
+
+
+def up_of(note: bytes, orientation: int = 1, lens: str = "iPhone 15 back camera") -> tuple[float, float, float] | None:
+    def fill(exif: Image.Exif) -> None:
+        exif[B.Make], exif[B.Orientation] = "Apple", orientation
+        exif.get_ifd(ExifTags.IFD.Exif).update({B.MakerNote: note, B.LensModel: lens})
+
+    return with_exif(fill).up
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "orientation", "up"),
+    [
+        ((-1.0, 0.0, 0.0), 1, (0, -1, 0)),  # held across, its right side up
+        ((1.0, 0.0, 0.0), 3, (0, -1, 0)),  # across, its left side up
+        ((0.0, -1.0, 0.0), 6, (0, -1, 0)),  # upright
+        ((0.0, 1.0, 0.0), 8, (0, -1, 0)),  # on its head
+        ((0.0, -0.8, -0.6), 6, (0, -0.8, -0.6)),  # upright, the camera turned to the ground
+        ((0.0, 0.0, -1.0), 6, (0, 0, -1)),  # lying on its back, the camera looks to the ground
+        ((0.17, -0.98, 0.0), 6, (-0.171, -0.985, 0)),  # upright, turned a little towards its right side
+    ],
+)
+def test_up_is_that_of_the_phones_accelerometer(
+    acceleration: tuple[float, float, float], orientation: int, up: tuple[float, float, float]
+) -> None:
+    assert up_of(apple_note(*acceleration), orientation) == pytest.approx(up, abs=1e-3)
+
+
+def test_an_acceleration_that_cannot_be_gravity_is_not_believed() -> None:
+    assert up_of(apple_note(0.0, -1.3, 0.0), 6) is None, "the phone was moved"
+    assert up_of(apple_note(0.0, -1.0, 0.0), 1) is None, "turned by hand afterwards"
+    assert up_of(apple_note(0.0, -1.0, 0.0), 5) is None, "mirrored"
+    assert up_of(apple_note(0.0, -1.0, 0.0), 6, "iPhone 15 front TrueDepth camera") is None
+
+
+@given(st.integers(0, 80), st.binary(max_size=8))
+def test_a_broken_maker_note_is_none(length: int, more: bytes) -> None:
+    whole = apple_note(0.0, -1.0, 0.0)
+    found = up_of(whole[:length] + more, 6)
+    assert found is None or len(found) == 3
+    assert up_of(b"Nikon" + whole) is None and up_of(b"") is None

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
 
-from bitymi_ns.capture.frame import local_positions, settle
+from bitymi_ns.capture.frame import UP, local_positions, read_frame, settle, write_frame
 
 
 def synthetic(seed: int = 0) -> pycolmap.Reconstruction:
@@ -71,3 +73,51 @@ def test_without_gps_up_is_that_of_the_cameras() -> None:
     places = np.array(list(centers(model).values()))
     np.testing.assert_allclose(places.mean(axis=0), 0, atol=1e-9)
     assert np.linalg.norm(places, axis=1).mean() == pytest.approx(1)
+
+
+def held(model: pycolmap.Reconstruction, up: np.ndarray, wrong: int = 0) -> dict[str, tuple[float, float, float]]:
+    """What the accelerometers say of this up, with an error of a degree; the first ones say something else."""
+    rng = np.random.default_rng(0)
+    found = {}
+    for i, image in enumerate(sorted(model.images.values(), key=lambda image: image.name)):
+        said = rng.normal(size=3) if i < wrong else up + rng.normal(0, 0.017, 3)
+        x, y, z = image.cam_from_world().rotation.matrix() @ (said / np.linalg.norm(said))
+        found[image.name] = (x, y, z)
+    return found
+
+
+@pytest.mark.parametrize(("wrong", "source"), [(0, "gravity"), (4, "gravity"), (10, "cameras")])
+def test_up_is_what_most_accelerometers_say(wrong: int, source: str) -> None:
+    model = synthetic()
+    up = np.array([0.36, 0.48, 0.8])
+    frame = settle(model, {}, held(model, up, wrong))
+    assert frame.up == source and frame.metres_per_unit is None
+    if source == "gravity":
+        assert np.array(frame.transform)[2, :3] @ up / np.linalg.norm(np.array(frame.transform)[2, :3]) > 0.9998
+
+
+def test_two_accelerometers_are_too_few() -> None:
+    model = synthetic()
+    assert settle(model, {}, dict(list(held(model, np.array(UP)).items())[:2])).up == "cameras"
+
+
+def test_gravity_says_what_is_up_and_gps_how_long_a_metre_is() -> None:
+    model = synthetic()
+    scale = 40 / np.std(list(centers(model).values()))
+    true = {name: scale * place for name, place in centers(model).items()}
+    ups = held(model, np.array(UP))
+    rng = np.random.default_rng(0)
+    places = {name: to_degrees(place + rng.normal(0, 4, 3)) for name, place in true.items()}
+    frame = settle(model, places, ups)
+    assert frame.up == "gravity" and frame.metres_per_unit == 1 and frame.gps_error < 10
+    turn = np.array(frame.transform)[:, :3]
+    assert turn[2] @ UP / np.linalg.norm(turn[2]) > 0.9998
+    assert np.cbrt(np.linalg.det(turn)) == pytest.approx(scale, rel=0.1)
+    north = turn @ [0, 1, 0]
+    assert north[1] / np.linalg.norm(north) > 0.97, "y is north"
+
+
+def test_the_frame_is_read_as_it_was_written(tmp_path: Path) -> None:
+    frame = settle(synthetic(), {})
+    write_frame(tmp_path, frame)
+    assert read_frame(tmp_path) == frame

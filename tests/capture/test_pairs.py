@@ -1,15 +1,20 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bitymi_ns.capture.sfm import pairs
 from bitymi_ns.capture.sfm.explain import ViewGraph, left_out
+from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.sfm.pairs import NEIGHBOURS, is_sequence, nearest, sequence
 
 
-def connected(count: int, pairs: set[tuple[int, int]]) -> bool:
-    graph = ViewGraph({str(i): 100 for i in range(count)}, {(str(i), str(j)): 20 for i, j in pairs})
+def connected(count: int, found: set[tuple[int, int]]) -> bool:
+    graph = ViewGraph({str(i): 100 for i in range(count)}, {(str(i), str(j)): 20 for i, j in found})
     return count < 2 or len(graph.components()[0]) == count
 
 
@@ -51,3 +56,26 @@ def test_reasons_name_what_is_missing() -> None:
     assert "no other photograph" in reasons["alone.jpg"]
     assert "left out as well" in reasons["c.jpg"]
     assert "16 matches" in reasons["weak.jpg"]
+
+
+def job_of(places: dict[str, list[float]], order: list[str]) -> Job:
+    return Job("", "", None, [], order, {name: name for name in order}, False, places)
+
+
+def test_photographs_are_compared_with_those_near_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    count = 60
+    monkeypatch.setattr(pairs, "likeness", lambda job, database, tell: np.zeros((count, count), np.float32))
+    order = [f"{i}" for i in np.random.default_rng(0).permutation(count)]
+    line = {name: [10.0 * int(name), 0.0, 0.0] for name in order}
+
+    def chosen(places: dict[str, list[float]]) -> set[tuple[int, int]]:
+        found = pairs.choose(job_of(places, order), Path(), lambda *said: None)
+        return {(int(order[i]), int(order[j])) for i, j in found}
+
+    alone = chosen({})
+    near = chosen(line) - alone
+    assert max(abs(a - b) for a, b in near) <= NEIGHBOURS
+    for i in range(count):
+        for step in range(1, NEIGHBOURS // 2):  # half of the nearest lie on either side
+            assert i + step >= count or {(i, i + step), (i + step, i)} & (near | alone)
+    assert chosen({name: line[name] for name in order[:NEIGHBOURS]}) == alone, "a few say nothing of the others"

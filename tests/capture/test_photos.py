@@ -7,6 +7,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from bitymi_ns.capture.photos import find_photos, natural, photo_folder, read_photo, read_photos, upright
+from bitymi_ns.capture.prepare import mask_of
 from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.types import CaptureError
 
@@ -86,3 +87,49 @@ def test_duplicates_are_found_and_neighbours_are_none(arc: Path, tmp_path: Path)
     photos, _ = read_photos(tmp_path, find_photos(tmp_path), silent)
     found = {frozenset(pair) for pair in duplicates(photos).items()}
     assert found == {frozenset(("burst.png", "2.png")), frozenset(("again.png", "3.png"))}
+
+
+def deep(pixels: np.ndarray) -> Image.Image:
+    """A grey picture of 16 bits per pixel."""
+    return Image.fromarray(pixels.mean(axis=2).astype(np.uint16) * 257)
+
+
+@pytest.mark.parametrize(("suffix", "options"), [("png", {}), ("tif", {"compression": "tiff_lzw"})])
+def test_deep_grey_pictures_are_scaled_and_turned(
+    tmp_path: Path, pictures: list[np.ndarray], suffix: str, options: dict[str, str]
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    deep(pictures[0]).save(tmp_path / f"a.{suffix}", exif=exif, **options)
+    photo = read_photo(tmp_path, f"a.{suffix}")
+    assert (photo.width, photo.height) == (216, 288) and not photo.plain
+    expected = np.rot90(pictures[0].mean(axis=2), -1)
+    assert np.abs(np.asarray(upright(photo).convert("L"), float) - expected).max() < 2
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("a.png", "a.jpg"),
+        ("a.jpg.png", "a.jpg"),
+        ("a.jpg", "a.png"),
+        ("b/a.png", "b/a.jpg"),
+        ("a.png", "a.heic.jpg"),  # an upright copy
+        ("a.heic.png", "a.heic.jpg"),
+        ("a.heic.jpg.png", "a.heic.jpg"),
+        ("a.png", "b/a.jpg"),
+        ("a.png", "a.b.jpg"),
+    ],
+)
+def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, file: str, name: str) -> None:
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"")
+    assert mask_of(tmp_path, name) == (None if (file, name) in [("a.png", "b/a.jpg"), ("a.png", "a.b.jpg")] else path)
+
+
+def test_a_file_of_several_pictures_is_not_used_as_it_is(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    first, second = (Image.fromarray(picture) for picture in pictures[:2])
+    first.save(tmp_path / "a.tif", save_all=True, append_images=[second])
+    photo = read_photo(tmp_path, "a.tif")
+    assert not photo.plain and np.array_equal(np.asarray(upright(photo)), pictures[0])

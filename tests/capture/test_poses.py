@@ -5,22 +5,25 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
-from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
+from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, SfmSettings, find_poses, triangulate
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.photos import Photo
-from bitymi_ns.capture.poses import by_camera, camera_group
+from bitymi_ns.capture.poses import by_camera, camera_group, make_job, ordered
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import View, render
 from bitymi_ns.sample.room import Room
+from tests.capture.test_exif import apple_note
 
 Copy = Callable[[str], Path]
+B = ExifTags.Base
 
 
 @pytest.fixture(scope="module")
@@ -230,3 +233,70 @@ def test_a_focal_length_is_known_only_if_all_photographs_state_it() -> None:
 def test_options_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(CaptureError, match=f"{name} is .*: give a number of at least"):
         SfmOptions(**{name: value})
+
+
+OTHER = {
+    "matching": "sequential",
+    "mapper": "global",
+    "camera_model": "OPENCV",
+    "focal_length": 321.0,
+    "max_image_size": 800,
+    "max_features": 1234,
+    "frames": 30,
+}
+"""Another value of every setting."""
+
+
+def test_every_setting_is_part_of_the_key(copied: Copy, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, keys = copied("keys"), []
+    monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: keys.append(arguments[-2].name))
+    assert OTHER.keys() == {field.name for field in fields(SfmSettings)}
+    for options in [{}, {}, *({name: value} for name, value in OTHER.items())]:
+        find_poses(folder, SfmOptions(**options))
+    assert keys[0] == keys[1] and len(set(keys)) == 1 + len(OTHER)
+
+
+def test_every_setting_reaches_the_job(tmp_path: Path) -> None:
+    photos = [photo("a.jpg", focal_length=350.0)]
+    job = make_job(photos, tmp_path, {"a.jpg": "a.jpg"}, None, SfmOptions(**OTHER), tmp_path, sequence=False)
+    assert (job.matching, job.mapper, job.max_image_size, job.max_features) == ("sequential", "global", 800, 1234)
+    (camera,) = job.cameras
+    assert camera.model == "OPENCV" and camera.params[:2] == [321.0, 321.0] and not job.opencv_if_better
+
+
+def test_photographs_are_in_the_order_of_their_times() -> None:
+    times = {"a": "2024:05:01 10:00:02", "b": "2024:05:01 10:00:01.5", "c": "2024:05:01 10:00:01.25"}
+    taken = [photo(name, time=time) for name, time in times.items()]
+    assert [each.name for each in ordered(taken)] == ["c", "b", "a"]
+    assert ordered([*taken, photo("d")])[-1].name == "d", "by name where one has no time"
+    same = [photo(name, time=times["a"]) for name in "xcb"]
+    assert [each.name for each in ordered(same)] == ["x", "c", "b"], "as they are where all times are the same"
+
+
+def test_heic_photographs(tmp_path: Path, pictures: list[np.ndarray], views: list[View]) -> None:
+    """As phones take them: turned and the turn stored, with the lens, the time and gravity in EXIF."""
+    folder = tmp_path / "phone"
+    folder.mkdir()
+    for i, (picture, view) in enumerate(zip(pictures, views, strict=True)):
+        exif = Image.Exif()
+        exif[B.Make], exif[B.Orientation] = "Apple", 6
+        film = round(view.focal / np.hypot(288, 216) * np.hypot(36, 24))
+        note = apple_note(*-view.camera_to_world[2, :3])  # the phone's axes are the upright picture's, each reversed
+        exif.get_ifd(ExifTags.IFD.Exif).update(
+            {B.FocalLengthIn35mmFilm: film, B.DateTimeOriginal: f"2024:05:01 10:00:{59 - i}", B.MakerNote: note}
+        )
+        stored = Image.fromarray(np.ascontiguousarray(np.rot90(picture)))
+        stored.save(folder / f"IMG_{i}.HEIC", exif=exif.tobytes(), quality=95)
+    poses = find_poses(folder)
+    assert poses.registered == len(pictures)
+    model = pycolmap.Reconstruction(poses.model)
+    assert {image.name for image in model.images.values()} == {f"IMG_{i}.HEIC.jpg" for i in range(len(pictures))}
+    assert all(Image.open(poses.images / image.name).size == (288, 216) for image in model.images.values())
+    (camera,) = json.loads((poses.report / "report.json").read_text("utf8"))["cameras"]
+    assert camera["prior"] and abs(camera["params"][0] / views[0].focal - 1) < 0.05
+    frame = json.loads((poses.report / "frame.json").read_text("utf8"))
+    assert frame["up"] == "gravity"
+    names = [f"IMG_{i}.HEIC.jpg" for i in range(len(pictures))]
+    found = np.array([model.find_image_with_name(name).projection_center() for name in names])
+    similarity = pycolmap.estimate_sim3d(found, known_centers(views))
+    assert (similarity.rotation.matrix() @ [0, 0, 1])[2] > 0.999

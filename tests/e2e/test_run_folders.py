@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import copy
 import errno
+import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
 
+from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.host import run_folder
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.errors import InputError
+from bitymi_ns.measure.report import build
 from tests.e2e.runs import Start, checkpoint
 
 
@@ -96,3 +101,18 @@ def test_a_new_run_keeps_out_of_the_folder_of_an_earlier_one(trained: BitymiTrai
     ):
         ns_train.main(config)
     assert len(list(trained.get_checkpoint_dir().glob("*.ckpt"))) == 3
+
+
+def test_a_run_keeps_how_its_poses_were_found(start: Start, room: Path, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(room, tmp_path / "capture"))
+    write_frame(capture, WorldFrame("gps", 1.0, None, 2.0, 12, [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]))
+    found = {"source": "photos", "given": 14, "registered": 12, "reprojection_error": 0.5, "track_length": 3.0}
+    (capture / "report.json").write_text(json.dumps({**found, "left_out": {"a.jpg": "blurred"}, "seconds": {"all": 9}}))
+    config = start(data=capture)
+    config.max_num_iterations = 1
+    ns_train.main(config)
+    shutil.rmtree(capture)
+    page = build([config.get_base_dir()], tmp_path / "report").read_text("utf8")
+    assert "12 of 14" in page and "a.jpg" in page and "blurred" in page
+    kept = (config.get_base_dir() / "poses").iterdir()
+    assert sorted(path.name for path in kept) == ["frame.json", "report.json"]

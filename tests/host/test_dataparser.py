@@ -268,7 +268,9 @@ def ngp(capture: Path, edit: Any) -> Path:
 
 def test_instant_ngps_transforms(ngp: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one = load_any(ngp)
-    assert "transforms.json (instant-ngp, 12 photographs)" in said(capsys)
+    text = said(capsys)
+    assert "transforms.json (instant-ngp, 12 photographs)" in text
+    assert "If nerfstudio wrote it: `bitymi-data --format nerfstudio`." in text
     assert [path.name for path in one.eval_dataset.image_filenames] == ["frame_00001.png", "frame_00009.png"]
     assert one.train_dataset.metadata["declares_box"] is True
     assert one.train_dataset.scene_box.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]

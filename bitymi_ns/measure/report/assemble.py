@@ -15,6 +15,7 @@ from bitymi_ns.measure.report.knob_plots import knob_tables
 from bitymi_ns.measure.report.page import GENERATOR, Content, to_page, to_report_md
 from bitymi_ns.measure.report.paper import paper_tables, wanted
 from bitymi_ns.measure.report.plots import draw_plots, is_plot_name
+from bitymi_ns.measure.report.poses import shown as shown_poses
 from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
 from bitymi_ns.measure.report.tables import everything_table, quality_tables, summary, training_table
 from bitymi_ns.measure.report.views import compare_views
@@ -35,6 +36,7 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
     views, others, view_notes = compare_views(records.images)
     gallery, notes = make_gallery(others)
     worst, more_notes = make_worst(records.worst)
+    poses, poses_notes = shown_poses(records.poses)
     counts = [
         _counted(number, noun)
         for number, noun in (
@@ -42,6 +44,7 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
             (len(records.curves), "training run"),
             (len({row.scene for row in records.evaluations}), "scene"),
             (len(records.knobs), "knob setting"),
+            (len(poses), "capture whose poses were found"),
         )
         if number
     ]
@@ -54,6 +57,7 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
         summary=summary(shown),
         quality=quality_tables(shown),
         training=training_table(records.curves),
+        poses=poses,
         everything=everything_table(records.evaluations),
         plots=draw_plots(records),
         knobs=knob_tables(records.knobs),
@@ -61,7 +65,7 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
         views=views,
         worst=worst,
         gallery=gallery,
-        notes=[*records.notes, *view_notes, *notes, *more_notes],
+        notes=[*records.notes, *view_notes, *notes, *more_notes, *poses_notes],
     )
 
 
@@ -97,8 +101,8 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
 
     Args:
         inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
-            `fragments`, `psnr`), cells, knobs and pictures of `bitymi bench`, PNG images, and folders that are searched
-            for all of these.
+            `fragments`, `psnr`), cells, knobs and pictures of `bitymi bench`, report.json of
+            camera poses, PNG images, and folders that are searched for all of these.
         output_dir: folder of the report; made if needed. A report of an earlier call is replaced.
         title: heading of the page.
         published: show the paper's tables even when the input has no scene of its data sets.

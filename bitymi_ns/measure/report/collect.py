@@ -1,4 +1,4 @@
-"""Find evaluations, training curves and rendered images among files and folders."""
+"""Find evaluations, training curves, reports of camera poses and rendered images among files and folders."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bitymi_ns.measure.report.cells import CELLS, PICTURES, is_cell, is_knob, knob_from, read_cells, read_pictures
+from bitymi_ns.measure.report.poses import is_poses, poses_from
 from bitymi_ns.measure.report.records import (
     Records,
     ReportError,
     add_training_time,
     disambiguate,
+    evaluation_from,
+    is_evaluation,
     link_curves,
     read_json,
     read_jsonl,
@@ -79,7 +82,11 @@ def _read(path: Path, records: Records) -> bool:
         records.worst += views
         return bool(views)
     else:
-        evaluations, curves = read_json(path), []
+        data = read_json(path)
+        if is_poses(data):
+            records.poses.append(poses_from(data, path))
+            return True
+        evaluations, curves = [evaluation_from(data, path)] if is_evaluation(data) else [], []
     records.evaluations += evaluations
     return bool(evaluations or curves)
 
@@ -102,8 +109,8 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
     """Read all inputs.
 
     Args:
-        inputs: ns-eval JSON files, training curves, cells and knobs of `bitymi bench` (JSONL), pictures.json, PNG
-            images, and folders that are searched for all of these.
+        inputs: ns-eval JSON files, training curves, cells and knobs of `bitymi bench` (JSONL), pictures.json,
+            report.json of camera poses, PNG images, and folders that are searched for all of these.
         output_dir: where the report goes; not searched when it lies inside one of the folders.
 
     Raises:
@@ -124,9 +131,9 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
             if not _read(path, records):
                 raise ReportError(
                     f"{path} holds neither an evaluation (a JSON object with 'results', as ns-eval writes it) "
-                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench."
+                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench, nor how poses were found."
                 )
-    if not (records.evaluations or records.curves or records.knobs or records.worst):
+    if not (records.evaluations or records.curves or records.knobs or records.worst or records.poses):
         where = ", ".join(map(str, paths)) or "no inputs"
         more = "".join(f"\n  {note}" for note in records.notes)
         raise ReportError(

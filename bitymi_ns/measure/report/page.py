@@ -8,6 +8,7 @@ from bitymi_ns.measure.report.drawing import Plot
 from bitymi_ns.measure.report.gallery import Group
 from bitymi_ns.measure.report.knob_plots import KNOBS
 from bitymi_ns.measure.report.plots import CURVES
+from bitymi_ns.measure.report.poses import PosesShown
 from bitymi_ns.measure.report.tables import NOTES, Table, to_markdown
 from bitymi_ns.measure.report.views import ERROR_CAPTION, ComparedSet
 from bitymi_ns.measure.templates import rendered
@@ -25,6 +26,7 @@ class Content:
         intro: a line on what was read, and the program's version.
         summary: sentences on what baking changed.
         quality: tables of evaluations; training: of runs; everything: every recorded number.
+        poses: how the camera poses of captures were found.
         plots: drawn plots.
         knobs: tables of the quality knobs.
         paper: the paper's tables, with ours.
@@ -40,6 +42,7 @@ class Content:
     quality: list[Table]
     training: Table | None
     everything: Table | None
+    poses: list[PosesShown]
     plots: list[Plot]
     knobs: list[Table]
     paper: list[Table]
@@ -116,6 +119,8 @@ def to_report_md(content: Content) -> str:
         parts += ["## Quality and speed", *_markdown_tables(content.quality), NOTES]
     if content.training:
         parts += ["## Training", to_markdown(content.training)]
+    for each in content.poses:
+        parts += ["## Camera poses", *_markdown_tables(list(each.tables))]
     for section in _sections(content.plots):
         parts += [f"## {section.name}", *(f"![{plot.title}]({plot.name}.png)" for plot in section.plots)]
         parts += [*_markdown_tables(content.knobs), KNOB_NOTE] if section.name == KNOBS else []

@@ -117,6 +117,28 @@ class WorstView:
     pictures: tuple[tuple[str, Path], ...]
 
 
+@dataclass(frozen=True)
+class FoundPoses:
+    """How the poses of one capture were found.
+
+    Attributes:
+        source: the photographs or the video.
+        numbers: registered, given, reprojection_error, track_length, points, ...: those that are finite.
+        seconds: of every stage.
+        left_out: photographs without a pose, and why; notes: what else there is to say of photographs.
+        frame: where up and scale come from.
+        file: the report.json that was read; the picture lies beside it.
+    """
+
+    source: str
+    numbers: dict[str, float]
+    seconds: dict[str, float]
+    left_out: dict[str, str]
+    notes: dict[str, str]
+    frame: str
+    file: Path
+
+
 @dataclass
 class Records:
     """Everything that was read, with notes on what was skipped and why."""
@@ -126,6 +148,7 @@ class Records:
     images: list[Path] = field(default_factory=list)
     knobs: list[KnobPoint] = field(default_factory=list)
     worst: list[WorstView] = field(default_factory=list)
+    poses: list[FoundPoses] = field(default_factory=list)
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -231,10 +254,9 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
     return Curve(scene, label or source.stem, [points[step] for step in sorted(points)], source)
 
 
-def read_json(path: Path) -> list[Evaluation]:
-    """The evaluation in a JSON file; an empty list when the file holds something else."""
-    data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
-    return [evaluation_from(data, path)] if is_evaluation(data) else []
+def read_json(path: Path) -> Any:
+    """What a JSON file holds."""
+    return parse_json(read_text(path, MAX_JSON_BYTES), str(path))
 
 
 def read_lines(path: Path) -> tuple[list[tuple[int, Any]], list[str]]:

@@ -19,7 +19,7 @@ def make(scene="fox", method="bitymi", checkpoint="", source="a/eval.json", **re
 def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
     path = tmp_path / "eval.json"
     path.write_text('{"results": {"psnr": 20.5, "psnr_std": NaN, "lpips": Infinity, "note": "x", "flag": true}}')
-    (row,) = read_json(path)
+    row = evaluation_from(read_json(path), path)
     assert row.results == {"psnr": 20.5}
     assert row.scene == tmp_path.name and row.method == "unnamed method"
 

@@ -54,8 +54,16 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
     return [*command, *python("card_smoke.py", "--sections", *sections)]
 
 
-def orders(results: Path, data: Path) -> dict[str, list[Step]]:
-    """What can be run: name -> steps. `fox` needs that capture in `data`; `train` takes every other one there."""
+def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
+    """What can be run: name -> steps. `fox` needs that capture in `data`; `train` takes every other one there.
+
+    Args:
+        results: folder of the tables.
+        data: folder of captures.
+        surfels: sizes of the scenes in the tables.
+        steps: of the runs of `train`; None = the preset's.
+    """
+    length = [] if steps is None else ["--steps", str(steps)]
     tests = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", "--timeout=90", "tests/cuda"]
     bundles = results / "bundles"
     baked = ("--surfels", "150000", "--runs", "100", "--no-check", "--sections", "baked")
@@ -69,7 +77,14 @@ def orders(results: Path, data: Path) -> dict[str, list[Step]]:
             Step("sanitizers", [sanitizer(tool, "baked", "training") for tool in SANITIZERS], 150),
         ],
         "tables": [
-            Step("tables", [python("gpu.py", "--runs", "100", "--no-check", "--output", str(results / "gpu.md"))], 240),
+            Step(
+                "tables",
+                [
+                    python("gpu.py", "--runs", "100", "--no-check", "--surfels", *surfels)
+                    + ["--output", str(results / "gpu.md")]
+                ],
+                240,
+            ),
         ],
         "fox": [
             Step(
@@ -100,7 +115,9 @@ def orders(results: Path, data: Path) -> dict[str, list[Step]]:
             Step(
                 name,
                 [
-                    python("gpu_train.py", str(data / name), "--presets", "bitymi", "--keep", str(bundles / name))
+                    python(
+                        "gpu_train.py", str(data / name), "--presets", "bitymi", "--keep", str(bundles / name), *length
+                    )
                     + ["--output", str(results / f"{name}.md")]
                 ],
                 600,
@@ -215,6 +232,8 @@ def main() -> int:
     running.add_argument("--stage", type=Path, required=True, help="folder of wheels")
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
+    running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
+    running.add_argument("--steps", type=int, help="of the runs of `train` (default: the preset's)")
     running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
     arguments = parser.parse_args()
     if arguments.command == "stage":
@@ -227,7 +246,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as work:
         environment = unpack(arguments.stage.resolve(), Path(work))
         for name in arguments.orders:
-            for step in orders(results, arguments.data.resolve())[name]:
+            for step in orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)[name]:
                 lines.append(run_step(step, Path(work) / "tree", environment, log, deadline))
                 print(lines[-1], flush=True)
                 (results / "summary.md").write_text("\n".join(lines) + "\n")

@@ -26,8 +26,8 @@ __device__ int64_t item(uint32_t number) {
   const uint32_t chunk = number / kChunk;
   return ((int64_t(chunk / kWarps) * gridDim.x + blockIdx.x) * kWarps + chunk % kWarps) * kChunk + number % kChunk;
 }
-// The next of the block's chunks that no warp has taken, so that warps with many look-ups take fewer chunks. Exact sums need a fixed
-// order: their warps take chunks in turn.
+// The next of the block's chunks that no warp has taken, so that warps with many look-ups take fewer chunks. Exact sums
+// need a fixed order: their warps take chunks in turn.
 __device__ uint32_t take_chunk(uint32_t* taken, int lane) {
   const uint32_t chunk = lane == 0 ? atomicAdd(taken, 1u) : 0u;
   return __shfl_sync(kFullMask, chunk, 0);

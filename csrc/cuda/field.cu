@@ -10,7 +10,7 @@ constexpr int kThreads = 128;
 template <class S>
 __global__ void __launch_bounds__(kThreads)
     field_forward_kernel(int64_t n, FieldArrays<S> field, const S* __restrict__ x, S* __restrict__ rho) {
-  __shared__ WarpMlp<S> m;
+  __shared__ ForwardMlp<S> m;
   __shared__ ForwardStage<S> stage[kThreads / kWarp];
   load_mlp(field, threadIdx.x, kThreads, m);
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -55,7 +55,7 @@ __global__ void __launch_bounds__(kThreads)
     bake_kernel(int64_t n, int64_t warps, FieldArrays<S> field, const S* __restrict__ frames,
                 const S* __restrict__ extent, const int32_t* __restrict__ tiles, const int64_t* __restrict__ first,
                 int width, int height, S* __restrict__ pages, int32_t* bad) {
-  __shared__ WarpMlp<S> m;
+  __shared__ ForwardMlp<S> m;
   __shared__ ForwardStage<S> stage[kThreads / kWarp];
   load_mlp(field, threadIdx.x, kThreads, m);
   const int64_t warp = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kWarp;

@@ -29,27 +29,28 @@ __device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec3<S> x) {
 }
 
 // Interpolated features at a grid position, to memory; those of missing levels and of look-ups that are not active are
-// 0.
+// 0. All entries of a level are asked for before the first is waited for, and a level's features leave the registers at
+// once.
 template <class S>
 __device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bool active, S* to) {
   const uint32_t mask = f.hash_mask();
-  Entry<S> features[kMaxLevels];
   BT_UNROLL
   for (int l = 0; l < kMaxLevels; ++l) {
-    BT_UNROLL
-    for (int j = 0; j < kFeatures; ++j) features[l].v[j] = S(0);
-    if (l >= f.levels || !active) continue;
-    Corners<S> at;
-    corners(c, f.resolution(l), mask, at);
-    BT_UNROLL
-    for (int k = 0; k < 8; ++k) {
-      const Entry<S> e = entry(f, l, at.index[k]);
+    Entry<S> features = {};
+    if (l < f.levels && active) {
+      Corners<S> at;
+      corners(c, f.resolution(l), mask, at);
+      Entry<S> e[8];
       BT_UNROLL
-      for (int j = 0; j < kFeatures; ++j) features[l].v[j] += at.weight[k] * e.v[j];
+      for (int k = 0; k < 8; ++k) e[k] = entry(f, l, at.index[k]);
+      BT_UNROLL
+      for (int k = 0; k < 8; ++k) {
+        BT_UNROLL
+        for (int j = 0; j < kFeatures; ++j) features.v[j] += at.weight[k] * e[k].v[j];
+      }
     }
+    *reinterpret_cast<Entry<S>*>(to + l * kFeatures) = features;
   }
-  BT_UNROLL
-  for (int l = 0; l < kMaxLevels; ++l) *reinterpret_cast<Entry<S>*>(to + l * kFeatures) = features[l];
 }
 
 // Memory of a warp for 32 values of the field. With rows 24 numbers apart the pairs that lanes read as a first factor
@@ -61,7 +62,7 @@ struct ForwardStage {
 };
 // The residual at a point per lane. All 32 lanes take part; those that are not active get the value at features of 0.
 template <class S>
-__device__ Vec3<S> evaluate(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, bool active, int lane,
+__device__ Vec3<S> evaluate(const FieldArrays<S>& f, const ForwardMlp<S>& m, Vec3<S> x, bool active, int lane,
                             ForwardStage<S>& stage) {
   using Stage = ForwardStage<S>;
   S* mine = stage.number + lane * Stage::kColumns;
@@ -84,13 +85,13 @@ __device__ Vec3<S> evaluate(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S
 
 // ---- backward, by warps
 
-// Memory of a warp for 32 look-ups: first what layers were given and their gradients, a row per look-up and rows 72
-// apart, so that a factor's numbers lie in different banks along rows and along columns. Later, in the same place, the
-// gradients of the features, and weights and entries of the corners of a level (two levels take turns). There look-ups
-// 0, 8, 16 and 24 are read together, and every eight of them begin at another bank.
+// Memory of a warp for 32 look-ups: first what layers were given and their gradients and the point, a row per look-up
+// and rows 72 apart, so that a factor's numbers lie in different banks along rows and along columns. Later, in the same
+// place, the gradients of the features, and weights and entries of the corners of a level (two levels take turns).
+// There look-ups 0, 8, 16 and 24 are read together, and every eight of them begin at another bank.
 template <class S>
 struct Stage {
-  enum { kX = 0, kH1 = 16, kG1 = 32, kG2 = 48, kD = 64, kColumns = 72 };
+  enum { kX = 0, kH1 = 16, kG1 = 32, kG2 = 48, kD = 64, kPoint = 68, kColumns = 72 };
   enum { kFeatureRows = 648, kCornerRows = 280 };
   alignas(16) S number[kWarp * kColumns];
   static_assert(kFeatureRows + 4 * kCornerRows <= kWarp * kColumns, "the second use fits into the memory of the first");
@@ -185,15 +186,15 @@ template <class S, bool kExact>
 __device__ Vec3<S> learn(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active, int lane,
                          Stage<S>& stage, WeightSums<S>& weights, const Adder<S, kExact>& table, bool positions) {
   using At = Stage<S>;
-  const Vec3<S> c = grid_position(f, x);
-  encode(f, c, active, stage.row(lane) + At::kX);
+  encode(f, grid_position(f, x), active, stage.row(lane) + At::kX);
   *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kD) = {{drho.x, drho.y, drho.z, S(0)}};
+  *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kPoint) = {{x.x, x.y, x.z, S(0)}};  // registers are scarce
   __syncwarp();
   const auto column = [&](int first) { return [&stage, first](int p) { return stage.row(p) + first; }; };
-  const Rows<S> h1 = rectified(layer(load_rows<S>(lane, column(At::kX)), m.w1, lane));
-  store_rows(h1, lane, column(At::kH1));
   Rows<S> g;
   {
+    const Rows<S> h1 = rectified(layer(load_rows<S>(lane, column(At::kX)), m.w1, lane));
+    store_rows(h1, lane, column(At::kH1));
     const Rows<S> h2 = rectified(layer(h1, m.w2, lane));
     Vec3<S> d[4];
     BT_UNROLL
@@ -208,15 +209,17 @@ __device__ Vec3<S> learn(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x
     g = where_open(g, h2);
   }
   store_rows(g, lane, column(At::kG2));
-  g = where_open(layer(g, m.w2t, lane), h1);
+  __syncwarp();
+  g = where_open(layer(g, m.w2t, lane), load_rows<S>(lane, column(At::kH1)));
   store_rows(g, lane, column(At::kG1));
   g = layer(g, m.w1t, lane);
   __syncwarp();
   weights.add_outer(weights.w1, stage.number + At::kX, stage.number + At::kG1, At::kColumns, lane);
   weights.add_outer(weights.w2, stage.number + At::kH1, stage.number + At::kG2, At::kColumns, lane);
+  x = load3(stage.row(lane) + At::kPoint);
   __syncwarp();
   store_rows(g, lane, [&](int p) { return stage.feature_gradients(p); });
-  const Vec3<S> dc = learn_table(f, c, active, lane, stage, table, positions);
+  const Vec3<S> dc = learn_table(f, grid_position(f, x), active, lane, stage, table, positions);
   __syncwarp();  // the next look-ups write where these are read
   if (!positions || !active) return {S(0), S(0), S(0)};
   return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
@@ -229,11 +232,16 @@ constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 9 K
 template <class S>
 constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // blocks at a time on a multiprocessor
 
+constexpr int kChunk = 8 * kWarp;  // consecutive items that a warp takes at a time
+constexpr int kStep = 2 * kWarp;   // and asks memory for at a time
+constexpr int kQueue = kWarp + kStep;
+
 template <class S>
 struct BackwardShared {
   WarpMlp<S> mlp;
   Stage<S> stage[kBackwardWarps<S>];
-  int64_t queue[kBackwardWarps<S>][2 * kWarp];
+  uint32_t queue[kBackwardWarps<S>][kQueue];
+  uint32_t taken;  // chunks
 };
 
 // Sums of the block's warps, in their order, to the block's row of `out`.
@@ -251,8 +259,6 @@ __device__ void give_weights(BackwardShared<S>& shared, WeightSums<S>& weights, 
   }
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) out[int64_t(blockIdx.x) * kMlpWeights + k] = sums[k];
 }
-
-constexpr int kChunk = 8 * kWarp;  // consecutive items that a warp takes at a time
 
 // Blocks of a backward pass over n items. A function of n alone: with it the order of all sums is fixed.
 template <class S>

@@ -17,20 +17,32 @@ struct ShadeGradients {
 namespace {
 constexpr int kForwardWarps = 4;
 template <class S>
-constexpr int kForwardResident = sizeof(S) == 4 ? 6 : 2;  // blocks at a time on a multiprocessor
-constexpr int64_t kMostForwardBlocks = 6 * 132;           // one round of them on an H100
+constexpr int kForwardResident = sizeof(S) == 4 ? 8 : 2;  // blocks at a time on a multiprocessor
+constexpr int64_t kMostForwardBlocks = 8 * 132;           // one round of them on an H100
+
+// A block's items by number, which 32 bits hold: those of kWarps neighbouring chunks, then those a grid further on.
+template <int kWarps>
+__device__ int64_t item(uint32_t number) {
+  const uint32_t chunk = number / kChunk;
+  return ((int64_t(chunk / kWarps) * gridDim.x + blockIdx.x) * kWarps + chunk % kWarps) * kChunk + number % kChunk;
+}
+// The next of the block's chunks that no warp has taken, so that warps with many look-ups take fewer chunks. Exact sums
+// need a fixed order: their warps take chunks in turn.
+__device__ uint32_t take_chunk(uint32_t* taken, int lane) {
+  const uint32_t chunk = lane == 0 ? atomicAdd(taken, 1u) : 0u;
+  return __shfl_sync(kFullMask, chunk, 0);
+}
 
 // Puts the item of every lane that has one at the end of the queue, in the order of the lanes.
-__device__ void put(int64_t* queue, int& count, bool has, int64_t item, int lane) {
+__device__ void put(uint32_t* queue, int& count, bool has, uint32_t number, int lane) {
   const unsigned votes = __ballot_sync(kFullMask, has);
-  if (has) queue[count + count_below(votes, lane)] = item;
+  if (has) queue[count + count_below(votes, lane)] = number;
   count += __popc(votes);
-  __syncwarp();
 }
-// Takes up to 32 items from the front.
-__device__ void drop(int64_t* queue, int& count, int lane) {
-  const int rest = count > kWarp ? count - kWarp : 0;
-  const int64_t later = lane < rest ? queue[kWarp + lane] : 0;
+// Takes the items from the front that were looked up; fewer than 32 are left.
+__device__ void drop(uint32_t* queue, int& count, int looked_up, int lane) {
+  const int rest = count > looked_up ? count - looked_up : 0;
+  const uint32_t later = lane < rest ? queue[looked_up + lane] : 0u;
   __syncwarp();
   if (lane < rest) queue[lane] = later;
   __syncwarp();
@@ -44,9 +56,10 @@ __device__ Vec3<S> fragment_point(const FragmentArrays<S>& f, const S* frames, i
 
 template <class S>
 struct ForwardShared {
-  WarpMlp<S> mlp;
+  ForwardMlp<S> mlp;
   ForwardStage<S> stage[kForwardWarps];
-  int64_t queue[kForwardWarps][2 * kWarp];
+  uint32_t queue[kForwardWarps][kQueue];
+  uint32_t taken;  // chunks
 };
 template <class S>
 __global__ void __launch_bounds__(kForwardWarps* kWarp, kForwardResident<S>)
@@ -54,30 +67,54 @@ __global__ void __launch_bounds__(kForwardWarps* kWarp, kForwardResident<S>)
                    FieldArrays<S> field, S* __restrict__ colors) {
   __shared__ ForwardShared<S> shared;
   const bool textured = field.levels > 0;
-  if (textured) load_mlp(field, threadIdx.x, kForwardWarps * kWarp, shared.mlp);
+  if (threadIdx.x == 0) shared.taken = kForwardWarps;
+  if (textured)
+    load_mlp(field, threadIdx.x, kForwardWarps * kWarp, shared.mlp);
+  else
+    __syncthreads();
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  const int64_t step = int64_t(gridDim.x) * kForwardWarps * kChunk;
-  int64_t chunk = (int64_t(blockIdx.x) * kForwardWarps + warp) * kChunk, first = chunk;
-  int64_t* queue = shared.queue[warp];
+  uint32_t* queue = shared.queue[warp];
+  uint32_t next = uint32_t(warp) * kChunk;  // item
   int count = 0;
-  while (first < f.total) {
-    const int64_t i = first + lane;
-    const bool in = i < f.total, looks_up = in && textured && f.weight[i] >= bound;
-    if (in && !looks_up) {
-      store3(colors + 3 * i, view_base(load3(base + 3 * int64_t(f.surfel[i]))));
+  for (bool more = true; more || count;) {
+    const int64_t first = item<kForwardWarps>(next);
+    more = first < f.total;
+    if (more) {
+      // all lanes read, the last ones what others read, so that the reads of a step are on their way together
+      int32_t surfel[kStep / kWarp];
+      bool in[kStep / kWarp], looks_up[kStep / kWarp];
+      BT_UNROLL
+      for (int k = 0; k < kStep / kWarp; ++k) {
+        const int64_t i = first + k * kWarp + lane;
+        in[k] = i < f.total;
+        const int64_t j = in[k] ? i : f.total - 1;
+        surfel[k] = f.surfel[j];
+        looks_up[k] = in[k] && textured && f.weight[j] >= bound;
+      }
+      BT_UNROLL
+      for (int k = 0; k < kStep / kWarp; ++k) {
+        if (in[k] && !looks_up[k])
+          store3(colors + 3 * (first + k * kWarp + lane), view_base(load3(base + 3 * int64_t(surfel[k]))));
+        put(queue, count, looks_up[k], next + k * kWarp + lane, lane);
+      }
+      __syncwarp();
+      next += kStep;
+      if (next % kChunk == 0) next = take_chunk(&shared.taken, lane) * kChunk;
     }
-    put(queue, count, looks_up, i, lane);
-    first += kWarp;
-    if (first == chunk + kChunk) first = chunk += step;
-    while (count >= kWarp || (count && first >= f.total)) {
-      const bool active = lane < count;
-      const int64_t j = active ? queue[lane] : 0;
+    int looked_up = 0;
+    while (count - looked_up >= kWarp || (!more && looked_up < count)) {
+      const bool active = looked_up + lane < count;
+      const auto mine = [&] { return item<kForwardWarps>(queue[looked_up + lane]); };
       Vec3<S> x = {S(0), S(0), S(0)};
-      if (active) x = fragment_point(f, frames, j);
+      if (active) x = fragment_point(f, frames, mine());
       const Vec3<S> rho = evaluate(field, shared.mlp, x, active, lane, shared.stage[warp]);
-      if (active) store3(colors + 3 * j, shaded(view_base(load3(base + 3 * int64_t(f.surfel[j]))), rho));
-      drop(queue, count, lane);
+      if (active) {
+        const int64_t j = mine();
+        store3(colors + 3 * j, shaded(view_base(load3(base + 3 * int64_t(f.surfel[j]))), rho));
+      }
+      looked_up += kWarp;
     }
+    if (looked_up) drop(queue, count, looked_up, lane);
   }
 }
 
@@ -99,7 +136,10 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
                     ShadeGradients<S> out, ExactSums exact) {
   constexpr int kWarps = kBackwardWarps<S>;
   BT_DYNAMIC_SHARED(BackwardShared<S>, shared);
-  if constexpr (kLearn) load_mlp(field, threadIdx.x, kWarps * kWarp, shared->mlp);
+  if constexpr (kLearn) {
+    if (threadIdx.x == 0) shared->taken = kWarps;
+    load_mlp(field, threadIdx.x, kWarps * kWarp, shared->mlp);
+  }
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   Adder<S, kExact> dbase, dtable, dframes;
   if constexpr (kExact) {
@@ -109,16 +149,16 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
     dbase = {out.base}, dtable = {out.table}, dframes = {out.frames};
   }
   WeightSums<S> weights;
-  int count = 0;
-  const int64_t step = int64_t(gridDim.x) * kWarps * kChunk;
-  const int64_t begin = (int64_t(blockIdx.x) * kWarps + warp) * kChunk;
+  int count = 0, looked_up = 0;
 
   const auto look_up = [&] {
-    const bool active = lane < count;
-    const int64_t j = active ? shared->queue[warp][lane] : 0;
+    const bool active = looked_up + lane < count;
+    // read again later, as registers are scarce until then
+    const auto mine = [&] { return item<kWarps>(shared->queue[warp][looked_up + lane]); };
     const Vec3<S> zero = {S(0), S(0), S(0)};
     Vec3<S> x = zero, d = zero;
     if (active) {
+      const int64_t j = mine();
       x = fragment_point(f, frames, j);
       d = residual_gradient(load3(colors + 3 * j), load3(dcolors + 3 * j));
     }
@@ -126,32 +166,63 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
     const Vec3<S> dx = learn(field, shared->mlp, x, d, active, lane, shared->stage[warp], weights, dtable, moves);
     if (moves) {
       S g[kFrame] = {};
+      int32_t surfel = -1;
       if (active) {
-        const S* frame = frames + int64_t(f.surfel[j]) * kFrame;
-        world_point_vjp(frame, f.uv[j], f.uv[f.total + j], dx, out.uv[j], out.uv[f.total + j], g);
+        const int64_t j = mine();
+        surfel = f.surfel[j];
+        world_point_vjp(frames + int64_t(surfel) * kFrame, f.uv[j], f.uv[f.total + j], dx, out.uv[j],
+                        out.uv[f.total + j], g);
       }
-      add_to_rows(active ? f.surfel[j] : -1, lane, g, dframes);
+      add_to_rows(surfel, lane, g, dframes);
     }
-    drop(shared->queue[warp], count, lane);
+    looked_up += kWarp;
   };
 
-  int64_t chunk = begin, first = begin;
-  while (first < f.total) {
-    const int64_t i = first + lane;
-    const bool in = i < f.total;
-    const int32_t surfel = in ? f.surfel[i] : -1;
-    S g[3] = {};
-    if (in)
-      store3(g, base_gradient(load3(base + 3 * int64_t(surfel)),
-                              residual_gradient(load3(colors + 3 * i), load3(dcolors + 3 * i))));
-    add_to_rows(surfel, lane, g, dbase);
-    first += kWarp;
-    if (first == chunk + kChunk) first = chunk += step;
+  uint32_t next = uint32_t(warp) * kChunk;  // item
+  for (bool more = true; more || count;) {
+    const int64_t first = item<kWarps>(next);
+    more = first < f.total;
+    if (more) {
+      // as in the forward kernel
+      constexpr int kRows = kStep / kWarp;
+      int32_t surfel[kRows];
+      bool textured[kRows];
+      Vec3<S> d[kRows], f_view[kRows];
+      BT_UNROLL
+      for (int k = 0; k < kRows; ++k) {
+        const int64_t i = first + k * kWarp + lane, j = i < f.total ? i : f.total - 1;
+        surfel[k] = f.surfel[j];
+        if constexpr (kLearn) textured[k] = f.weight[j] >= bound;
+        d[k] = residual_gradient(load3(colors + 3 * j), load3(dcolors + 3 * j));
+      }
+      BT_UNROLL
+      for (int k = 0; k < kRows; ++k) f_view[k] = load3(base + 3 * int64_t(surfel[k]));
+      BT_UNROLL
+      for (int k = 0; k < kRows; ++k) {
+        const int64_t i = first + k * kWarp + lane;
+        const bool in = i < f.total;
+        S g[3] = {};
+        if (in) store3(g, base_gradient(f_view[k], d[k]));
+        add_to_rows(in ? surfel[k] : -1, lane, g, dbase);
+        if constexpr (kLearn) {
+          const bool looks_up = in && textured[k];
+          if (in && !looks_up && out.uv) out.uv[i] = out.uv[f.total + i] = S(0);
+          put(shared->queue[warp], count, looks_up, next + k * kWarp + lane, lane);
+        }
+      }
+      __syncwarp();
+      next += kStep;
+      if (next % kChunk == 0) {
+        if constexpr (kLearn && !kExact)
+          next = take_chunk(&shared->taken, lane) * kChunk;
+        else
+          next += (kWarps - 1) * kChunk;
+      }
+    }
     if constexpr (kLearn) {
-      const bool looks_up = in && f.weight[i] >= bound;
-      if (in && !looks_up && out.uv) out.uv[i] = out.uv[f.total + i] = S(0);
-      put(shared->queue[warp], count, looks_up, i, lane);
-      while (count >= kWarp || (count && first >= f.total)) look_up();
+      while (count - looked_up >= kWarp || (!more && looked_up < count)) look_up();
+      if (looked_up) drop(shared->queue[warp], count, looked_up, lane);
+      looked_up = 0;
     }
   }
   if constexpr (kLearn) give_weights(*shared, weights, warp, lane, out.partial);

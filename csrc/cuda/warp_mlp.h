@@ -139,17 +139,22 @@ template <class S, int kTiles>
 struct Weights {
   Factor<S, 2> tile[2][kTiles][kWarp];
 };
-// The weights in shared memory; of w3 the plain numbers, too.
+// The weights in shared memory; for gradients their transposes, and of w3 the plain numbers, too.
 template <class S>
-struct WarpMlp {
-  Weights<S, 2> w1, w2, w1t, w2t;
+struct ForwardMlp {
+  Weights<S, 2> w1, w2;
   Weights<S, 1> w3;
+};
+template <class S>
+struct WarpMlp : ForwardMlp<S> {
+  Weights<S, 2> w1t, w2t;
   alignas(16) S output[kWidth][4];
 };
 
-// All threads of the block; ends with a barrier.
-template <class S>
-__device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, WarpMlp<S>& m) {
+// All threads of the block; ends with a barrier. M: one of the two above.
+template <class S, class M>
+__device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, M& m) {
+  constexpr bool kGradients = std::is_same_v<M, WarpMlp<S>>;
   const int inputs = f.levels * kFeatures;
   for (int k = thread; k < 2 * 2 * kWarp; k += threads) {
     const int j = k / kWarp / 2, n = k / kWarp % 2, lane = k % kWarp;
@@ -161,15 +166,19 @@ __device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, WarpM
     const S* w1 = f.w1;
     put(m.w1.tile[j][n][lane], from < inputs ? w1[from * kWidth + to] : S(0),
         from < inputs ? w1[(from + 1) * kWidth + to] : S(0));
-    put(m.w1t.tile[j][n][lane], to < inputs ? w1[to * kWidth + from] : S(0),
-        to < inputs ? w1[to * kWidth + from + 1] : S(0));
+    if constexpr (kGradients) {
+      put(m.w1t.tile[j][n][lane], to < inputs ? w1[to * kWidth + from] : S(0),
+          to < inputs ? w1[to * kWidth + from + 1] : S(0));
+      put(m.w2t.tile[j][n][lane], f.w2[to * kWidth + from], f.w2[to * kWidth + from + 1]);
+    }
     put(m.w2.tile[j][n][lane], f.w2[from * kWidth + to], f.w2[(from + 1) * kWidth + to]);
-    put(m.w2t.tile[j][n][lane], f.w2[to * kWidth + from], f.w2[to * kWidth + from + 1]);
     if (n == 0)
       put(m.w3.tile[j][0][lane], to < 3 ? f.w3[3 * from + to] : S(0), to < 3 ? f.w3[3 * (from + 1) + to] : S(0));
   }
-  for (int k = thread; k < 4 * kWidth; k += threads)
-    m.output[k / 4][k % 4] = k % 4 < 3 ? f.w3[k / 4 * 3 + k % 4] : S(0);
+  if constexpr (kGradients) {
+    for (int k = thread; k < 4 * kWidth; k += threads)
+      m.output[k / 4][k % 4] = k % 4 < 3 ? f.w3[k / 4 * 3 + k % 4] : S(0);
+  }
   __syncthreads();
 }
 

@@ -120,7 +120,7 @@ def check(source: Source, kept: Path) -> None:
     """
     model = read_model(source.folder)
     files = source.files(model)
-    missing = [file for file in files if not file.is_file()]
+    missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
     changed = [] if source.reduced is not None else _changed(model, files)
     what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
     what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []

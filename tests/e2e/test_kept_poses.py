@@ -248,6 +248,14 @@ def test_photographs_that_changed_are_named_in_one_message(shoot: Callable[..., 
     eval_setup(shot.run / "config.yml", test_mode="inference")  # needs none
 
 
+def test_the_photograph_behind_a_link_is_named(shoot: Callable[..., Shot]) -> None:
+    shot = shoot(upright=True)
+    gone = shot.photographs / "frame_00004.png"
+    gone.unlink()
+    with pytest.raises(InputError, match=f"trained with, 1 are missing \\({gone}\\), so"):
+        eval_setup(shot.run / "config.yml")
+
+
 def test_a_run_of_an_earlier_version_finds_them_as_before(
     shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch
 ) -> None:

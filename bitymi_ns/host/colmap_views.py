@@ -41,6 +41,22 @@ class Place:
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Of what a model was found here, so that a run can keep it.
+
+    Attributes:
+        kind: of what.
+        path: the folder that was searched for photographs, or the video, seen from the capture.
+        photographs: folder of the photographs, seen from the capture; None = those of the model are upright copies or
+            frames, in a folder that can go.
+    """
+
+    kind: Literal["photographs", "video"]
+    path: str
+    photographs: str | None
+
+
+@dataclass(frozen=True)
 class Source:
     """A COLMAP model and the photographs that belong to it.
 
@@ -52,6 +68,7 @@ class Source:
         reduced: folder of photographs that are that much smaller already; None = they are made so when they are read.
         left_out: photographs that the model lacks, with reasons where they are known.
         report: folder of the report on how the poses were found; None = there is none.
+        origin: of what the model was found here; None = the capture came with it.
     """
 
     folder: Path
@@ -61,6 +78,7 @@ class Source:
     reduced: Path | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
     report: Path | None = None
+    origin: Origin | None = None
 
     @property
     def read(self) -> Path:

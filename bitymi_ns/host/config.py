@@ -15,7 +15,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns.files import reason, write_file
-from bitymi_ns.host import checkpoints, run_folder
+from bitymi_ns.host import checkpoints, kept_poses, run_folder
 from bitymi_ns.host.bundle_config import find_bundle, folder_being_evaluated, stub_checkpoint_dir
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.capture import check_capture
@@ -75,6 +75,7 @@ class BitymiTrainerConfig(TrainerConfig):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
         self._make_paths_absolute()
+        self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
 
@@ -142,6 +143,20 @@ class BitymiTrainerConfig(TrainerConfig):
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
             datamanager.dataparser.settle()
 
+    def _take_poses_of_resumed(self) -> None:
+        """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
+        checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
+        if checkpoints_of is not None:
+            self._take_poses_of(Path(checkpoints_of).expanduser().absolute().parent)
+        elif isinstance(self.pipeline.datamanager.dataparser, BitymiDataParserConfig):
+            self.pipeline.datamanager.dataparser.poses = None
+
+    def _take_poses_of(self, run: Path) -> None:
+        """Have the data read with the poses in this run's folder, where it keeps any."""
+        dataparser = self.pipeline.datamanager.dataparser
+        if isinstance(dataparser, BitymiDataParserConfig) and kept_poses.are_in(run / run_folder.POSES):
+            dataparser.poses = run / run_folder.POSES
+
     def is_viewer_enabled(self) -> bool:
         return self.vis != "none" and super().is_viewer_enabled()
 
@@ -162,6 +177,7 @@ class BitymiTrainerConfig(TrainerConfig):
             if (evaluated / self.relative_model_dir).is_dir():
                 folder = evaluated / self.relative_model_dir
             self._choose_checkpoint(folder)
+            self._take_poses_of(evaluated)
         return folder
 
     def _choose_checkpoint(self, folder: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
@@ -25,7 +26,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.host import finding, holdout
+from bitymi_ns.host import finding, holdout, kept_poses
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import (
     Place,
@@ -37,7 +38,8 @@ from bitymi_ns.host.colmap_views import (
     views,
 )
 from bitymi_ns.host.dataset import views_of
-from bitymi_ns.host.errors import fail, listed, say
+from bitymi_ns.host.errors import fail, listed, say, warn
+from bitymi_ns.host.kept_poses import KeptPoses
 from bitymi_ns.host.lens import lens
 from bitymi_ns.host.transforms import (
     Lists,
@@ -114,6 +116,13 @@ class BitymiDataParserConfig(DataParserConfig):
     """Scale the capture so that the cameras fit into a box from -1 to 1."""
     sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
     """How the poses of photographs and videos are found."""
+    poses: tyro.conf.Suppress[Path | None] = None
+    """Folder of the poses that an earlier run was trained with. Not in the help: the host sets it where the data of an
+    existing run are read."""
+
+    def kept(self) -> KeptPoses | None:
+        """The poses that the run was trained with; None = they are not kept."""
+        return None if self.poses is None else kept_poses.read(Path(self.poses))
 
     def settle(self) -> None:
         """Replace the name of a list of photographs by what is in it, so that config.yml stands on its own."""
@@ -125,8 +134,9 @@ class BitymiDataParserConfig(DataParserConfig):
         Raises:
             InputError: nothing, or an option that is not for what there is.
         """
+        kept = self.kept()
         try:
-            found = recognise(Path(self.data), self.format, self.colmap_path)
+            found = recognise(Path(self.data), self.format, self.colmap_path) if kept is None else kept.found(self.data)
         except NotRecognised as error:
             fail(str(error), error)
         for name, formats in USED_BY.items():
@@ -164,6 +174,11 @@ class BitymiDataParserConfig(DataParserConfig):
         reduction = self.downscale_factor or 1
         if found.format == "colmap":
             return find_source(found.path, found.folder, self.images_path, self.masks_path, reduction, look=look)
+        kept = self.kept()
+        if kept is not None:
+            return finding.source_of_run(found, kept, self.masks_path, reduction, look)
+        if self.poses is not None:
+            warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
         return finding.source_of(found, self.masks_path, reduction, self.sfm)
 
 
@@ -173,6 +188,7 @@ class BitymiDataParser(DataParser):
     Attributes:
         downscale_factor: set by nerfstudio where photographs are not needed, so that none is opened; else None.
         poses_report: folder of the report on how the poses were found, once the views are read; None = there is none.
+        found: the model that was found here, once the views are read; None = the capture came with its poses.
     """
 
     config: BitymiDataParserConfig
@@ -181,6 +197,7 @@ class BitymiDataParser(DataParser):
         super().__init__(config)
         self.downscale_factor: int | None = None
         self.poses_report: Path | None = None
+        self.found: Source | None = None
 
     @cached_property
     def splits(self) -> dict[str, DataparserOutputs]:
@@ -235,6 +252,7 @@ class BitymiDataParser(DataParser):
         look = self.downscale_factor is None
         source = self.config.source(found, look)
         self.poses_report = source.report or self.poses_report
+        self.found = None if source.origin is None else source
         model = read_model(source.folder)
         self._tell(found, source.told(model))
         if look:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from bitymi_ns.capture.cache import read_from
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.host.colmap_views import Source, find_source
+from bitymi_ns.host import kept_poses
+from bitymi_ns.host.colmap_model import read_model
+from bitymi_ns.host.colmap_views import Origin, Source, find_source
 from bitymi_ns.host.errors import fail, say
+from bitymi_ns.host.kept_poses import KeptPoses
 
 
 def source_of(found: Found, masks_path: Path | None, reduction: int, settings: SfmSettings) -> Source:
@@ -38,7 +42,40 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
     )
-    if masks is None and found.format == "photographs" and (found.path / "masks").is_dir():
-        masks = found.path / "masks"
+    masks = _masks(found, masks_path)
     source = find_source(poses.model, poses.images, Path(), masks, reduction, poses.left_out, look=False)
-    return replace(source, report=poses.report)
+    made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the folder of the work
+    photographs = None if made else os.path.relpath(poses.images, found.folder)
+    assert found.format in ("photographs", "video")
+    origin = Origin(found.format, os.path.relpath(found.path, found.folder), photographs)
+    return replace(source, report=poses.report, origin=origin)
+
+
+def source_of_run(found: Found, kept: KeptPoses, masks_path: Path | None, reduction: int, look: bool) -> Source:
+    """The COLMAP model that a run was trained with, which nothing that happened to the photographs since changes.
+
+    Args:
+        found: photographs, or a video; see `KeptPoses.found`.
+        kept: the poses of the run.
+        masks_path, reduction: see `source_of`.
+        look: the photographs are needed; else they may be missing.
+
+    Raises:
+        InputError: photographs of the model are missing, or have another size than they had.
+    """
+    images = kept.images(found.folder)
+    masks = _masks(found, masks_path)
+    source = find_source(kept.model, images, Path(), masks, reduction, kept.left_out, look=False)
+    if look:
+        kept_poses.check(source, kept.folder)
+    count = len(read_model(source.folder).images)
+    say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
+    return replace(source, report=kept.folder, origin=kept.origin)
+
+
+def _masks(found: Found, given: Path | None) -> Path | None:
+    """The folder of masks: the given one, seen from the capture, or `masks` beside the photographs."""
+    if given is not None:
+        return found.folder / given
+    beside = found.path / "masks"
+    return beside if found.format == "photographs" and beside.is_dir() else None

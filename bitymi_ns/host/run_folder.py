@@ -8,12 +8,14 @@ from pathlib import Path
 
 from bitymi_ns import files
 from bitymi_ns.capture.report import FILES
+from bitymi_ns.host import kept_poses
+from bitymi_ns.host.colmap_views import Source
 from bitymi_ns.host.errors import fail, warn
 
 LOCK = ".lock"
 """Name of the file that lies in a run folder while a process trains into it."""
 POSES = "poses"
-"""Folder in that of the run for the report on how the poses were found, where they were found by this package."""
+"""Folder in that of the run for the poses and the report on how they were found, where this package found them."""
 
 
 def take(folder: Path) -> None:
@@ -58,22 +60,29 @@ def leave(folder: Path) -> None:
     files.release(folder / LOCK)
 
 
-def keep_poses_report(folder: Path, report: Path | None) -> None:
-    """Copy the report on how the poses were found to POSES, so that it stays when the photographs go.
+def keep_poses_report(folder: Path, report: Path | None, source: Source | None = None) -> None:
+    """Copy the poses that were found, and the report on how, to POSES, so that they stay when the photographs change.
 
     Args:
         folder: the run's.
         report: folder of the report; None = the capture came with its poses.
+        source: the poses that were found; None = the capture came with them.
     """
     there = [] if report is None else [report / name for name in FILES if (report / name).is_file()]
-    if not there:
+    origin = None if source is None else source.origin
+    if origin is None and not there:
         return
+    if report is not None and report.resolve() == (folder / POSES).resolve():
+        return  # the run goes on with what it keeps already
     try:
         with files.complete_folder(folder / POSES, tell=warn) as new:
             for file in there:
                 shutil.copyfile(file, new / file.name)
+            if source is not None and origin is not None:
+                kept_poses.write(new, source, origin)
     except OSError as error:
-        warn(f"How the poses were found is not kept with the run: {files.reason(error, folder)}.")
+        loss = "" if origin is None else " Nor are the poses: leave the photographs as they are while you use the run."
+        warn(f"How the poses were found is not kept with the run: {files.reason(error, folder)}.{loss}")
 
 
 def check_space(folder: Path, needed: int) -> None:

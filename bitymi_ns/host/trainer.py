@@ -60,7 +60,10 @@ class BitymiTrainer(Trainer):
         except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
-        run_folder.keep_poses_report(self.base_dir, getattr(self.pipeline.datamanager.dataparser, "poses_report", None))
+        parser = self.pipeline.datamanager.dataparser
+        run_folder.keep_poses_report(
+            self.base_dir, getattr(parser, "poses_report", None), getattr(parser, "found", None)
+        )
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)
         # after all other callbacks of a step: the state is then complete and can be saved

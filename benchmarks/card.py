@@ -34,7 +34,7 @@ class Step:
 
     Attributes:
         name: in the summary.
-        words: its command; several = run at the same time.
+        commands: one, or several that run at the same time.
         limit: seconds.
     """
 
@@ -74,7 +74,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             Step("block textures", [[sys.executable, "-c", BLOCKS]], 60),
             Step("tests", [[*tests, "-k", "not emulated"]], 240),
             Step("kernels", [python("card_smoke.py", *large, "--times", "20")], 90),
-            Step("sanitizers", [sanitizer(tool, "baked", "training") for tool in SANITIZERS], 150),
+            Step("sanitizers", [sanitizer(tool, *PROFILED) for tool in SANITIZERS], 150),
         ],
         "tables": [
             Step(
@@ -107,7 +107,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "profile": [
             Step(
                 "profile",
-                [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", "baked", "training")]],
+                [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]],
                 400,
             )
         ],
@@ -122,13 +122,14 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
                 ],
                 600,
             )
-            for name in sorted(folder.name for folder in data.glob("*") if folder.name != "fox")
+            for name in sorted(file.parent.name for file in data.glob("*/transforms.json"))
+            if name != "fox"
         ],
     }
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-PROFILED = ("baked", "training")
+PROFILED = ("baked", "training")  # sections of card_smoke.py
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 

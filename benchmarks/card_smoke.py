@@ -13,8 +13,7 @@ from collections.abc import Callable
 
 import torch
 from gpu_baked import textured
-from gpu_common import trained_like
-from torch.nn.functional import l1_loss
+from gpu_common import deterministic, photo_loss, trained_like, training_step
 
 from bitymi_ns import ops
 from bitymi_ns.scene.baked_renderer import BakedRenderer
@@ -37,33 +36,16 @@ def images(n: int, width: int, height: int, device: torch.device) -> Callable[[]
 def training(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
     """A training step: field, SSIM, Adam."""
     scene, camera = trained_like(n, width, height, device)
-    photo = torch.rand(height, width, 3, device=device)
-    optimizer = torch.optim.Adam(scene.parameters(), lr=0.0, fused=device.type == "cuda")
-
-    def run() -> None:
-        optimizer.zero_grad(set_to_none=True)
-        rgb = scene.render(camera, field_mode="train").rgb
-        (0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))).backward()
-        optimizer.step()
-
-    return run
+    loss = photo_loss(torch.rand(height, width, 3, device=device))
+    return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.parameters()))
 
 
-def deterministic(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
     """A training step with sums that do not depend on the order."""
-    step = training(n, width, height, device)
-
-    def run() -> None:
-        torch.use_deterministic_algorithms(True, warn_only=True)
-        try:
-            step()
-        finally:
-            torch.use_deterministic_algorithms(False)
-
-    return run
+    return deterministic(training(n, width, height, device), warn_only=True)
 
 
-SECTIONS = {"baked": baked, "images": images, "training": training, "deterministic": deterministic}
+SECTIONS = {"baked": baked, "images": images, "training": training, "deterministic": exact}
 
 
 def main() -> int:

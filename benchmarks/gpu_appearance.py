@@ -26,7 +26,18 @@ from functools import partial
 import numpy as np
 import torch
 from common import number, say, table
-from gpu_common import Options, Section, attempt, backward, failures, milliseconds, trained_like
+from gpu_common import (
+    Options,
+    Section,
+    arithmetic_rate,
+    attempt,
+    backward,
+    deterministic,
+    failures,
+    milliseconds,
+    trained_like,
+    without_graph,
+)
 from torch import Tensor
 
 from bitymi_ns import ops
@@ -52,17 +63,6 @@ class Case:
     operations: float
     run: Callable[[], object]
     gathers: float = 0.0
-
-
-def arithmetic_rate(options: Options) -> float:
-    """Floating-point operations a second of a large matrix product in full single precision."""
-    n = 8192 if options.device.type == "cuda" else 64
-    a, b = (torch.rand(n, n, device=options.device) for _ in range(2))
-    before = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = False
-    ms = milliseconds(lambda: a @ b, Options(options.device, (), (), 3, 10, 0.0))
-    torch.backends.cuda.matmul.allow_tf32 = before
-    return 2 * n**3 / (1e-3 * ms)
 
 
 def appearance(options: Options) -> str:
@@ -128,10 +128,10 @@ def _cases(n: int, width: int, height: int, device: torch.device) -> list[Case]:
     numbers = sum(parameter.numel() for parameter in parameters)
     tables = 2.0 * field.field_table.nbytes  # cleared and written back
     return [
-        Case("view colours", v, "surfels", 208 * v + n, 330 * v, _without_graph(lambda: scene.base_color(projection))),
+        Case("view colours", v, "surfels", 208 * v + n, 330 * v, without_graph(lambda: scene.base_color(projection))),
         Case("view colours, backward", v, "surfels", 404 * v + 220 * n, 550 * v, backward(base, list(q.values())[5:])),
-        Case("shade, no field", f, "fragments", 32 * f, 6 * f, _without_graph(lambda: shade(textured=False))),
-        Case("shade", f, "fragments", 32 * f + 12 * t, 6 * f + LOOK_UP * t, _without_graph(shade), gathers * t),
+        Case("shade, no field", f, "fragments", 32 * f, 6 * f, without_graph(lambda: shade(textured=False))),
+        Case("shade", f, "fragments", 32 * f + 12 * t, 6 * f + LOOK_UP * t, without_graph(shade), gathers * t),
         Case("shade, backward, frozen", f, "fragments", 28 * f + 12 * n, 9 * f, backward(shaded, (leaf,))),
         Case(
             "shade, backward, learning",
@@ -148,7 +148,7 @@ def _cases(n: int, width: int, height: int, device: torch.device) -> list[Case]:
             "fragments",
             28 * f + 52 * t + 12 * n + 4 * tables,
             9 * f + LEARN * t,
-            _deterministic(exact),
+            deterministic(exact),
             3 * gathers * t,
         ),
         Case("SSIM, both passes", x, "values", 60 * x, 411 * x, lambda: ops.ssim(a, b)),
@@ -174,25 +174,6 @@ def _bake_case(n: int, scene, projection: ops.Projection) -> Case:
         lambda: field_tiles(frames, extent, tiles, pages, scene.field.geometry, *scene.field.weights),
         128.0 * LEVELS * texels,
     )
-
-
-def _without_graph(run: Callable[[], object]) -> Callable[[], object]:
-    def call() -> object:
-        with torch.no_grad():
-            return run()
-
-    return call
-
-
-def _deterministic(run: Callable[[], object]) -> Callable[[], object]:
-    def call() -> object:
-        torch.use_deterministic_algorithms(True)
-        try:
-            return run()
-        finally:
-            torch.use_deterministic_algorithms(False)
-
-    return call
 
 
 SECTIONS = (Section("appearance", NEEDS, appearance),)

@@ -24,7 +24,16 @@ from pathlib import Path
 import gpu_gsplat
 import torch
 from common import number, say, table
-from gpu_common import Options, Section, attempt, failures, milliseconds, trained_like, with_launches
+from gpu_common import (
+    Options,
+    Section,
+    arithmetic_rate,
+    attempt,
+    failures,
+    milliseconds,
+    trained_like,
+    with_launches,
+)
 
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bundle import read_bundle
@@ -55,7 +64,7 @@ HEADER = (
 
 def frames(options: Options) -> str:
     """Every scene at every size, then gsplat at the same sizes."""
-    rate = fp32_rate(options)
+    rate = arithmetic_rate(options)
     rows, graphs = [], {}
     sizes = [*options.sizes, *([LARGE] if options.device.type == "cuda" and LARGE not in options.sizes else [])]
     for width, height in sizes:
@@ -110,17 +119,6 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
         blocks=blocks,
     )
     return baked.to(device), camera
-
-
-def fp32_rate(options: Options) -> float:
-    """Single-precision operations a second of a product of matrices."""
-    side = 8192 if options.device.type == "cuda" else 256
-    a = torch.rand(side, side, device=options.device)
-    before, torch.backends.cuda.matmul.allow_tf32 = torch.backends.cuda.matmul.allow_tf32, False
-    few = Options(options.device, (), (), 2, 5, options.copy_bytes)
-    ms = milliseconds(lambda: a @ a, few)
-    torch.backends.cuda.matmul.allow_tf32 = before
-    return 2 * side**3 / (1e-3 * ms)
 
 
 def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:

@@ -13,7 +13,9 @@ from typing import TypeVar
 import torch
 from common import say
 from torch import Tensor
+from torch.nn.functional import l1_loss
 
+from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
@@ -162,6 +164,65 @@ def backward(outputs: Tensor | Sequence[Tensor], inputs: Sequence[Tensor]) -> Ca
     outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
     gradients = [torch.randn_like(output) for output in outputs]
     return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
+
+
+def arithmetic_rate(options: Options) -> float:
+    """Floating-point operations a second of a large matrix product in full single precision."""
+    n = 8192 if options.device.type == "cuda" else 64
+    a, b = (torch.rand(n, n, device=options.device) for _ in range(2))
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = False
+    ms = milliseconds(lambda: a @ b, Options(options.device, (), (), 3, 10, 0.0))
+    torch.backends.cuda.matmul.allow_tf32 = before
+    return 2 * n**3 / (1e-3 * ms)
+
+
+def without_graph(run: Callable[[], object]) -> Callable[[], object]:
+    """A call that records nothing for a backward pass."""
+
+    def call() -> object:
+        with torch.no_grad():
+            return run()
+
+    return call
+
+
+def deterministic(run: Callable[[], object], warn_only: bool = False) -> Callable[[], object]:
+    """A call with sums that do not depend on the order; `warn_only` where torch's own operations have none such."""
+
+    def call() -> object:
+        torch.use_deterministic_algorithms(True, warn_only=warn_only)
+        try:
+            return run()
+        finally:
+            torch.use_deterministic_algorithms(False)
+
+    return call
+
+
+def photo_loss(photo: Tensor, with_ssim: bool = True) -> Callable[[Tensor], Tensor]:
+    """Of an image [height, width, 3]: 0.8 L1 + 0.2 (1 - SSIM), or L1 alone."""
+
+    def loss(rgb: Tensor) -> Tensor:
+        l1 = l1_loss(rgb, photo)
+        return 0.8 * l1 + 0.2 * (1 - ops.ssim(rgb, photo)) if with_ssim else l1
+
+    return loss
+
+
+def training_step(
+    render: Callable[[], Tensor], loss: Callable[[Tensor], Tensor], parameters: list[Tensor]
+) -> Callable[[], object]:
+    """Render, loss, backward and Adam, of the parameters."""
+    # a rate of zero: the work of a step, but the scene stays what it is
+    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
+
+    def run() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        loss(render()).backward()
+        optimizer.step()
+
+    return run
 
 
 def trained_like(

@@ -20,9 +20,21 @@ from functools import partial
 import gpu_gsplat
 import torch
 from common import number, say, table
-from gpu_common import Options, Section, attempt, backward, failures, milliseconds, missing, peak_memory, trained_like
+from gpu_common import (
+    Options,
+    Section,
+    attempt,
+    backward,
+    failures,
+    milliseconds,
+    missing,
+    peak_memory,
+    photo_loss,
+    trained_like,
+    training_step,
+    without_graph,
+)
 from torch import Tensor
-from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
 from bitymi_ns.ops import trace_cuda
@@ -91,7 +103,7 @@ def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tupl
     n, v, b = len(scene), int(projection.visible.sum()), bins.slot.shape[0]
     f, p = len(fragments), camera.width * camera.height
     return {"v": v, "b": b, "f": f, "p": p}, [
-        ("project", 152 * n, _without_graph(project)),
+        ("project", 152 * n, without_graph(project)),
         ("project backward", 260 * n, backward(projection.geom, geometry)),
         ("tile lists", 96 * n + 64 * v + 64 * b, lambda: trace_cuda.tile_lists(geom, projection)),
         ("trace", 64 * v + 100 * b + 28 * f, trace),
@@ -99,7 +111,7 @@ def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tupl
         (
             "composite",
             16 * f + 44 * b + 20 * p,
-            _without_graph(lambda: ops.composite_image(fragments, projection, colors)),
+            without_graph(lambda: ops.composite_image(fragments, projection, colors)),
         ),
         (
             "composite backward",
@@ -107,14 +119,6 @@ def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tupl
             backward(image, (fragments.weight, projection.geom, colors)),
         ),
     ]
-
-
-def _without_graph(run: Callable[[], object]) -> Callable[[], object]:
-    def call() -> object:
-        with torch.no_grad():
-            return run()
-
-    return call
 
 
 def steps(options: Options) -> str:
@@ -146,10 +150,7 @@ def _steps(
 ) -> list[tuple[str, Callable[[], object], int | None]]:
     device = options.device
 
-    def loss(rgb: Tensor) -> Tensor:
-        l1 = l1_loss(rgb, photo)
-        return 0.8 * l1 + 0.2 * (1 - ops.ssim(rgb, photo)) if with_ssim else l1
-
+    loss = photo_loss(photo, with_ssim)
     cases: list[tuple[str, Callable[[], object], int | None]] = []
     for name, mode in (("bitymi, field training", "train"), ("bitymi, field frozen", "frozen"), ("bitymi, sv", "off")):
         scene, camera = trained_like(n, width, height, device, texture=mode != "off")
@@ -159,22 +160,8 @@ def _steps(
             return scene.render(camera, field_mode=mode).rgb
 
         pairs = scene.render(camera, field_mode="off").fragments.layout.pairs
-        cases.append((name, _step(render, loss, parameters), pairs))
-    return cases + (gpu_gsplat.steps(n, width, height, loss, _step, device) if options.peers else [])
-
-
-def _step(
-    render: Callable[[], Tensor], loss: Callable[[Tensor], Tensor], parameters: list[Tensor]
-) -> Callable[[], object]:
-    # a rate of zero: the work of a step, but the scene stays what it is
-    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
-
-    def run() -> None:
-        optimizer.zero_grad(set_to_none=True)
-        loss(render()).backward()
-        optimizer.step()
-
-    return run
+        cases.append((name, training_step(render, loss, parameters), pairs))
+    return cases + (gpu_gsplat.steps(n, width, height, loss, training_step, device) if options.peers else [])
 
 
 SECTIONS = (Section("operations", OPERATIONS, operations), Section("steps", STEP, steps))

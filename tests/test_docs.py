@@ -1,9 +1,11 @@
-"""Links between the pages of the documentation lead somewhere."""
+"""Links between the pages of the documentation lead somewhere; files and names that they mention are in the code."""
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"\[[^\]]*\]\(\s*<?([^)>\s]+)>?[^)]*\)")
 OUTSIDE = re.compile(r"[a-z][a-z0-9+.-]*:")
+SOURCE = re.compile(r"(?<![\w./-])[\w/]+\.(?:py|h|cpp|cu|cmake)\b")
+DOTTED = re.compile(r"`([a-zA-Z_]\w*(?:\.\w+)+)`")
+FOREIGN = {"activations.py"}
+"""Files of other projects that the pages mention."""
+DATA = {"json", "jsonl", "ply", "ktx2", "png", "jpg", "yml", "yaml", "toml", "py", "h", "txt", "pth"}
 MENTION = re.compile(r"\b(?:docs|benchmarks)/[\w/]+\.md\b")
 
 
@@ -26,9 +33,14 @@ def tracked(*patterns: str) -> list[Path]:
 PAGES = tracked("*.md")
 
 
+def without_blocks(text: str) -> str:
+    """The text without its blocks of code."""
+    return re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
 def without_code(text: str) -> str:
     """The text without its code, in which brackets are no links and # begins no heading."""
-    text = re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = without_blocks(text)
     return re.sub(r"`[^`\n]*`", lambda code: "" if "](" in code[0] else code[0], text)
 
 
@@ -58,6 +70,56 @@ def dead_links(page: Path) -> list[str]:
     return dead
 
 
+def owners(paths: list[Path]) -> dict[str, set[str]]:
+    """The names that modules and classes define, by the name of the module, of its package and of the class, in lower
+    case and without a final Config: as `scene.rim` names an option of `SceneConfig` and `ops.trace` a function."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for path in paths:
+        tree = ast.parse(path.read_text("utf8"))
+        module = {path.stem, path.parent.name, path.parent.parent.name}
+        bodies = [(module, tree.body)]
+        bodies += [
+            ({*module, node.name, node.name.removesuffix("Config")}, node.body)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef)
+        ]
+        for places, body in bodies:
+            names = set(module)
+            for node in body:
+                if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+                    names.add(node.name)
+                elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+                    targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                    names |= {target.id for target in targets if isinstance(target, ast.Name)}
+            for place in places:
+                found[place.lower()] |= names
+    return found
+
+
+@pytest.mark.skipif(not PAGES, reason="not a git checkout")
+def test_files_that_pages_mention_are_there() -> None:
+    files = [f"/{path.relative_to(ROOT)}" for path in tracked("*")]
+    for page in PAGES:
+        for name in sorted(set(SOURCE.findall(without_blocks(page.read_text("utf8")))) - FOREIGN):
+            assert any(file.endswith(f"/{name}") for file in files), f"{page.relative_to(ROOT)} mentions {name}"
+
+
+@pytest.mark.skipif(not PAGES, reason="not a git checkout")
+def test_functions_and_options_that_pages_mention_are_there() -> None:
+    defined = owners(tracked("bitymi_ns/*.py", "benchmarks/*.py"))
+    seen = 0
+    for page in PAGES:
+        for name in sorted(set(DOTTED.findall(page.read_text("utf8")))):
+            parts = name.split(".")
+            if parts[-1] in DATA or parts[0] in ("gsplat", "torch"):
+                continue
+            seen += 1
+            for i, member in enumerate(parts[1:], start=1):
+                there = any(member in defined[place.lower()] for place in parts[:i])
+                assert there, f"{page.relative_to(ROOT)} mentions {name}: no {member}"
+    assert seen > 30
+
+
 @pytest.mark.skipif(not PAGES, reason="not a git checkout")
 def test_the_links_of_every_page_resolve() -> None:
     dead = {str(page.relative_to(ROOT)): links for page in PAGES if (links := dead_links(page))}
@@ -77,3 +139,12 @@ def test_dead_links_are_found(tmp_path: Path) -> None:
     assert dead_links(page) == []
     page.write_text("[1](c.md) [2](b.md#no-heading) [3](#b) ![4](c.png)\n")
     assert dead_links(page) == ["c.md", "b.md#no-heading", "#b", "c.png"]
+
+
+def test_names_that_are_gone_are_found(tmp_path: Path) -> None:
+    package = tmp_path / "bitymi_ns" / "scene"
+    package.mkdir(parents=True)
+    (package / "config.py").write_text("class SceneConfig:\n    rim: float = 1\ndef f(): pass\n")
+    defined = owners([package / "config.py"])
+    assert {"rim", "f", "SceneConfig", "config"} <= defined["scene"] and "f" in defined["config"]
+    assert "near" not in defined["scene"] and "rim" in defined["sceneconfig"]

@@ -5,27 +5,81 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 NUMBERED = 10
 """Numbered equations of the paper."""
+REFERENCE = "bitymi_ns/ops/reference"
+CODE = r"`(\w+)`"
 
 
-def rows() -> list[list[str]]:
+def rows(section: str) -> list[list[str]]:
+    """The rows of the first table of a section, cells without white space."""
     text = (ROOT / "docs" / "glossary.md").read_text("utf8")
-    table = text.split("## Equations")[1].split("## Symbols")[0]
-    lines = [line for line in table.splitlines() if line.startswith("| ")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
+    table = text.split(f"## {section}\n")[1].split("\n## ")[0].split("\n\n| ", 1)[-1]
+    lines = [line for line in ("| " + table).split("\n\n")[0].splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines[1:]]
+
+
+def defines(file: str, text: str, name: str) -> bool:
+    """Whether a file has the body of a function of this name, or of a C++ constant: calls and declarations are none."""
+    if file.endswith(".py"):
+        return re.search(rf"^def {name}\(", text, re.MULTILINE) is not None
+    if re.search(rf"^constexpr double {name} =", text, re.MULTILINE):
+        return True
+    start = rf"^ *(?:BT_HD|__device__|__global__|void)\b[^;\n]*\b{name}\([^;]*?\{{"
+    return re.search(start, text, re.MULTILINE) is not None
 
 
 def test_every_numbered_equation_is_there() -> None:
-    numbers = {int(found) for row in rows() if (found := row[0].split(",")[0]).isdecimal()}
+    numbers = {int(found) for row in rows("Equations") if (found := row[0].split(",")[0]).isdecimal()}
     assert numbers == set(range(1, NUMBERED + 1))
 
 
 def test_names_are_defined_where_the_page_says() -> None:
-    for _, _, file, name in rows():
-        assert re.fullmatch(r"`\w+`", name), name
-        name = name.strip("`")
-        text = (ROOT / file).read_text("utf8")
-        definition = rf"^def {name}\(" if file.endswith(".py") else rf"^(BT_HD .*|constexpr double )\b{name}\b( =|\()"
-        assert re.search(definition, text, re.MULTILINE), f"{file} does not define {name}"
+    for _, _, file, name in rows("Equations"):
+        assert re.fullmatch(CODE, name), name
+        assert defines(file, (ROOT / file).read_text("utf8"), name.strip("`")), f"{file} does not define {name}"
+
+
+def test_every_formula_has_its_file_and_its_twin() -> None:
+    table = rows("Where a formula lives")
+    assert len(table) > 20
+    for formula, files, twin in table:
+        mentioned = re.findall(r"[\w/]+\.(?:h|cpp|cu|py)\b", files)
+        assert mentioned, f"{formula} has no file"
+        for file in [*mentioned, *re.findall(r"bitymi_ns/[\w/]+\.py", formula)]:
+            assert (ROOT / file).is_file(), f"{formula}: there is no {file}"
+        for name in re.findall(CODE, files):
+            texts = [(ROOT / file).read_text("utf8") for file in mentioned]
+            assert any(re.search(rf"^ *def {name}\(", text, re.MULTILINE) for text in texts), f"{formula}: no {name}"
+        twins = re.findall(r"[\w/]+\.py\b", twin)
+        assert twins or not twin or twin.startswith("none: "), f"{formula}: {twin}"
+        for file in twins:
+            assert any((ROOT / folder / file).is_file() for folder in (REFERENCE, "")), f"{formula}: there is no {file}"
+
+
+def test_symbols_are_names_of_the_code() -> None:
+    sources = [*ROOT.glob("bitymi_ns/**/*.py"), *ROOT.glob("csrc/**/*.h")]
+    words = set(re.findall(r"\w+", "\n".join(path.read_text("utf8") for path in sources)))
+    for symbol, names, _ in rows("Symbols"):
+        for name in re.findall(CODE, names):
+            assert name in words, f"{symbol}: the code has no {name}"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "found"),
+    [
+        ("a.py", "def f(x):\n", True),
+        ("a.py", "    y = f(x)\n", False),
+        ("a.h", "template <class S>\nBT_HD S f(S a,\n          S b) {\n", True),
+        ("a.h", "  void f(int a) {\n", True),
+        ("a.cu", "__global__ void __launch_bounds__(kThreads) f(int a) {\n", True),
+        ("a.h", "BT_HD S f(S a);\n", False),
+        ("a.h", "  const S b = f(a);\n", False),
+        ("a.h", "constexpr double f = 4.0;\n", True),
+    ],
+)
+def test_a_vanished_function_is_noticed(file: str, text: str, found: bool) -> None:
+    assert defines(file, text, "f") is found

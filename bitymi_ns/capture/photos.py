@@ -17,6 +17,8 @@ from bitymi_ns.progress import Progress
 
 PLAIN_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 """What COLMAP and nerfstudio read as it is."""
+COPY = ".jpg"
+"""What the name of an upright copy has at its end, after that of the photograph."""
 THUMB = 256
 """Longer side in pixels of the grey thumbnails by which duplicates are found."""
 SHARPNESS_SIZE = 1024

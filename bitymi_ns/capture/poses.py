@@ -16,6 +16,7 @@ import pycolmap
 from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, take_place, work_folder
 from bitymi_ns.capture.frame import local_positions, settle, write_frame
+from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS
 from bitymi_ns.capture.report import write_report
@@ -49,7 +50,7 @@ def find_poses(source: Path, options: SfmOptions | None = None, progress: Progre
     options = options or SfmOptions()
     tell = progress or no_progress
     source, folder, names = _what(Path(source))
-    masks = prepare.mask_folder(source, folder, options.masks) if folder.is_dir() else None
+    masks = mask_folder(folder, source, options.masks) if folder.is_dir() else None
     inputs = [folder / name for name in names] if names else [source]
     if masks is not None:
         inputs += sorted(path for path in masks.rglob("*") if path.is_file())

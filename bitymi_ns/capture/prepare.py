@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from PIL import Image
 
-from bitymi_ns.capture.photos import Photo, upright
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.masks import counted, in_proportion, mask_of
+from bitymi_ns.capture.photos import COPY, Photo, upright
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
-COPY = ".jpg"
-"""What the name of an upright copy has at its end, after that of the photograph."""
 
 
 def upright_photos(
@@ -49,30 +47,6 @@ def upright_photos(
     return target, names
 
 
-def mask_folder(source: Path, photo_folder: Path, given: Path | None) -> Path | None:
-    """The folder of masks that belongs to a capture.
-
-    Raises:
-        CaptureError: the one that was given is not there.
-    """
-    if given is not None:
-        if not given.is_dir():
-            raise CaptureError(f"{given} is not a folder: name the folder of the masks")
-        return given
-    beside = [source / "masks", photo_folder.parent / "masks"] if photo_folder.name == "images" else [source / "masks"]
-    return next((path for path in beside if path.is_dir()), None)
-
-
-def mask_of(masks: Path, name: str) -> Path | None:
-    """The mask of a photograph: NAME.png after the whole name, as COLMAP has it, or the same name with any suffix of an
-    image, as nerfstudio has it. That of an upright copy is that of the photograph."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    candidates = [f"{name}.png", *(stem + suffix for suffix in (".png", *PHOTOGRAPHS))]
-    found = next((masks / c for c in candidates if (masks / c).is_file()), None)
-    is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
-    return mask_of(masks, stem) if is_copy else found
-
-
 def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, work: Path) -> Path:
     """Write the masks as COLMAP reads them, grey PNGs of the size of the upright photographs, and return their folder.
 
@@ -103,14 +77,13 @@ def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, wo
 def _read_mask(path: Path, photo: Photo) -> Image.Image:
     try:
         with Image.open(path) as image:
-            mask = image.convert("L")
+            mask = Image.fromarray(counted(image))
     except Exception as error:
         raise CaptureError(f"the mask {path} cannot be read: save it anew, or remove it") from error
     size = (photo.width, photo.height)
-    if abs(mask.width / mask.height / (photo.width / photo.height) - 1) > 0.02:
+    if not in_proportion(mask.size, size):
         raise CaptureError(
             f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {photo.name} stands upright with "
             f"{photo.width} x {photo.height}: save it in the same proportions"
         )
-    # COLMAP keeps whatever is above 0, so the soft edge of a mask is cut in its middle.
-    return mask.resize(size, Image.NEAREST).point(lambda value: 255 if value > 127 else 0)
+    return mask.resize(size, Image.Resampling.NEAREST).convert("L")

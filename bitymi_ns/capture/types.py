@@ -42,8 +42,8 @@ class SfmOptions(SfmSettings):
     """
 
     masks: Path | None = None
-    """Folder of masks; features are found where they are not black. None = the folder `masks` beside the photographs,
-    if there is one."""
+    """Folder of masks; features are found where they are not black. None = `masks` beside the photographs or in their
+    folder, if there is one."""
 
     def __post_init__(self) -> None:
         least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}

@@ -17,16 +17,14 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
-from bitymi_ns.capture.prepare import mask_of
+from bitymi_ns.capture.masks import USUAL_FOLDERS, mask_folder, mask_of, smaller_masks
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS, of_header
 from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.poses import check_spread
-
-USUAL_PLACES = ("images", "input", "image", "photos", "photographs", "rgb", "color")
-"""Folders of photographs beside a COLMAP model, the most usual first."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +127,24 @@ def find_source(
     """
     names = [image.name for image in read_model(folder).images]
     photographs = _photographs(names, folder, capture, images_path, reduction, look)
+    masks = masks_of_capture(photographs, capture, masks_path, reduction)
+    return source_in(folder, photographs, masks, reduction, left_out)
+
+
+def source_in(
+    folder: Path,
+    photographs: Path,
+    masks: Path | None = None,
+    reduction: int = 1,
+    left_out: Mapping[str, str] | None = None,
+) -> Source:
+    """A model whose photographs and masks are in known folders; those of reduced ones, as `images_2` and `masks_2`, are
+    used where they are there."""
     smaller = photographs.with_name(f"{photographs.name}_{reduction}")
     reduced = smaller if reduction > 1 and smaller.is_dir() else None
-    masks = _masks(photographs, capture, masks_path, reduction if reduced is not None else 1)
+    if masks is not None and reduction > 1 and (reduced is not None or not masks.is_dir()):
+        small = smaller_masks(masks, reduction)
+        masks = small if small.is_dir() else masks  # which are reduced as they are read
     return Source(folder, photographs, masks, reduction, reduced, dict(left_out or {}))
 
 
@@ -151,7 +164,7 @@ def _photographs(
         bases += [path for path in folder.parents if path.is_relative_to(capture) and path != capture]
     if folder == capture:
         bases += folder.parents[:3]
-    places = [base / name for base in bases for name in USUAL_PLACES]
+    places = [base / name for base in bases for name in USUAL_FOLDERS]
     places += [path for base in bases[:1] for path in sorted(base.iterdir()) if path.is_dir()]
     places += bases
 
@@ -168,17 +181,22 @@ def _photographs(
     return best
 
 
-def _masks(photographs: Path, capture: Path, given: Path | None, reduction: int) -> Path | None:
-    """The folder of masks: the given one, or `masks` beside the photographs, or in the capture where it is they."""
-    beside = capture if photographs == capture else photographs.parent
-    folder = beside / "masks" if given is None else capture / given
-    if reduction > 1:
-        folder = folder.with_name(f"{folder.name}_{reduction}")
-    if folder.is_dir():
-        return folder
-    if given is not None:
-        fail(f"the folder of masks {folder} does not exist. Give it, seen from {capture}, with --masks-path.")
-    return None
+def masks_of_capture(photographs: Path, capture: Path, given: Path | None, reduction: int = 1) -> Path | None:
+    """The folder of masks by the rule of `mask_folder`.
+
+    Args:
+        photographs: their folder.
+        capture: the folder of the data.
+        given: the folder of masks, seen from the capture; None = it is found.
+        reduction: photographs that are so many times smaller may be used.
+
+    Raises:
+        InputError: the given one is not there.
+    """
+    try:
+        return mask_folder(photographs, capture, None if given is None else capture / given, reduction)
+    except CaptureError as error:
+        fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
 
 
 def mask_files(source: Source, model: Model) -> list[Path] | None:

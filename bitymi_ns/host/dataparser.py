@@ -86,7 +86,8 @@ class BitymiDataParserConfig(DataParserConfig):
     images_path: Path | None = None
     """Folder of the photographs of a COLMAP model, seen from --data; not given: it is found."""
     masks_path: Path | None = None
-    """Folder of masks for a COLMAP model or photographs; not given: `masks` beside the photographs, if there is one."""
+    """Folder of masks for a COLMAP model or photographs, seen from --data; not given: `masks` beside the
+    photographs, in their folder or in that of the data."""
     colmap_path: Path | None = None
     """Folder of the COLMAP model, seen from --data; not given: it is found."""
     ply_path: Path | None = None

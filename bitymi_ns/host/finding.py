@@ -7,11 +7,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from bitymi_ns.capture.cache import read_from
+from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import kept_poses
 from bitymi_ns.host.colmap_model import read_model
-from bitymi_ns.host.colmap_views import Origin, Source, find_source
+from bitymi_ns.host.colmap_views import Origin, Source, masks_of_capture, source_in
 from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.kept_poses import KeptPoses
 
@@ -21,7 +22,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
 
     Args:
         found: photographs, or a video.
-        masks_path: folder of masks, seen from the capture; None = `masks` beside the photographs, if there is one.
+        masks_path: folder of masks, seen from the capture; None = it is found.
         reduction: train on photographs that are so many times smaller.
         settings: how the poses are found.
 
@@ -31,7 +32,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
     from bitymi_ns.capture import CaptureError, SfmOptions, find_poses  # late: it is much, and seldom needed
     from bitymi_ns.progress import rich_progress
 
-    masks = None if masks_path is None else found.folder / masks_path
+    masks = _masks(found, masks_path)
     try:
         with rich_progress() as progress:
             poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress)
@@ -42,8 +43,8 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
     )
-    masks = _masks(found, masks_path)
-    source = find_source(poses.model, poses.images, Path(), masks, reduction, poses.left_out, look=False)
+    masks = _masks(found, masks_path, reduction)
+    source = source_in(poses.model, poses.images, masks, reduction, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the folder of the work
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
@@ -64,8 +65,8 @@ def source_of_run(found: Found, kept: KeptPoses, masks_path: Path | None, reduct
         InputError: photographs of the model are missing, or have another size than they had.
     """
     images = kept.images(found.folder)
-    masks = _masks(found, masks_path)
-    source = find_source(kept.model, images, Path(), masks, reduction, kept.left_out, look=False)
+    masks = _masks(found, masks_path, reduction)
+    source = source_in(kept.model, images, masks, reduction, kept.left_out)
     if look:
         kept_poses.check(source, kept.folder)
     count = len(read_model(source.folder).images)
@@ -73,9 +74,8 @@ def source_of_run(found: Found, kept: KeptPoses, masks_path: Path | None, reduct
     return replace(source, report=kept.folder, origin=kept.origin)
 
 
-def _masks(found: Found, given: Path | None) -> Path | None:
-    """The folder of masks: the given one, seen from the capture, or `masks` beside the photographs."""
-    if given is not None:
-        return found.folder / given
-    beside = found.path / "masks"
-    return beside if found.format == "photographs" and beside.is_dir() else None
+def _masks(found: Found, given: Path | None, reduction: int = 1) -> Path | None:
+    """The folder of the masks, which upright copies of the photographs share; a video has none."""
+    if found.format == "video":
+        return None
+    return masks_of_capture(photo_folder(found.path), found.folder, given, reduction)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
+from bitymi_ns.capture.masks import counted, has_transparency
 from bitymi_ns.capture.photos import eight_bits
 from bitymi_ns.host.errors import fail, listed, warn
 
@@ -94,29 +95,14 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
 
 def read_mask(path: Path) -> Image.Image:
-    """The mask as one grey channel; pixels that are not black count, transparent ones do not."""
+    """The mask as one channel of truth values; see `counted`."""
     try:
         with Image.open(path) as file:
-            grey = _not_black(file)
-            if has_transparency(file):
-                alpha = np.asarray(file.convert("RGBA"))[..., 3]
-                grey = grey & (alpha > 0)
-            return Image.fromarray(grey)
+            return Image.fromarray(counted(file))
     except FileNotFoundError as error:
         fail(f"the mask {path} is missing", error)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         fail(f"the mask {path} cannot be read: {error}. Replace it, or remove the masks from the capture.", error)
-
-
-def _not_black(image: Image.Image) -> npt.NDArray[np.bool_]:
-    if image.mode.startswith(("I", "F")):
-        return np.asarray(image) != 0
-    return np.asarray(image.convert("RGB")).any(-1)
-
-
-def has_transparency(image: Image.Image) -> bool:
-    """Whether an image has an alpha channel or a transparent colour."""
-    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
 
 
 def file_has_transparency(path: Path) -> bool:

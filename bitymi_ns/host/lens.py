@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pycolmap
 from PIL import Image
 
+from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.host.cameras import LITTLE_LEFT, NOTHING_LEFT, PANORAMAS
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import wrong_size
@@ -84,8 +85,9 @@ class Lens:
         return Image.fromarray(pixels, image.mode)
 
     def mask(self, mask: Image.Image, path: Path) -> Image.Image:
-        """The same for a mask: pixels count where the nearest of the photograph does."""
-        if mask.size != self.stored:
+        """The same for a mask: pixels count where the nearest of the photograph does. It may have another size, as that
+        of a photograph that was reduced, but not other proportions."""
+        if not in_proportion(mask.size, self.stored):
             fail(wrong_size(path, mask.size, self.stored))
         pixels = np.asarray(mask.resize(self.size, Image.Resampling.NEAREST)).astype(np.uint8)
         if self.distorts:

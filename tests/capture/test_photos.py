@@ -7,7 +7,6 @@ import pytest
 from PIL import Image, ImageFilter
 
 from bitymi_ns.capture.photos import find_photos, natural, photo_folder, read_photo, read_photos, upright
-from bitymi_ns.capture.prepare import mask_of
 from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.types import CaptureError
 
@@ -105,27 +104,6 @@ def test_deep_grey_pictures_are_scaled_and_turned(
     assert (photo.width, photo.height) == (216, 288) and not photo.plain
     expected = np.rot90(pictures[0].mean(axis=2), -1)
     assert np.abs(np.asarray(upright(photo).convert("L"), float) - expected).max() < 2
-
-
-@pytest.mark.parametrize(
-    ("file", "name"),
-    [
-        ("a.png", "a.jpg"),
-        ("a.jpg.png", "a.jpg"),
-        ("a.jpg", "a.png"),
-        ("b/a.png", "b/a.jpg"),
-        ("a.png", "a.heic.jpg"),  # an upright copy
-        ("a.heic.png", "a.heic.jpg"),
-        ("a.heic.jpg.png", "a.heic.jpg"),
-        ("a.png", "b/a.jpg"),
-        ("a.png", "a.b.jpg"),
-    ],
-)
-def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, file: str, name: str) -> None:
-    path = tmp_path / file
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(b"")
-    assert mask_of(tmp_path, name) == (None if (file, name) in [("a.png", "b/a.jpg"), ("a.png", "a.b.jpg")] else path)
 
 
 def test_a_file_of_several_pictures_is_not_used_as_it_is(tmp_path: Path, pictures: list[np.ndarray]) -> None:

@@ -232,6 +232,19 @@ def test_masks_beside_the_photographs(project: Path, ending: str, reduction: int
         load_any(project)
 
 
+def test_whole_masks_serve_reduced_photographs(project: Path) -> None:
+    reduce_photographs(project, 2, (24, 18))
+    (project / "masks").mkdir()
+    for path in images_of(project):
+        Image.fromarray(np.uint8(np.arange(48) < 24)[None].repeat(36, 0)).save(project / "masks" / path.name)
+    mask = load_any(project, downscale_factor=2).cached_train[0]["mask"]
+    assert mask.shape == (18, 24, 1) and mask[:, :12].all() and not mask[:, 12:].any()
+    (project / "masks").rename(project / "masks_2")
+    assert load_any(project, downscale_factor=2).cached_train[0]["mask"].shape == (18, 24, 1)
+    with expect("the folder of masks .*/mine does not exist. Give it, seen from .*, with --masks-path"):
+        load_any(project, masks_path=Path("mine"))
+
+
 # what is wrong
 
 

@@ -1,0 +1,108 @@
+"""Which folder holds the masks of photographs, which file is that of one, and which of its pixels count."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bitymi_ns.capture import CaptureError
+from bitymi_ns.capture.masks import counted, in_proportion, mask_folder, mask_of
+
+
+@pytest.mark.parametrize(
+    ("photographs", "data", "there", "found"),
+    [
+        ("bed/images", "bed", ["bed/masks"], "bed/masks"),
+        ("bed/images", "bed/images", ["bed/masks"], "bed/masks"),
+        ("bed/input", "bed/input", ["bed/masks", "bed/input/masks"], "bed/masks"),
+        ("bed/shots", "bed", ["bed/masks"], "bed/masks"),  # below the data, whatever its name
+        ("bed/shots", "bed/sparse/0", ["bed/masks"], "bed/masks"),
+        ("bed/a/images", "bed", ["bed/a/masks", "bed/masks"], "bed/a/masks"),
+        ("bed/a/images", "bed", ["bed/masks"], "bed/masks"),
+        ("all/bed", "all/bed", ["all/bed/masks", "all/masks"], "all/bed/masks"),
+        ("all/bed", "all/bed", ["all/masks"], None),  # of another capture
+        ("all/bed", "all/bed/sparse/0", ["all/masks"], None),
+        ("bed/images", "bed", [], None),
+    ],
+)
+def test_the_folder_of_masks(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    photographs: str,
+    data: str,
+    there: list[str],
+    found: str | None,
+) -> None:
+    for folder in (photographs, data, *there):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    expected = None if found is None else tmp_path / found
+    assert mask_folder(tmp_path / photographs, tmp_path / data) == expected
+    monkeypatch.chdir(tmp_path / data)  # the same from within
+    assert mask_folder(tmp_path / photographs, Path()) == expected
+
+
+def test_the_folder_of_masks_that_is_given(tmp_path: Path) -> None:
+    for name in ("images", "masks", "mine"):
+        (tmp_path / name).mkdir()
+    assert mask_folder(tmp_path / "images", tmp_path, tmp_path / "mine") == tmp_path / "mine"
+    with pytest.raises(CaptureError, match="the folder of masks .*/yours does not exist"):
+        mask_folder(tmp_path / "images", tmp_path, tmp_path / "yours")
+
+
+def test_a_folder_of_smaller_masks_alone(tmp_path: Path) -> None:
+    for name in ("images", "masks_2"):
+        (tmp_path / name).mkdir()
+    assert mask_folder(tmp_path / "images", tmp_path) is None
+    assert mask_folder(tmp_path / "images", tmp_path, reduction=2) == tmp_path / "masks"
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("a.png", "a.jpg"),
+        ("a.jpg.png", "a.jpg"),
+        ("a.jpg", "a.png"),
+        ("b/a.png", "b/a.jpg"),
+        ("a.png", "a.heic.jpg"),  # an upright copy
+        ("a.heic.png", "a.heic.jpg"),
+        ("a.heic.jpg.png", "a.heic.jpg"),
+        ("a.png", "b/a.jpg"),
+        ("a.png", "a.b.jpg"),
+    ],
+)
+def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, file: str, name: str) -> None:
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"")
+    assert mask_of(tmp_path, name) == (None if (file, name) in [("a.png", "b/a.jpg"), ("a.png", "a.b.jpg")] else path)
+
+
+def blob() -> np.ndarray:
+    """A round mask [48,64] bool, whose edge no block of a compressed picture follows."""
+    y, x = np.mgrid[:48, :64]
+    return (x - 30) ** 2 + (y - 22) ** 2 < 15**2
+
+
+@pytest.mark.parametrize("values", [(0, 255), (0, 1), (0, 3)])
+def test_pixels_of_a_lossless_mask_count_where_they_are_not_black(tmp_path: Path, values: tuple[int, int]) -> None:
+    Image.fromarray(np.where(blob(), values[1], values[0]).astype(np.uint8)).save(tmp_path / "m.png")
+    assert np.array_equal(counted(Image.open(tmp_path / "m.png")), blob())
+
+
+@pytest.mark.parametrize("ending", ["jpg", "webp"])
+@pytest.mark.parametrize("quality", [50, 90])
+def test_pixels_of_a_lossy_mask_count_above_the_middle(tmp_path: Path, ending: str, quality: int) -> None:
+    path = tmp_path / f"m.{ending}"
+    Image.fromarray(np.where(blob(), 255, 0).astype(np.uint8)).save(path, quality=quality)
+    stored = Image.open(path)
+    ripples = np.asarray(stored.convert("L"))[~blob()]
+    assert (ripples > 0).sum() > 50  # what would count where nothing does
+    assert (counted(stored) != blob()).sum() <= 20  # of 132 along the edge
+
+
+def test_masks_in_the_proportions_of_their_photographs() -> None:
+    assert in_proportion((144, 108), (288, 216)) and in_proportion((67, 50), (4000, 3000))
+    assert not in_proportion((216, 288), (288, 216))

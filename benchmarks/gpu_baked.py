@@ -10,8 +10,8 @@ without, with n surfels of which v are visible, b pairs of surfel and tile, f fr
             read from the second-level cache, which the rows fit in; each of a tile's four warps reads its own.
 
 On a card 3840 x 2160 is drawn in any case. "frame" is the three stages launched by the host, "graph" the same as a CUDA
-graph, "packed" that with 8 bits a channel instead of floats, "waited for" the time of a program
-that waits for each frame.
+graph, "packed" that with 8 bits per channel instead of floats, "waited for" the time of a program that waits for
+each frame.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def operations(options: Options) -> str:
                 )
             title = (
                 f"#### {n:,} surfels at {width} x {height}\n\n{sizes['v']:,} visible, {sizes['b']:,} pairs of surfel "
-                f"and tile, {sizes['f']:,} fragments ({sizes['f'] / sizes['p']:.1f} a pixel)\n"
+                f"and tile, {sizes['f']:,} fragments ({sizes['f'] / sizes['p']:.1f} per pixel)\n"
             )
             parts.append(title + "\n" + table(header, rows))
     return "### Training operations\n\n" + "\n\n".join(parts) + failures()

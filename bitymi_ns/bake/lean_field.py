@@ -80,8 +80,9 @@ def lean_field(
 ) -> tuple[HashField, FieldLevels]:
     """The field without its finest and coarsest levels, as far as no surfel needs them.
 
-    The levels that stay are a run of neighbours, which is a field again: finest levels go first, then coarsest, while
-    the largest change (`level_changes`) of all that is left out together stays within LEVEL_SHARE of the tolerance.
+    The levels that stay are consecutive, so they are a field again. The finest levels are left out first, then the
+    coarsest, as long as all that is left out together changes no surfel (`level_changes`) by more than LEVEL_SHARE of
+    the tolerance.
 
     Args:
         field: the residual field.

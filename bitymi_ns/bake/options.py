@@ -30,14 +30,14 @@ class BakeOptions:
     """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
     4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
     tolerance: float = 0.75
-    """Largest error that is left out, in 8-bit steps, weighted by what a fragment can contribute to a pixel. Of a tile:
-    root mean square over its visible part; it takes the smallest grid that keeps this, or none. Of a surfel's view
-    colour: the largest one at the directions of the training views that see it, and at others between and around them;
-    it keeps as few Spherical Voronoi sites as that takes, or one colour (of other view colours all or one colour). 0:
-    the sizes of the rule, and all of the view colours."""
+    """Largest error of the reduction, in 8-bit steps, weighted by what a fragment can contribute to a pixel. A tile
+    takes the smallest grid, or none, whose root mean square error over its visible part is within it. A view colour
+    keeps the fewest Spherical Voronoi sites, or one colour, whose largest error is within it, at the directions of the
+    training views that see the surfel and at others between and around them. (Other view colours keep all or one
+    colour.) 0: tile sizes by the Nyquist rule, and all of the view colours."""
     local_voxel: bool = True
-    """Measure a tile against the field's voxels where the surfel is; False: against the smallest voxel of the scene, as
-    the paper's rule has it (which also has an extent of 4)."""
+    """Choose the size of a tile by the field's voxels where the surfel is; False: by the smallest voxel of the scene,
+    as in the paper (which also has an extent of 4)."""
     cap_by_views: bool = True
     """Give no tile more texels than pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = True

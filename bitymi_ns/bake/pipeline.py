@@ -110,9 +110,9 @@ def bake(
 ) -> Baked:
     """Bakes a scene's residual field into an atlas (paper, section Texture Baking).
 
-    Surfels that can never be drawn (opacity below 1/255), rows that are not finite or beyond what a bundle holds
-    (`limits.LIMITS`) and rotations of length zero are left out and counted; so are surfels that no training view
-    blends. A scene without a field has no atlas and its tiles are zeros; nor has one whose tiles are all constant
+    Left out and counted are surfels that can never be drawn (opacity below 1/255), rows that are not finite or beyond
+    what a bundle holds (`limits.LIMITS`), rotations of length zero, and surfels that no training view blends. A scene
+    without a field has no atlas, and its tiles are zeros. There is no atlas, either, where all tiles are constant
     within the tolerance.
 
     Args:

@@ -49,7 +49,7 @@ class EncodedAtlas:
     """An atlas in the format it is stored in.
 
     Attributes:
-        payload: one bytes object a page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top.
+        payload: one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top.
         format: one of bc7, uint8, fp16.
         width, height: page size in texels.
         range: quantisation range (offset 0 and scale 1 for fp16).
@@ -153,7 +153,7 @@ def encode(
         format: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
         value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
         profile: effort of the BC7 encoder, from ultrafast to slow.
-        threads: encoder threads; not given: one a processor. The result does not depend on it.
+        threads: encoder threads; not given: one per processor. The result does not depend on it.
         progress: called with the number of rows done.
     """
     if format not in BYTES_PER_TEXEL:

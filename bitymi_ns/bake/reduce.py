@@ -56,10 +56,10 @@ def reduce_tiles(
 ) -> Reduced:
     """Chooses every tile's grid.
 
-    The error of a grid is the root mean square, over the part of the support that gets a residual and over the colour
-    channels, of (reconstruction - field) times the largest blending weight a fragment has there, in 8-bit steps. The
-    grids are tried from none (one constant colour) by number of texels; the first within the tolerance is taken, the
-    plan's limit at the latest.
+    The error of a grid is (reconstruction - field) times the largest blending weight that a fragment has there, in
+    8-bit steps: its root mean square over the colour channels and over the part of the support that gets a residual.
+    Grids are tried by their number of texels, starting with none (one constant colour). The first within the tolerance
+    is taken, the plan's limit at the latest.
 
     Args:
         field: the residual field.

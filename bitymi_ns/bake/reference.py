@@ -51,10 +51,10 @@ class Reference:
 def references(field: Field, plan: Plan, chunk: int = 1 << 18) -> Iterator[Reference]:
     """The exact field on the grids of the plan, in chunks of tiles of one size.
 
-    The field is evaluated at the probes and fitted by least squares on the finest grid of use: with as many probes as
-    texels these are the field's values at the texel centres; with more, detail that no view resolves is averaged out
-    instead of aliased. Beyond the disc of radius `extent`, where nothing is seen, the field is read at the nearest
-    point of the disc: smooth, and within the range of what is seen.
+    The field is evaluated at the probes and fitted by least squares on the finest useful grid. With as many probes as
+    texels the result is the field's values at the texel centres. With more probes, detail that no view resolves is
+    averaged out instead of aliased. Beyond the disc of radius `extent` nothing is seen. There the field is read at the
+    nearest point of the disc, so values stay smooth and within the range of what is seen.
 
     Args:
         field: the residual field.

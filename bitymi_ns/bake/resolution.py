@@ -26,9 +26,9 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
     """Edge of the finest voxel along each tangent axis of a surfel: the local delta of the Nyquist rule.
 
     Outside the unit ball of a contracted scene a voxel is longer along the ray from the centre than across it.
-    A step of length 1 along the axis t crosses cos / radial voxels one way and sin / tangential the other, cos being
-    the component of t along that ray; the edge along t is the reciprocal of the two together (an ellipse).
-    Without a centre the smaller of the two edges holds for both axes, which never samples too coarsely.
+    Let cos be the component of the axis t along that ray. A step of length 1 along t crosses cos / radial voxels along
+    the ray and sin / tangential voxels across it. The edge along t is 1 over the root of the sum of their squares.
+    Without a centre the smaller of the two edges is taken for both axes, which never samples too coarsely.
 
     Args:
         voxel: [N, 2] (radial, tangential) voxel edges at the surfels' centres, world units.

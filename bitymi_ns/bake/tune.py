@@ -230,14 +230,14 @@ def tune_atlas(
 ) -> Baked:
     """Fine-tunes the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
-    A step moves texel t against the gradient g of one view's loss, taken as a sum over pixels:
-    t <- t - rate g / (m + prior), m = sum over all views and fragments of weight times bilinear weight, which is how
-    much of the pictures the texel makes up. This is the step of simultaneous algebraic reconstruction (SART) with the
-    loss's gradient for the residual: it needs no second moments, and a texel that is hardly seen hardly moves. The
-    texels kept are those that show the set-aside views best, the baked ones where none are better.
+    A step moves texel t by t <- t - rate g / (m + prior). Here g is the gradient of one view's loss, as a sum over
+    pixels. m is the sum over all views and fragments of weight times bilinear weight: the number of pixels that show
+    the texel. This is the step of simultaneous algebraic reconstruction (SART), with the loss's gradient for the
+    residual. It needs no second moments, and a texel that is hardly seen hardly moves. The texels that show the
+    set-aside views best are kept, or the baked ones if none are better.
 
-    It runs on the CPU, which alone has kernels for `ops.texel_image` and its gradient, and where a bake is whatever the
-    device it was made on. Photographs and cameras may lie elsewhere: each view is copied when it is traced.
+    It runs on the CPU, because `ops.texel_image` and its gradient have no other kernels. A bake is on the CPU, whatever
+    device made it. Photographs and cameras may be on another device: each view is copied when it is traced.
 
     Args:
         baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.

@@ -26,7 +26,7 @@ class _Layout:
 
     vk_format: int
     type_size: int  # bytes of one component, 1 for compressed formats
-    block: int  # texels a block along x and y
+    block: int  # texels per block along x and y
     block_bytes: int
     color_model: int
     samples: tuple[tuple[int, int, int, int, int], ...]  # bit offset, bit length, channel type, lower, upper

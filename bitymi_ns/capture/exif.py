@@ -129,8 +129,10 @@ def _up(
 
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
-    """AccelerationVector (tag 8) of Apple's maker note in g: towards the left side of the phone as its front is seen,
-    towards its bottom, and into its face; of a phone that is held still it points away from the ground.
+    """AccelerationVector (tag 8) of Apple's maker note, in g.
+
+    Its components point to the left side of the phone as seen from its front, to its bottom, and into its face. When
+    the phone is held still the vector points away from the ground.
 
     The note is an IFD of big-endian numbers after 14 bytes, "Apple iOS", its version and "MM"; places count from its
     start.

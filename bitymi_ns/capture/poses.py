@@ -35,8 +35,10 @@ LEAST = 3
 
 
 def find_poses(source: Path, options: SfmOptions | None = None, progress: Progress | None = None) -> Poses:
-    """Find the camera poses of photographs or of the frames of a video, once: the result is kept beside them, or in the
-    user's cache folder where nothing can be written there, and a run that was ended goes on where it stopped.
+    """Find the camera poses of photographs or of the frames of a video.
+
+    They are found once. The result is kept beside the photographs, or in the user's cache folder if nothing can be
+    written there. A run that was interrupted goes on where it stopped.
 
     Args:
         source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.

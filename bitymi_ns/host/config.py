@@ -163,8 +163,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def get_checkpoint_dir(self) -> Path:
         """The folder of the checkpoints; for the configuration in a bundle, a stand-in that satisfies nerfstudio.
 
-        nerfstudio's tools ask here before they build the model, so this is also where a bundle or a run that was moved
-        is found, or one that is used from another folder than it was trained in.
+        nerfstudio's tools ask here before they build the model. So this is also where a bundle or a run is found that
+        was moved, or that is used from another folder than it was trained in.
         """
         model, evaluated = self.pipeline.model, folder_being_evaluated()
         if evaluated is not None:

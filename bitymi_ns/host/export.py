@@ -212,9 +212,8 @@ def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera]) -> 
 
 @torch.no_grad()
 def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
-    """PSNR in dB over the held-out views, of bundle, trained scene and photographs against each other, and after the
-    affine fit of each view's colours to its photograph: means, and the view in which the bundle is farthest from the
-    trained scene."""
+    """PSNR in dB over the held-out views: means of bundle, trained scene and photographs against each other, also after
+    the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
     rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
     names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")

@@ -75,8 +75,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     Args:
         path: of the file.
         stored: width and height that it must have; None = any.
-        wanted: width and height to which it will be reduced: a JPEG file may then be decoded to a half, a quarter or an
-            eighth of its size, which is no smaller than that and takes a fraction of the time and memory.
+        wanted: width and height to which it will be reduced. A JPEG file may then be decoded at a half, a quarter or an
+            eighth of its size, but no smaller than this; that takes a fraction of the time and memory.
 
     Raises:
         InputError: it is missing, cannot be read, or has another size.

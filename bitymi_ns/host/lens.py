@@ -23,7 +23,8 @@ WIDEST = 110.0
 """Degrees that a pinhole picture of a photograph spans at most, across and down. Beyond, a picture grows fast and shows
 little: each further degree takes more pixels, out of ever fewer of the photograph."""
 STEP = 4
-"""Every how many pixels a lens is evaluated; between them its distortion is linear to far less than a pixel."""
+"""Pixels between the points at which a lens is evaluated; between them its distortion is linear to far less than a
+pixel."""
 ALONG = 32
 """Points along a ray on which a lens must not fold the picture."""
 AROUND = 64

@@ -1,7 +1,7 @@
 """PLY files of points: rows that are no points, and colours that are no bytes.
 
-The reader that nerfstudio uses does not say: it returns whatever the memory held for points that the file lacks, or
-that follow one it cannot read, and divides every colour by 255, also those that lie between 0 and 1.
+The reader that nerfstudio uses reports neither. For points that the file lacks, or that follow one it cannot read, it
+returns whatever the memory held. It divides every colour by 255, also those that lie between 0 and 1.
 """
 
 from __future__ import annotations

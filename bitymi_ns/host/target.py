@@ -54,8 +54,10 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
 
 
 def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
-    """Bytes that a bundle of a run takes at most, by a generous estimate: as many surfels as if the newest checkpoint
-    held nothing else, each with a tile of 32 x 32 texels, or with the largest where everything is kept.
+    """A generous estimate of the bytes of a run's bundle.
+
+    It assumes that the newest checkpoint holds nothing but surfels, each with a tile of 32 x 32 texels, or with the
+    largest tile where everything is kept.
 
     Args:
         load_config: config.yml of the run; without a checkpoint beside it the estimate is 0.

@@ -31,8 +31,8 @@ def draw(
         name -> [views, height, width, channels].
 
     Raises:
-        ValueError: the cameras differ in size or have skew; an image that does not exist, or not on this device; on the
-            CPU, the atlas is only there as BC7 blocks; on a CUDA device, views times surfels is above 2^24.
+        ValueError: the cameras differ in size or have skew; there is no such image, or this device cannot draw it; on
+            the CPU, the atlas was not decoded from BC7 blocks; on a CUDA device, views times surfels is above 2^24.
         RuntimeError: the device has too little memory.
     """
     by = baked_cuda if cuda_backend(scene.tiles.device) else baked_cpu

@@ -52,7 +52,7 @@ class TexelTiles:
 
 @dataclass(frozen=True)
 class TexelFragments:
-    """What the colours of a view depend on once its geometry stands still. Nothing here has a gradient.
+    """What the colours of a view depend on while its geometry is fixed. Nothing here has a gradient.
 
     Attributes:
         weight: [F] blending weight.
@@ -60,8 +60,8 @@ class TexelFragments:
         surfel, pixel: [F] int32, row of the surfel and y * width + x.
         tile_start: [tiles + 1] int64, where the fragments of each screen tile begin.
         run_start: [R + 1] int64; fragments run_start[r] to run_start[r + 1] - 1 are of one surfel.
-        order: [R] int64, the runs sorted by surfel: the backward pass gives every thread whole surfels, so that no two
-            add to one texel and its sums do not depend on the number of threads.
+        order: [R] int64, the runs sorted by surfel. The backward pass gives whole surfels to each thread, so that no
+            two threads add to one texel, and sums do not depend on the number of threads.
         width, height: of the image, pixels.
     """
 

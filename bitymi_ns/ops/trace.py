@@ -114,17 +114,18 @@ class _Trace(torch.autograd.Function):
 
 
 def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) -> Fragments:
-    """Finds the fragments of a view: for each pixel, front to back by centre depth, the surfels with
-    sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255, until the
-    transmittance would fall below 1e-4.
+    """Finds the fragments of a view: for each pixel the surfels that are blended there, front to back by centre depth.
+
+    They have sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255. A pixel ends before the surfel
+    that would take its transmittance below 1e-4.
 
     The backward pass fills `projection.mean2d_grad` and `projection.mean2d_absgrad`.
 
     Args:
         projection: of `project`; geom [N, 16].
         rim: lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1.
-        most: fragments that there may be; 0 = on a CUDA device as many as its free memory holds together with what
-            shading, blending and their backward pass need, on the CPU `trace_cpu.MOST`; None = as many as there are.
+        most: largest number of fragments; None = no limit; 0 = on the CPU `trace_cpu.MOST`, on a CUDA device as many as
+            its free memory holds together with what shading, blending and their backward pass need.
 
     Raises:
         TooManyFragments: there are more, or their list does not fit the memory of the CUDA device.

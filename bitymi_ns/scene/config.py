@@ -27,7 +27,8 @@ class SceneConfig:
     min_resolution: int = 256
     """Cells along an edge of the coarsest hash grid level, 2 to 2^20."""
     log2_table_size: int | None = None
-    """Entries a hash level, as a power of two, 1 to 24; not given: as the photographs and the cache ask for."""
+    """Entries per hash level, as a power of two, 1 to 24; not given: chosen by the number of pixels in the photographs,
+    so that the table fits the cache."""
     contraction: Literal["auto", "on", "off"] = "auto"
     """Contraction of space beyond the cameras; auto: off for images with alpha, and where a small box is declared."""
     near: float | None = None
@@ -37,11 +38,11 @@ class SceneConfig:
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels."""
     prefilter: Literal["low_pass", "pixel"] = "low_pass"
-    """How discs of a pixel or less are drawn: low_pass = never less than a fixed blob around their centre; pixel = as
-    much as they cover of a pixel, moments kept (docs/numerics.md)."""
+    """How discs of a pixel or less are drawn: low_pass = never smaller than a fixed blob around their centre; pixel =
+    as what they cover of each pixel, with the right moments (docs/numerics.md)."""
     max_fragments: int = 0
-    """Fragments that are kept at once: views with more are drawn in bands, and once more in the backward pass; 0 = on a
-    GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
+    """Fragments that are kept at once. Views with more are drawn in bands, which the backward pass draws once more. 0:
+    on a GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
 

@@ -105,7 +105,7 @@ class Scene(nn.Module):
             parameter.data = parameter.new_zeros(n, *parameter.shape[1:])
 
     def parameters_per_surfel(self) -> int:
-        """Numbers stored a surfel: 60 for sv, 59 for sh, 26 for sb."""
+        """Numbers stored per surfel: 60 for sv, 59 for sh, 26 for sb."""
         return sum(p[:1].numel() if len(p) else p.new_zeros(1, *p.shape[1:]).numel() for p in self.surfels.values())
 
     def base_color(self, projection: Projection) -> Tensor:

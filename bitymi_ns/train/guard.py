@@ -3,15 +3,16 @@
 What counts as divergence:
 - a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could mend them);
 - surfels that are not finite, beyond a hundredth of them (fewer are dropped and counted);
-- views drawn worse than blank ones, over a window of steps: the mean photometric loss exceeds both that of every view
-  in its own mean colour and that of the scene as the run found it; by a quarter in the first tenth of the run, and
-  in its first 100 steps;
-- views drawn worse than before: the mean over a window exceeds that of the best window since the run began or last went
-  back by a quarter, and by a tenth of what blank views cost. Windows are whole epochs, so that all are means over the
-  same views; where the resolution changes, what was measured is converted by the loss of a few views at both.
+- views drawn worse than blank ones: over a window of steps the mean photometric loss exceeds two others. One is the
+  loss of views that show only their own mean colour, the other that of the scene as the run found it. In the first
+  tenth of the run, and in its first 100 steps, it has to exceed them by a quarter;
+- views drawn worse than before: the mean over a window exceeds that of the best window by a quarter, and by a tenth of
+  the loss of blank views. The best window is sought since the run began or last went back. Windows are whole epochs, so
+  that all are means over the same views. Where the resolution changes, earlier losses are converted by the loss of a
+  few views at both resolutions.
 
-After an opacity reset nothing is judged until half of the time to the next one, by when opacities can be made up for
-(`Schedule.reset_opacity`). The last window ends with the run.
+After an opacity reset nothing is judged until half of the time to the next reset has passed: by then opacities can have
+risen again (`Schedule.reset_opacity`). The last window ends with the run.
 
 Going back restores parameters, optimisers and the strategy's statistics as they were a whole window before the last
 good one ended; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power

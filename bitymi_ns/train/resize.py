@@ -23,8 +23,8 @@ def replace_rows(
 ) -> None:
     """Keep the rows `keep` of every surfel parameter, in that order, and append the rows `new`.
 
-    Every entry of `surfels` becomes a new Parameter, which takes the old one's place in its optimiser: the state of
-    the rows that stay moves along, new rows start with zeros (as torch's Adam does for a fresh parameter).
+    Every entry of `surfels` becomes a new Parameter, which replaces the old one in its optimiser. Rows that stay keep
+    their optimiser state. New rows start with zeros, as torch's Adam does for a new parameter.
 
     Args:
         surfels: parameters by name, each [N, ...].

@@ -79,10 +79,10 @@ class Schedule:
     def reset_opacity(self) -> float:
         """Opacity that a reset lowers to: `reset_opacity`, or more in a short run.
 
-        Adam moves a logit by no more than its learning rate per step. A reset goes only as deep as can be made up for
-        in half the time to the next one: else a short run would never see an opaque surfel, and its final prunes would
-        take nearly all. It matters where resets are less than about 370 steps apart (fewer with the rates of a short
-        run).
+        Adam moves a logit by no more than its learning rate per step. So a reset lowers opacities only as far as they
+        can rise again in half the time to the next reset. Otherwise a short run would never have an opaque surfel, and
+        its final prunes would remove nearly all. This matters where resets are less than about 370 steps apart (fewer
+        with the rates of a short run).
         """
         densify = self.config.densify
         if not 0.0 < densify.reset_opacity < 1.0:

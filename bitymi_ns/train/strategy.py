@@ -1,9 +1,12 @@
 """FastGS densification and pruning: multi-view scores decide which surfels multiply and which go.
 
-At each densification, in this order: surfels that can never be seen again go (a value that is not finite; an opacity
-of 1/255 or less), surfels with many bad pixels and a large gradient are cloned or split, half of the candidates for
-pruning are drawn by lot, opacities are clamped. Between 60 and 90 % of the run, four final prunes remove what is
-transparent or in the way. See the published rules in docs/training.md.
+At each densification, in this order:
+- surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);
+- surfels with many bad pixels and a large gradient are cloned or split;
+- up to half of the candidates for pruning, drawn by lot, are removed;
+- opacities are clamped.
+Between 60 and 90 % of the run, four final prunes remove what is transparent or in the way. docs/training.md states the
+published rules.
 """
 
 from __future__ import annotations

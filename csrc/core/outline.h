@@ -1,6 +1,6 @@
-// What the two ways of bounding a surfel's pixels share (core/bounds.h in double, core/reach.h in the reals of the
-// fragments): the level set, the padding, and which x offsets a box, an ellipse and the low pass have between two
-// lines.
+// A surfel's pixels are bounded in two ways: in double (core/bounds.h), and in the reals of the fragments
+// (core/reach.h). This is what both share: the level set, the padding, and which x offsets a box, an ellipse and the
+// low pass have between two lines.
 #pragma once
 
 #include "core/surfel.h"

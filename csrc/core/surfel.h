@@ -1,7 +1,8 @@
 // A surfel seen by a camera: everything that its fragments need, and the vector-Jacobian product of that.
 //
-// With the camera-frame tangents a, b (unit), normal n = a x b, centre p and the ray r = (x, y, 1) of a pixel whose
-// offset from the projected centre is (dx, dy) pixels, the ray meets the disc's plane at depth n.p / n.r, and
+// Given are the unit tangents a, b, the normal n = a x b and the centre p, all in the camera frame, and the ray
+// r = (x, y, 1) of a pixel at (dx, dy) pixels from the projected centre. The ray meets the disc's plane at depth
+// n.p / n.r, and
 //   u = U / W,  v = V / W,  W = n.r = n.p/z + n.x dx/fx + n.y dy/fy,
 //   U = -((p x b).x dx/fx + (p x b).y dy/fy) / s_u,   V = ((p x a).x dx/fx + (p x a).y dy/fy) / s_v.
 // This is the solution of the homography of 2D Gaussian Splatting (Huang et al. 2024) divided by fx fy s_u s_v. No
@@ -29,9 +30,9 @@ enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBe
 // frame.
 constexpr int kFrame = 9;
 
-// How a launch draws surfels, known when its code is compiled: united with the low pass (core/kernel.h), or seen
-// through a pixel (PixelKernel), where rows without kArea are as with the low pass. with_kernel is the one place
-// that chooses.
+// How a launch draws surfels, known when its code is compiled. LowPassKernel: the maximum of the kernel and the low
+// pass (core/kernel.h). PixelKernel: seen through a pixel; rows without kArea are drawn as with LowPassKernel. Only
+// with_kernel chooses.
 struct LowPassKernel {
   static constexpr bool kPixel = false;
 };

@@ -1,13 +1,14 @@
 // Third stage of the baked renderer: the images.
 //
 // A warp draws 8 x 8 pixels, two per thread (four rows apart), and works for itself: no barrier of the block, no
-// waiting for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time, keeps those whose mask names
-// one of its two parts, gathers 32 of them and loads their rows side by side into shared memory; then every thread
-// reads the same row (a broadcast, four loads of 16 bytes) for both its pixels, which it works on together. On scenes
-// like trained ones 2.5 of a tile's four warps look at a pair, at 4.3 of its 8 parts, and 6 of 10 pixels that are
-// looked at blend it: the masks leave little to reject. A hit costs one reciprocal, one logarithm, one exponential and,
-// where the weight is above the bound, one texture fetch. Bound by issue of arithmetic, then by the texture unit;
-// memory traffic is 96 bytes per row and warp, mostly from L2.
+// waiting for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time and keeps those whose mask
+// names one of its two parts. When it has 32 it loads their rows side by side into shared memory. Then every thread
+// reads the same row (a broadcast, four loads of 16 bytes), and works on both its pixels together.
+//
+// On scenes like trained ones 2.5 of a tile's four warps examine a pair, in 4.3 of its 8 parts, and 6 of 10 pixels that
+// are examined blend it. So the masks leave little to reject. A hit costs one reciprocal, one logarithm, one
+// exponential and, where the weight is above the bound, one texture fetch. The kernel is bound by issue of arithmetic,
+// then by the texture unit. Memory traffic is 96 bytes per row and warp, mostly from L2.
 #include "core/kernel.h"
 #include "core/shading.h"
 #include "core/texel.h"

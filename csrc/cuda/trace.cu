@@ -98,9 +98,9 @@ __global__ void __launch_bounds__(kThreads)
 template <class S>
 constexpr int kHeld = 4096 / sizeof(S);
 
-// A warp has about ten fragments of a pair, and few of them fill a sector of 32 bytes from end to end: written from
-// there, most sectors would be written in parts, by several warps, and memory takes a part for longer than a whole one.
-// So a block collects the fragments of up to 32 pairs, in the list's order, and then writes them from end to end.
+// A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes. If each warp wrote its own, most
+// sectors would be written in parts, by several warps, and memory takes longer for a part than for a whole sector. So a
+// block collects the fragments of up to 32 pairs, in the list's order, and writes them as one contiguous stretch.
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
     fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {

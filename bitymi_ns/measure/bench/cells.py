@@ -1,4 +1,4 @@
-"""Finished cells on disk: one JSON object a line, appended when a cell is done.
+"""Finished cells on disk: one JSON object per line, appended when a cell is done.
 
 A line has `key` (everything that decides the result; cells of equal keys are the same cell), `value` (what came out;
 paths in it are relative to the work folder) and `made` (when, where and with what).

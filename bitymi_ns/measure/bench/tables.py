@@ -80,7 +80,7 @@ def _line(
 
 
 def results_table(matrix: Matrix, cells: Cells) -> tuple[str, list[str]]:
-    """One line a form of each run that has been evaluated: the trained scene, then its bundles.
+    """One line per evaluated form of each run: the trained scene, then its bundles.
 
     Returns:
         The table without columns that no line fills, and the commits that made its cells.
@@ -111,7 +111,7 @@ BUNDLE_NOTES = (
     "dPSNR and dFLIP: against the photographs, bundle minus trained scene; PSNR to neural: bundle against trained "
     "scene on the held-out views, as the exporter measures it.",
     "Tile error: root mean square of a tile against the field as stored, in 8-bit steps, 99th percentile.",
-    "Sites a surfel: what is left of the view colour (or coefficients, lobes); one colour: share of the surfels with "
+    "Sites per surfel: what is left of the view colour (or coefficients, lobes); one colour: share of the surfels with "
     "nothing but a constant; colour error: largest over the directions of the training views and others between, times "
     "the blending weight, in 8-bit steps, 99th percentile. Bundles that keep all have none of these.",
 )

@@ -40,10 +40,10 @@ PROBES = 3
 class Errors:
     """Errors of one case, each the largest over all pixels or numbers, relative to the largest value of its kind.
 
-    Only pixels where both sides blend the same surfels, in the same branch of the kernel, are compared, and the
-    gradients are those of a loss over these pixels: elsewhere a threshold (1/255, the transmittance, which branch is
-    the larger) fell on the other side of a rounding, and what is then compared is a different sum. Their share is
-    stated on its own.
+    A pixel is compared only if both sides blend the same surfels there, in the same branch of the kernel. The gradients
+    are those of a loss over these pixels. In the other pixels rounding moved a value across a threshold (1/255, the
+    transmittance, which branch is the larger), so the two sides add up different terms. `flipped` is the share of these
+    pixels.
     """
 
     forward: float
@@ -154,7 +154,7 @@ def _by_reference(case: SceneCase, near: float, rim: float = RIM) -> _Result:
 
 
 def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Random weights a pixel and channel; each image counts by its own size."""
+    """Random weights per pixel and channel; each image counts by its own size."""
     generator = torch.Generator().manual_seed(1)
     weights = {}
     for key, image in images.items():

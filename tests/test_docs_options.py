@@ -1,0 +1,55 @@
+"""The README's table of options names options that exist, with their defaults."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from bitymi_ns.bake import BakeOptions
+from bitymi_ns.capture.types import SfmOptions
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import TrainConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOTS: dict[str, Any] = {
+    "--pipeline.model.scene.": SceneConfig(),
+    "--pipeline.model.train.": TrainConfig(),
+    "... bitymi-data --sfm.": SfmOptions(),
+    "--sfm.": SfmOptions(),
+    "ns-export ... --": BakeOptions(),
+}
+ELSEWHERE = {"--max-num-iterations", "ns-export ... --exact", "ns-export ... --finetune-steps"}
+"""Options that are declared with the commands, which need nerfstudio."""
+
+
+def value_of(option: str, before: str) -> Any:
+    """Default of an option as the README writes it; `before` is the option that its row begins with."""
+    if option.startswith("--") and before.startswith("ns-export"):
+        option = "ns-export ... " + option
+    prefix = max((root for root in ROOTS if option.startswith(root)), key=len)
+    value = ROOTS[prefix]
+    for name in option.removeprefix(prefix).replace("-", "_").split("."):
+        assert is_dataclass(value) and name in {field.name for field in fields(value)}, f"there is no option {option}"
+        value = getattr(value, name)
+    return value
+
+
+def test_options_have_the_defaults_that_the_readme_states() -> None:
+    table = (ROOT / "README.md").read_text("utf8").split("## Options that matter")[1].split("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("| `")]
+    checked = 0
+    for names, stated, _ in rows:
+        options = re.findall(r"`([^`]+)`", names)
+        if options[0] in ELSEWHERE:
+            continue
+        values = [value_of(option, options[0]) for option in options]
+        words = [word for word in re.split(r", | \(none\)| of the cameras' extent", stated.strip()) if word]
+        if len(words) == 1:
+            words *= len(values)
+        for option, value, word in zip(options, values, words, strict=bool(words)):
+            if value is not None:
+                assert word == (f"{value:g}" if isinstance(value, float) else str(value)), f"{option} is {value}"
+                checked += 1
+    assert checked > 12

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -51,6 +52,23 @@ class View(NamedTuple):
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
         """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
         return over_background(as_float(self.image.to(device)), background)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a run learns from.
+
+    Attributes:
+        views: training views at full size.
+        extent: scene extent in world units (`init.scene_extent`).
+        image_pixels: of all training views together.
+        exif_stops: log2 of the exposure of each photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
+    """
+
+    views: Sequence[View]
+    extent: float
+    image_pixels: int
+    exif_stops: Sequence[float] | None = None
 
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:

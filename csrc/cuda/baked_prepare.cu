@@ -17,17 +17,11 @@ constexpr int kThreads = 128;
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
   if (s.lean.base) return view_color(s.lean, i, d);
   const ViewColorArrays<const float>& p = s.colors;
-  const int K = p.terms;
-  switch (p.kind) {
-    case kSv:
-      return K == preset_terms(kSv) ? view_color(kSv, preset_terms(kSv), p, i, d) : view_color(kSv, K, p, i, d);
-    case kSh:
-      return K == preset_terms(kSh) ? view_color(kSh, preset_terms(kSh), p, i, d) : view_color(kSh, K, p, i, d);
-    case kSb:
-      return K == preset_terms(kSb) ? view_color(kSb, preset_terms(kSb), p, i, d) : view_color(kSb, K, p, i, d);
-    default:
-      return K == preset_terms(kSg) ? view_color(kSg, preset_terms(kSg), p, i, d) : view_color(kSg, K, p, i, d);
-  }
+  return for_view_color(p.kind, [&](auto kind) {
+    using Kind = decltype(kind);
+    constexpr int kPreset = Kind::kPresetTerms;
+    return p.terms == kPreset ? view_color<Kind>(kPreset, p, i, d) : view_color<Kind>(p.terms, p, i, d);
+  });
 }
 
 __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color, float* row) {

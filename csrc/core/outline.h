@@ -1,5 +1,5 @@
-// What the two ways of bounding a surfel's pixels share (core/bounds.h in double, core/reach.h in the reals of the
-// fragments): the level set, the padding, and which x offsets a box, an ellipse and the low pass have between two
+// What the two ways of bounding a surfel's pixels share (core/bounds.h in double, core/plane_bounds.h in the reals of
+// the fragments): the level set, the padding, and which x offsets a box, an ellipse and the low pass have between two
 // lines.
 #pragma once
 

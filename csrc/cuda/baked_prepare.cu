@@ -66,13 +66,13 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
     if (seen) {
       LevelSet<float> level;
       if (filtered<Kernel>(geom))
-        level = {filtered_reach(geom).visible, 0, -geom[kArea]};
+        level = {filtered_bounds(geom).visible, 0, -geom[kArea]};
       else
         level = level_set(geom);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
       const Footprint area = footprint<Kernel>(row, v.height);
-      const Reach<float>& e = area.reach;
+      const PlaneBounds<float>& e = area.bounds;
       const Interval<float> x = columns_of(e);
       const float pad = e.ellipse ? area.pad : 0;
       seen = level.visible && area.top <= area.bottom &&

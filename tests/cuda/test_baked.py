@@ -265,7 +265,7 @@ def test_errors(device: torch.device, cpu) -> None:
     with pytest.raises(ValueError, match="16777217, at most 16777216"):
         module(device).baked_memory(2**24 + 1, 1, 8, 8, 1, False)
     with pytest.raises(ValueError, match="a frame can have"):
-        BakedRenderer(scene, 8, 8)._fit(2**40)
+        BakedRenderer(scene, 8, 8)._resize(2**40)
     if device.type == "cpu":
         with cpu():
             with pytest.raises(RuntimeError, match="move the scene"):

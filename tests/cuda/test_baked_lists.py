@@ -125,7 +125,7 @@ def test_many_tiles(device: torch.device) -> None:
     scene, ranges = scene_of(case).to(device), []
     for width in (1_000, 600_000):
         renderer = BakedRenderer(scene, width, 20)
-        renderer._fit(2_000)
+        renderer._resize(2_000)
         renderer._viewmats.copy_(case.viewmat)
         renderer._Ks.copy_(case.K)
         renderer.run(Stage.PREPARE)

@@ -202,7 +202,7 @@ def _order(error: float) -> float:
 
 
 @dataclass(frozen=True)
-class Trust:
+class ExtendedErrors:
     """Errors against extended precision (`ops.reference.extended`), where even float64 may lose figures."""
 
     forward: float
@@ -212,7 +212,7 @@ class Trust:
     the root of the sum of squares of the products that it sums."""
 
 
-def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> Trust:
+def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> ExtendedErrors:
     """The float64 reference, or a backend in float64, against extended precision.
 
     Args:
@@ -252,4 +252,4 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
         products = grads[key].numpy() * direction
         size, error = math.sqrt((products**2).sum()), abs(slope - products.sum())
         worst = max(worst, error / size if size > NOTHING else error, key=_order)
-    return Trust(forward, worst)
+    return ExtendedErrors(forward, worst)

@@ -27,5 +27,5 @@ def test_names_are_defined_where_the_page_says() -> None:
         assert re.fullmatch(r"`\w+`", name), name
         name = name.strip("`")
         text = (ROOT / file).read_text("utf8")
-        definition = rf"^def {name}\(" if file.endswith(".py") else rf"^(BT_HD .*|constexpr double )\b{name}\b( =|\()"
+        definition = rf"^def {name}\(" if file.endswith(".py") else rf"^ *(BT_HD .*|constexpr double )\b{name}\b( =|\()"
         assert re.search(definition, text, re.MULTILINE), f"{file} does not define {name}"

@@ -1,8 +1,7 @@
 // View-dependent surfel colour f_view(d), without the offset 0.5: Spherical Voronoi (sv, Di Sario et al. 2025),
 // spherical harmonics (sh, as in 3D Gaussian Splatting, Kerbl et al. 2023), Spherical Beta (sb, Deformable Beta
 // Splatting, Liu et al. 2025) and spherical Gaussians (sg), each with its vector-Jacobian product. d is the unit vector
-// from the camera centre to the surfel, world frame. A kind is one struct, and for_view_color calls what is given with
-// it.
+// from the camera centre to the surfel, world frame. A kind is one struct; for_view_color finds it.
 #pragma once
 
 #include "core/common.h"
@@ -88,9 +87,9 @@ struct SphericalVoronoi {
     }
     return (S(1) / total) * c;
   }
-  // dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the
-  // heaviest site: where one site takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not
-  // the difference of two equal colours, whose rounding a temperature of 1e4 would multiply.
+  // dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the heaviest site: where one site
+  // takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not the difference of two equal
+  // colours, whose rounding a temperature of 1e4 would multiply.
   template <class S>
   BT_HD static void color_vjp(int K, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp, Vec3<S>& dd) {
     const S *sites = p.a, *log_tau = p.b, *rgb = p.c;

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.errors import tile_errors
+from bitymi_ns.bake.inputs import BakeInput, drawable
+from bitymi_ns.bake.methods import BakeMethod, Tiles, bake_method
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import tile_means
 from bitymi_ns.bake.plan import Field, paper_texels
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
-from bitymi_ns.bake.subject import Subject, drawable
-from bitymi_ns.bake.ways import Tiles, Way, way_of
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
@@ -126,14 +126,14 @@ def bake(
     """
     options, progress = options or BakeOptions(), progress or no_progress
     options.check()
-    started, way = time.perf_counter(), way_of(options)
+    started, method = time.perf_counter(), bake_method(options)
     rows, left_out = drawable(scene.surfels)
-    candidates = _subject(scene, rows, cameras)
-    subject = candidates.looked_at(options, progress)
-    if subject.views is not None and options.drop_unseen:
-        seen = subject.views.transmittance > 0
+    candidates = _inputs(scene, rows, cameras)
+    inputs = candidates.looked_at(options, progress)
+    if inputs.views is not None and options.drop_unseen:
+        seen = inputs.views.transmittance > 0
         left_out = left_out.but(unseen=int((~seen).sum()))
-        rows, subject = rows[seen], subject.of(seen)
+        rows, inputs = rows[seen], inputs.of(seen)
     trained = len(scene.surfels["means"])
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
@@ -142,32 +142,32 @@ def bake(
         tiles, atlas = Tiles.none(len(rows), options.extent), None
     else:
         paper = paper_texels(candidates.surfels, scene.field, options)
-        tiles, atlas, statistics = _textured(way, scene.field, subject, paper, statistics, options, progress)
-    surfels, view_color = way.view_color(subject, progress)
+        tiles, atlas, statistics = _textured(method, scene.field, inputs, paper, statistics, options, progress)
+    surfels, view_color = method.view_color(inputs, progress)
     baked = BakedScene(
         {name: value.cpu() for name, value in surfels.items()},
         kind_of(scene.surfels),
         torch.from_numpy(tiles.packing.tiles),
         extent=tiles.extent,
         mean_residual=tiles.mean_residual,
-        near=subject.near,
-        weight_bound=subject.weight_bound,
+        near=inputs.near,
+        weight_bound=inputs.weight_bound,
         prefilter=getattr(scene.config, "prefilter", "low_pass"),
     )
     statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
     return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics)
 
 
-def _subject(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> Subject:
+def _inputs(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> BakeInput:
     surfels = {name: value.detach()[rows].float() for name, value in scene.surfels.items()}
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
-    return Subject(surfels, cameras, scene.near, weight_bound, getattr(scene.config, "through_pixel", False))
+    return BakeInput(surfels, cameras, scene.near, weight_bound, getattr(scene.config, "through_pixel", False))
 
 
 def _textured(
-    way: Way,
+    method: BakeMethod,
     field: Field,
-    subject: Subject,
+    inputs: BakeInput,
     paper: int,
     statistics: Statistics,
     options: BakeOptions,
@@ -179,9 +179,9 @@ def _textured(
         paper: texels that the paper's rule gives.
         statistics: with the numbers of surfels.
     """
-    field, levels = way.field(field, subject)
-    plan = way.plan(field, subject)
-    tiles = way.tiles(field, plan, subject, progress)
+    field, levels = method.field(field, inputs)
+    plan = method.plan(field, inputs)
+    tiles = method.tiles(field, plan, inputs, progress)
     packing = tiles.packing
     atlas = None if tiles.texels is None else _encode(tiles.texels, packing, options, progress)
     stored = None if atlas is None else atlas.decoded()

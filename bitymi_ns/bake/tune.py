@@ -29,7 +29,7 @@ from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import mean_psnr, photometric, psnr
-from bitymi_ns.train.memory import OnDemand, Room
+from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.views import View, shown, training_order
 
 FEWEST_VIEWS = 4
@@ -193,10 +193,10 @@ class TexelScene:
 
 
 class TexelViews(Sequence[TexelView]):
-    """Views of a scene, traced when they are needed and kept while there is room for them."""
+    """Views of a scene, traced when they are needed and kept while there is budget for them."""
 
-    def __init__(self, scene: TexelScene, views: Sequence[View], room: Room) -> None:
-        self._scene, self._views, self._room = scene, views, room
+    def __init__(self, scene: TexelScene, views: Sequence[View], budget: MemoryBudget) -> None:
+        self._scene, self._views, self._budget = scene, views, budget
         self._kept: dict[int, TexelView] = {}
 
     def __len__(self) -> int:
@@ -206,7 +206,7 @@ class TexelViews(Sequence[TexelView]):
         if index in self._kept:
             return self._kept[index]
         view = self._scene.view(self._views[index])
-        if self._room.take(view.nbytes):
+        if self._budget.reserve(view.nbytes):
             self._kept[index] = view
         return view
 
@@ -257,9 +257,9 @@ def tune_atlas(
         return replace(baked, statistics=baked.statistics.but(finetune=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
     scene = TexelScene(baked, background)
-    room, every = Room(options.cache_bytes), options.held_in_every
+    budget, every = MemoryBudget(options.cache_bytes), options.held_in_every
     held_in, tuned = (
-        TexelViews(scene, OnDemand(len(rows), lambda i, rows=rows: views[rows[i]]), room)
+        TexelViews(scene, OnDemand(len(rows), lambda i, rows=rows: views[rows[i]]), budget)
         for rows in (range(0, len(views), every), [i for i in range(len(views)) if i % every])
     )
     texels, curve = _descend(scene, tuned, held_in, options, progress)
@@ -274,7 +274,7 @@ def tune_atlas(
         seconds=round(time.perf_counter() - started, 2),
         cpu_seconds=round(time.process_time() - cpu_started, 2),
     )
-    held_out = TexelViews(scene, eval_views, Room(0))
+    held_out = TexelViews(scene, eval_views, MemoryBudget(0))
     statistics = statistics.but(
         error_before=baked.statistics.error,
         psnr_held_out=_gain(held_out.psnr(scene.texels), held_out.psnr(texels)) if eval_views else None,

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.errors import tile_errors
+from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
+from bitymi_ns.bake.methods import bake_method
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.plan import Field, kernel_parameters
-from bitymi_ns.bake.subject import Subject
 from bitymi_ns.bake.visibility import visibility
-from bitymi_ns.bake.ways import way_of
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
 from bitymi_ns.bundle.read import Bundle, assemble, enough_memory, read_file, read_manifest
 from bitymi_ns.bundle.write import World
@@ -109,8 +109,8 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
             return Check(name, False, f"levels {first} to {first + count - 1} stated, the field has {field.levels}")
         field = field.only(first, count)
     options = statistics.options or BakeOptions()
-    subject = Subject(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
-    plan = way_of(options).plan(field, subject.looked_at(options))
+    subject = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
+    plan = bake_method(options).plan(field, subject.looked_at(options))
     tiled = bundle.scene.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
     residuals = None if bundle.scene.atlas is None else bundle.scene.residuals().numpy()

@@ -27,7 +27,7 @@ from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import TrainingData, View
 
 
 class TrainingRun:
@@ -66,20 +66,15 @@ class TrainingRun:
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
         self._curve_views = curve_views
-        extent = scene_extent(metadata["camera_centers"], scene.surfels["means"])
+        data = TrainingData(
+            self.datamanager.train_views,
+            scene_extent(metadata["camera_centers"], scene.surfels["means"]),
+            metadata["train_pixels"],
+            stops_of(self.datamanager.train_dataset.image_filenames),
+        )
+        optimizers = attributes.optimizers.optimizers
         try:
-            self.training = Training(
-                scene,
-                self.datamanager.train_views,
-                attributes.optimizers.optimizers,
-                config,
-                self.total,
-                extent,
-                metadata["train_pixels"],
-                self._on_resize,
-                warn,
-                stops_of(self.datamanager.train_dataset.image_filenames),
-            )
+            self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn)
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
         self.capture = capture_print(self.datamanager.train_dataset)

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from . import baked_cpu, baked_cuda
 from .backend import cuda_backend
-from .baked_scene import IMAGES, BakedScene, Kept
+from .baked_scene import IMAGES, BakedScene, DrawCache
 from .project import Camera
 
-__all__ = ["IMAGES", "BakedScene", "Kept", "draw"]
+__all__ = ["IMAGES", "BakedScene", "DrawCache", "draw"]
 
 
 @torch.no_grad()

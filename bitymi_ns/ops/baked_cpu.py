@@ -76,7 +76,7 @@ def frame(scene: BakedScene, camera: Camera, maps: bool) -> tuple[Tensor, Tensor
             **projection.view(geom),
             **look,
             base=view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible),
-            patches=scene.kept.atlas(lambda: gather(atlas, tiles), atlas, tiles),
+            patches=scene.cache.atlas(lambda: gather(atlas, tiles), atlas, tiles),
             bins=bins,
             maps=maps,
             image=image,

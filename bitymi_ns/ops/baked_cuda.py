@@ -108,7 +108,7 @@ def compiled(scene: BakedScene) -> Any:
     atlas = {}
     if texels is not None:
         is_blocks = texels is scene.blocks
-        kept = scene.kept.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
+        kept = scene.cache.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
         atlas = {"texture": kept.texture, "pages": kept.pages}
     with on_device(device):
         return module(device).BakedScene(
@@ -143,8 +143,8 @@ class Workspace:
         self.capacity = 0
         self.memory: Tensor | None = None
 
-    def fit(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
-        """Makes room for frames of this kind with at least `capacity` pairs, or as many as `settle` found.
+    def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
+        """Makes room for frames of this kind with at least `capacity` pairs, or as many as `frame_fitted` found.
 
         Raises:
             ValueError: more surfels, views or pairs than a frame can have; the message gives the numbers.
@@ -167,8 +167,8 @@ class Workspace:
         assert self.memory is not None
         return int(self.memory[:8].view(torch.int64))
 
-    def settle(self) -> bool:
-        """Whether the latest frame fitted; the next `fit` makes room for as many pairs and a quarter more.
+    def frame_fitted(self) -> bool:
+        """Whether the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
 
         Waits for the device.
         """
@@ -209,7 +209,7 @@ def frame(
     """Draws views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
 
     When more pairs were needed than the workspace has room for, surfels are missing: compare `workspace.pairs` with
-    `workspace.capacity`, `fit` and draw again.
+    `workspace.capacity`, `resize` and draw again.
 
     Args:
         scene: of `compiled`.
@@ -252,11 +252,11 @@ def draw(
         background = background.to(device, torch.float32).contiguous()
     to = empty_images(images, len(cameras), width, height, device)
     size = (n, len(cameras), width, height, "normal" in to)
-    with scene.kept.workspaces(lambda: Workspace(device)).borrow() as workspace:
-        workspace.fit(*size)
+    with scene.cache.workspaces(lambda: Workspace(device)).borrow() as workspace:
+        workspace.resize(*size)
         frame(arrays, viewmats, Ks, background, to, workspace)
-        if n and not workspace.settle():
-            workspace.fit(*size)
+        if n and not workspace.frame_fitted():
+            workspace.resize(*size)
             frame(arrays, viewmats, Ks, background, to, workspace)
-            workspace.settle()  # waits: the next frame may use the memory on another stream
+            workspace.frame_fitted()  # waits: the next frame may use the memory on another stream
     return to

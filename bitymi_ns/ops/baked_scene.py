@@ -24,7 +24,7 @@ IMAGES: dict[str, tuple[int, torch.dtype]] = {
 lowest."""
 
 
-class Kept:
+class DrawCache:
     """What drawing keeps of a scene from frame to frame: the atlas as its device reads it, and working memory."""
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class BakedScene(Protocol):
     near: float
     weight_bound: float
     transmittance_min: float
-    kept: Kept
+    cache: DrawCache
 
     @property
     def through_pixel(self) -> bool:

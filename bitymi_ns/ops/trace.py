@@ -82,8 +82,8 @@ class Fragments:
 class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, projection, rim, most):
-        find = trace_cuda.find if cuda_backend(geom.device) else trace_cpu.find
-        layout, tile_start, found = find(geom.detach(), projection, most)
+        find_fragments = trace_cuda.find_fragments if cuda_backend(geom.device) else trace_cpu.find_fragments
+        layout, tile_start, found = find_fragments(geom.detach(), projection, most)
         surfel, pixel, weight, uv, depth, sigma = arrays = [found[name] for name in FRAGMENT]
         ctx.save_for_backward(geom, *arrays)
         ctx.projection, ctx.rim, ctx.layout = projection, rim, layout

@@ -25,7 +25,9 @@ def tracers(like: Tensor) -> Pool[Any]:
     return _pool(kernel_class("Trace", like))
 
 
-def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+def find_fragments(
+    geom: Tensor, projection: Projection, most: int | None = None
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """The fragments of a view.
 
     Args:
@@ -40,7 +42,7 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
         TooManyFragments: there are more than `most`.
         RuntimeError: the tensors are not on the CPU.
     """
-    require("trace_cpu.find", "cpu", geom.device, "call `trace`")
+    require("trace_cpu.find_fragments", "cpu", geom.device, "call `trace`")
     most = MOST if most == 0 else most or 0
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), most=most)

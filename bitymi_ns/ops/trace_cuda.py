@@ -104,17 +104,17 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tens
     return layout, tile_start
 
 
-def room(geom: Tensor) -> int:
+def fragment_capacity(geom: Tensor) -> int:
     """Fragments that the free memory of a CUDA device holds with all that a training step makes of them."""
     free = torch.cuda.mem_get_info(geom.device)[0]
     kept = torch.cuda.memory_reserved(geom.device) - torch.cuda.memory_allocated(geom.device)  # by torch, unused
     return (free + kept) // (NUMBERS * geom.element_size())
 
 
-def check_room(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
+def check_capacity(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
     """Raises TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for."""
     if most == 0 and geom.device.type == "cuda" and count > FEW:
-        most = room(geom)
+        most = fragment_capacity(geom)
     if most and count > most:
         raise too_many(geom, projection, count, most)
 
@@ -125,12 +125,14 @@ def fill(geom: Tensor, projection: Projection, layout: Any) -> dict[str, Tensor]
     try:
         found = empty_list(geom, count)
     except torch.cuda.OutOfMemoryError as error:
-        raise too_many(geom, projection, count, room(geom)) from error
+        raise too_many(geom, projection, count, fragment_capacity(geom)) from error
     kernel("trace_fill", geom)(**projection.view(geom), **found, layout=layout)
     return found
 
 
-def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Any, Tensor, dict[str, Tensor]]:
+def find_fragments(
+    geom: Tensor, projection: Projection, most: int | None = None
+) -> tuple[Any, Tensor, dict[str, Tensor]]:
     """The fragments of a view.
 
     Args:
@@ -146,7 +148,7 @@ def find(geom: Tensor, projection: Projection, most: int | None = None) -> tuple
         TooManyFragments: there are more than that, or the device has no memory for their list.
     """
     layout, tile_start = blended(geom, projection, tile_lists(geom, projection))
-    check_room(geom, projection, layout.fragments, most)
+    check_capacity(geom, projection, layout.fragments, most)
     return layout, tile_start, fill(geom, projection, layout)
 
 

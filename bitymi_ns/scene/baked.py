@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.baked import Kept, draw
+from bitymi_ns.ops.baked import DrawCache, draw
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 
 from .camera import Camera
@@ -63,7 +63,7 @@ class BakedScene:
     prefilter: str = "low_pass"
     transmittance_min: float = TRANSMITTANCE_MIN
     blocks: Tensor | None = None
-    kept: Kept = field(default_factory=Kept, init=False, repr=False, compare=False)
+    cache: DrawCache = field(default_factory=DrawCache, init=False, repr=False, compare=False)
 
     def residuals(self) -> Tensor:
         """Residual colours of the atlas: [layers, height, width, 3] float32.

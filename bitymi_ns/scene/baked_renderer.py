@@ -54,7 +54,7 @@ class BakedRenderer:
         self._background = None if background is None else background.to(device, torch.float32).contiguous()
         self._size = (views, width, height)
         self._use_graph, self._graph = graph, None
-        self._fit(0)
+        self._resize(0)
 
     def draw(self, cameras: Sequence[Camera], check: bool = True) -> dict[str, Tensor]:
         """Draws the views.
@@ -76,7 +76,7 @@ class BakedRenderer:
         self._Ks.copy_(Ks)
         self.run()
         if check and not self.complete():
-            self._fit(self.workspace.pairs * 5 // 4)
+            self._resize(self.workspace.pairs * 5 // 4)
             self.run()
         return self.images
 
@@ -110,7 +110,7 @@ class BakedRenderer:
     def _draw(self, stages: Stage) -> None:
         frame(self._scene, self._viewmats, self._Ks, self._background, self.images, self.workspace, stages)
 
-    def _fit(self, capacity: int) -> None:
+    def _resize(self, capacity: int) -> None:
         views, width, height = self._size
-        self.workspace.fit(self._surfels, views, width, height, "normal" in self.images, capacity)
+        self.workspace.resize(self._surfels, views, width, height, "normal" in self.images, capacity)
         self._graph = None  # it points at the old memory

@@ -17,7 +17,7 @@ from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import View, training_order
+from bitymi_ns.train.views import TrainingData, View, training_order
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
@@ -80,7 +80,7 @@ class Trainer:
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
         pixels = sum(view.camera.width * view.camera.height for view in views)
-        self.training = Training(scene, views, self.optimizers, config, max_steps, extent, pixels)
+        self.training = Training(scene, TrainingData(views, extent, pixels), self.optimizers, config, max_steps)
         self.step = 0
         self._views = len(views)
         self._terms: list[Tensor] = []

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class Room:
+class MemoryBudget:
     """Memory that caches may fill, several together. What fits first stays for good: views are looked at in turn, and a
     cache that replaced the oldest would have dropped each one just before it is needed again.
 
@@ -19,8 +19,8 @@ class Room:
     def __init__(self, nbytes: int) -> None:
         self.left = nbytes
 
-    def take(self, nbytes: int) -> bool:
-        """Whether there is room for so much; if so it is taken."""
+    def reserve(self, nbytes: int) -> bool:
+        """Whether so much is left; if so it is taken."""
         if nbytes > self.left:
             return False
         self.left -= nbytes

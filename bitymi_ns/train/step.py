@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from bitymi_ns.train.losses import objective
 from bitymi_ns.train.resize import ResizeHook
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
-from bitymi_ns.train.views import ReducedViews, View, background_color
+from bitymi_ns.train.views import ReducedViews, TrainingData, View, background_color
 from bitymi_ns.train.watch import LossWatch
 
 if TYPE_CHECKING:
@@ -82,45 +82,39 @@ class Training:
     def __init__(
         self,
         scene: Scene,
-        views: Sequence[View],
+        data: TrainingData,
         optimizers: Mapping[str, Optimizer],
         config: TrainConfig,
         max_steps: int,
-        extent: float,
-        image_pixels: int,
         on_resize: ResizeHook | None = None,
         announce: Callable[[str], None] = warnings.warn,
-        exif: Sequence[float] | None = None,
     ) -> None:
         """
         Args:
             scene: changed in place.
-            views: training views at full size.
+            data: what it is learned from.
             optimizers: one per surfel parameter, under its name, and those of the field.
             config: training options.
             max_steps: length of the run; the schedules depend on it.
-            extent: scene extent in world units.
-            image_pixels: of all training views together.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
-            exif: log2 of the exposure of each training photograph (`exposure.exif_stops`); NaN, None = unknown.
 
         Raises:
             ValueError: a training option is out of its range.
         """
         self.scene, self.optimizers, self.config = scene, optimizers, config
-        self.schedule = Schedule(config, max_steps, extent)
+        self.schedule = Schedule(config, max_steps, data.extent)
         self.schedule.reset_opacity()
         for name in optimizers:
             self.schedule.lr(name, 0)
-        self.strategy = Strategy(config, self.schedule, extent, on_resize, image_pixels)
-        self.exposure = Exposure(config.exposure, exif)
+        self.strategy = Strategy(config, self.schedule, data.extent, on_resize, data.image_pixels)
+        self.exposure = Exposure(config.exposure, data.exif_stops)
         self.schedule.lr("exposure", 0)
         self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure)
         self.watch = LossWatch()
         self.clock = Stopwatch()
         self.step = 0
-        self._full_size = views
+        self._full_size = data.views
         self._output: RenderOutput | None = None
         self._photometric = torch.tensor(math.nan)
 

@@ -195,7 +195,7 @@ class Strategy:
         pruned = torch.zeros(n, dtype=torch.bool, device=device)
         pruned[stay[drawn]] = True
         pruned &= old_candidate
-        pruned = self._spare(pruned, surfels["opacity_logits"], n + len(clones) + len(splits), among=~split)
+        pruned = self._keep_minimum(pruned, surfels["opacity_logits"], n + len(clones) + len(splits), among=~split)
         keep = (~pruned & ~split).nonzero().flatten()
 
         if len(keep) != n or len(clones) + len(splits) > 0:
@@ -229,7 +229,7 @@ class Strategy:
         scores = self._scores(scene, views)
         logits = scene.surfels["opacity_logits"]
         pruned = (logits.sigmoid() < config.final_prune_opacity) | (scores.prune > config.final_prune_score)
-        pruned = self._spare(pruned, logits, len(scene))
+        pruned = self._keep_minimum(pruned, logits, len(scene))
         self._remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}
 
@@ -249,7 +249,7 @@ class Strategy:
             # only a scene loaded from elsewhere is over the cap: the faintest go
             lots = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
             invisible[lots[:over]] = True
-        pruned = ~finite | self._spare(invisible, logits, int(finite.sum()), among=finite)
+        pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
         self._remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
 
@@ -265,7 +265,7 @@ class Strategy:
         self._remove(broken, scene, optimizers)
         return int(broken.sum())
 
-    def _spare(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
+    def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
         """Take back as much of `pruned` [N] as `min_surfels` asks for, the most opaque first.
 
         Args:

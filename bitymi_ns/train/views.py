@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.memory import Room
+from bitymi_ns.train.memory import MemoryBudget
 
 REDUCED_BYTES = 1 << 28
 """Memory for reduced pictures on the CPU; the others are reduced anew at every use."""
@@ -51,6 +52,23 @@ class View(NamedTuple):
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
         """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
         return over_background(as_float(self.image.to(device)), background)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a run learns from.
+
+    Attributes:
+        views: training views at full size.
+        extent: scene extent in world units (`init.scene_extent`).
+        image_pixels: of all training views together.
+        exif_stops: log2 of the exposure of each photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
+    """
+
+    views: Sequence[View]
+    extent: float
+    image_pixels: int
+    exif_stops: Sequence[float] | None = None
 
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
@@ -178,9 +196,9 @@ class ReducedViews:
         self._kept: dict[int, View] = {}
         self._resident: dict[int, View] = {}
         cuda = self._device.type == "cuda"
-        self._room = Room(torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0)
+        self._budget = MemoryBudget(torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0)
         self._reduced_bytes = sys.maxsize if cuda else REDUCED_BYTES
-        self._reduced_room = Room(self._reduced_bytes)
+        self._reduced_budget = MemoryBudget(self._reduced_bytes)
 
     def __len__(self) -> int:
         return len(self._views)
@@ -196,13 +214,13 @@ class ReducedViews:
 
     def _at(self, index: int, factor: float) -> View:
         if factor != self._factor:
-            self._factor, self._kept, self._reduced_room = factor, {}, Room(self._reduced_bytes)
+            self._factor, self._kept, self._reduced_budget = factor, {}, MemoryBudget(self._reduced_bytes)
         if index in self._kept:
             return self._kept[index]
         view = self._full_size(index)
         camera = view.camera
         view = at_size(view, camera.scaled(factor) if factor < 1.0 else camera, self._device)
-        if factor < 1.0 and self._reduced_room.take(view.nbytes):
+        if factor < 1.0 and self._reduced_budget.reserve(view.nbytes):
             self._kept[index] = view
         return view
 
@@ -210,7 +228,7 @@ class ReducedViews:
         if index in self._resident:
             return self._resident[index]
         moved = self._views[index].to(self._device)
-        if self._room.take(moved.nbytes):
+        if self._budget.reserve(moved.nbytes):
             self._resident[index] = moved
         return moved
 

@@ -2,7 +2,7 @@
 // (csrc/ops); the caller allocates; shapes and dtypes are checked on the way (reader.h), values in Python.
 #include <nanobind/stl/optional.h>
 
-#include "bindings/reader.h"
+#include "bindings/operations.h"
 
 #if defined(__GLIBC__) || __has_include(<malloc.h>)
 #include <malloc.h>
@@ -88,22 +88,12 @@ template <class S>
 void bind_operations(nb::module_& m) {
   const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
   bind_class<FieldArrays<S>>(m, name("Field"), kHost, "The parameters of a residual field.");
+#define BT_BIND(operation) bind_operation(m, name(#operation), &operation<S>);
+  BT_OPERATIONS(BT_BIND)
+#undef BT_BIND
   bind_tracer<S>(m);
-  bind_operation(m, name("project_forward"), &project_forward<S>);
-  bind_operation(m, name("project_backward"), &project_backward<S>);
-  bind_operation(m, name("trace_backward"), &trace_backward<S>);
-  bind_operation(m, name("composite_forward"), &composite_forward<S>);
-  bind_operation(m, name("composite_backward"), &composite_backward<S>);
-  bind_operation(m, name("view_color_forward"), &view_color_forward<S>);
-  bind_operation(m, name("view_color_backward"), &view_color_backward<S>);
-  bind_operation(m, name("lean_color"), &lean_color<S>);
-  bind_operation(m, name("field_forward"), &field_forward<S>);
-  bind_operation(m, name("field_backward"), &field_backward<S>);
-  bind_operation(m, name("shade_forward"), &shade_forward<S>);
-  bind_operation(m, name("shade_backward"), &shade_backward<S>);
   bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
   bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
-  bind_operation(m, name("ssim"), &ssim<S>);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }
 }  // namespace

@@ -2,7 +2,7 @@
 // The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
 #include <nanobind/stl/vector.h>
 
-#include "bindings/reader.h"
+#include "bindings/operations.h"
 #include "cuda/atlas_texture.h"
 #include "cuda/baked.h"
 #include "cuda/device_check.h"
@@ -44,24 +44,14 @@ template <class S>
 void bind_operations(nb::module_& m) {
   const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
   bind_class<FieldArrays<S>>(m, name("Field"), kCard, "The parameters of a residual field.");
-  bind_operation(m, name("project_forward"), &project_forward<S>);
-  bind_operation(m, name("project_backward"), &project_backward<S>);
+#define BT_BIND(operation) bind_operation(m, name(#operation), &operation<S>);
+  BT_OPERATIONS(BT_BIND)
+#undef BT_BIND
   bind_operation(m, name("bin_count"), &bin_count<S>);
   bind_operation(m, name("bin_fill"), &bin_fill<S>);
   bind_operation(m, name("trace_mark"), &trace_mark<S>);
   bind_operation(m, name("trace_fill"), &trace_fill<S>);
-  bind_operation(m, name("trace_backward"), &trace_backward<S>);
-  bind_operation(m, name("composite_forward"), &composite_forward<S>);
-  bind_operation(m, name("composite_backward"), &composite_backward<S>);
-  bind_operation(m, name("view_color_forward"), &view_color_forward<S>);
-  bind_operation(m, name("view_color_backward"), &view_color_backward<S>);
-  bind_operation(m, name("lean_color"), &lean_color<S>);
-  bind_operation(m, name("field_forward"), &field_forward<S>);
-  bind_operation(m, name("field_backward"), &field_backward<S>);
   bind_operation(m, name("field_tiles"), &field_tiles<S>);
-  bind_operation(m, name("shade_forward"), &shade_forward<S>);
-  bind_operation(m, name("shade_backward"), &shade_backward<S>);
-  bind_operation(m, name("ssim"), &ssim<S>);
   bind_operation(m, name("picture_loss"), &picture_loss<S>);
   bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
   bind_operation(m, name("note_centers"), &note_centers<S>);

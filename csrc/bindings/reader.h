@@ -29,7 +29,7 @@ struct Device {
 };
 
 // What an object of Python points into.
-struct Kept {
+struct References {
   std::vector<nb::ndarray<nb::ro>> read;
   std::vector<nb::ndarray<>> written;
   std::vector<nb::object> objects;
@@ -110,7 +110,7 @@ inline namespace of_cuda {
 // Arguments that are an object of Python, with what they point to.
 template <class Arguments>
 struct Held : Arguments {
-  Kept kept;
+  References kept;
 };
 }
 
@@ -206,7 +206,7 @@ class Reader {
     for (const Given& g : given_)
       if (!g.taken && g.value != Py_None) throw nb::type_error((what_ + " takes no argument '" + g.name + "'").c_str());
   }
-  Kept keep() { return std::move(kept_); }
+  References keep() { return std::move(kept_); }
 
  private:
   // The names as Python keeps them: a look-up in the dictionary would make a string of each first.
@@ -279,7 +279,7 @@ class Reader {
   const std::string what_;  // its own: callers give literals, too
   Device device_;
   std::vector<Given> given_;  // all of them; the call keeps the objects
-  Kept kept_;
+  References kept_;
 };
 
 inline void Reader::wrong(const char* name, const std::string& wanted) const {

@@ -28,13 +28,13 @@ BT_HD Blend<T> blend(T sigma, T transmittance) {
 // Which of the open pixels take the fragment. One that would leave a pixel less than `stop` is not blended and ends the
 // pixel: it takes no more light.
 template <class T>
-struct Verdict {
+struct BlendTest {
   MaskOf<T> takes, ends;
 };
 template <class T>
-BT_HD Verdict<T> judge(MaskOf<T> open, T sigma, T behind, T stop) {
+BT_HD BlendTest<T> blend_test(MaskOf<T> open, T sigma, T behind, T stop) {
   const MaskOf<T> covers = open & (sigma >= T(kAlphaMin));
-  Verdict<T> v;
+  BlendTest<T> v;
   v.takes = covers & (behind >= stop);
   v.ends = covers & (behind < stop);
   return v;

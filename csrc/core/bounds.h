@@ -4,8 +4,8 @@
 //
 // Always evaluated in double, from the same (rounded) coefficients that the fragments use: the conic of a needle with
 // axis ratio k loses k^2 in its determinant, and a bound that misses a pixel is a hole in the picture. This is what
-// training and the CPU use; reach.h is for the baked renderer on cards on which doubles are slow. core/outline.h has
-// what both share.
+// training and the CPU use; plane_bounds.h is for the baked renderer on cards on which doubles are slow. core/outline.h
+// has what both share.
 #pragma once
 
 #include "core/outline.h"

@@ -78,7 +78,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
-  if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_place<S, T>(g, dx, dy));
+  if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_hit<S, T>(g, dx, dy));
   const Hit<T> h = hit(g, near, dx, dy);
   const auto inside = h.ok & (h.rest > zero);
   const T kernel = select(inside, power_(select(inside, h.rest, one), T(g[kBeta])), zero);

@@ -1,5 +1,5 @@
 // A surfel's pixels are bounded in two ways: in double (core/bounds.h), and in the reals of the fragments
-// (core/reach.h). This is what both share: the level set, the padding, and which x offsets a box, an ellipse and the
+// (core/plane_bounds.h). This is what both share: the level set, the padding, and which x offsets a box, an ellipse and the
 // low pass have between two lines.
 #pragma once
 

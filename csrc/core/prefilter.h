@@ -37,15 +37,15 @@ BT_HD S filter_spread(const S* g) {
 
 // What a pixel at (dx, dy) from the projected centre sees.
 template <class T>
-struct FilteredPlace {
+struct FilteredHit {
   T U, V, r;       // r = sqrt(U^2 + V^2)
   T omega;         // W / w0; outside the disc's image that of the rim in the pixel's direction, so that it is bounded
   T beyond;        // r - 3 (W - w0) outside, 0 inside
   T Un, Vn, D, q;  // n U, n V
 };
 template <class S, class T>
-BT_HD FilteredPlace<T> filtered_place(const S* g, T dx, T dy) {
-  FilteredPlace<T> f;
+BT_HD FilteredHit<T> filtered_hit(const S* g, T dx, T dy) {
+  FilteredHit<T> f;
   const T zero = T(S(0)), reach = T(S(kSupport)), w0 = T(g[kW0]), n = T(g[kArea]);
   const S c = filter_variance(g[kBeta]), spread = filter_spread(g);
   const T tilt = slope(g, kW1, dx, dy);  // W - w0
@@ -62,11 +62,11 @@ BT_HD FilteredPlace<T> filtered_place(const S* g, T dx, T dy) {
 }
 // Whether the kernel is above 0 there.
 template <class T>
-BT_HD MaskOf<T> in_support(const FilteredPlace<T>& at) {
+BT_HD MaskOf<T> in_support(const FilteredHit<T>& at) {
   return at.q < T(kSupport2);
 }
 template <class S, class T>
-BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredPlace<T>& at) {
+BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredHit<T>& at) {
   const T zero = T(S(0)), one = T(S(1)), r = T(S(kSupport));
   const T rest = one - at.q * T(S(1.0 / kSupport2));
   const auto inside = (rest > zero) & (T(g[kZ]) > T(near) * at.omega);
@@ -89,7 +89,7 @@ BT_HD void filtered_vjp(const S* g, S near, S rim, T dx, T dy, T dsigma, T du, T
   const T zero = T(S(0)), one = T(S(1)), two = T(S(2)), reach = T(S(kSupport));
   const T n = T(g[kArea]), w0 = T(g[kW0]), ninth = T(S(1.0 / kSupport2));
   const S c = filter_variance(g[kBeta]), spread = filter_spread(g);
-  const FilteredPlace<T> at = filtered_place<S, T>(g, dx, dy);
+  const FilteredHit<T> at = filtered_hit<S, T>(g, dx, dy);
   const T w = at.omega, w2 = w * w, inv_d = one / at.D, a = w2 * T(g[kArea] * g[kW0]);
   const T rho = a * sqrt_(inv_d);
   const T rest = max_(one - at.q * ninth, T(S(1e-30)));

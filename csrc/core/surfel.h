@@ -140,26 +140,26 @@ BT_HD bool scale_moves(S log_scale) {
 
 // Surfel i in the world, its centre in the camera's frame.
 template <class S>
-struct Place {
+struct WorldSurfel {
   Rotation<S> rot;
   S su, sv;  // scales
   Vec3<S> p;
 };
 template <class S>
-BT_HD Place<S> place(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i) {
+BT_HD WorldSurfel<S> world_surfel(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i) {
   return {rotation(in.quats + 4 * i), surfel_scale(in.log_scales[2 * i]), surfel_scale(in.log_scales[2 * i + 1]),
           to_camera(cam, in.means + 3 * i)};
 }
 // And what else a camera sees of it: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and
 // scales.
 template <class S>
-struct Pose {
+struct CameraSurfel {
   Vec3<S> a, b, n;
   S np, sign, iz, ifx, ify, isu, isv;
 };
 template <class S>
-BT_HD Pose<S> pose(const Pinhole<S>& cam, const Place<S>& at) {
-  Pose<S> s;
+BT_HD CameraSurfel<S> camera_surfel(const Pinhole<S>& cam, const WorldSurfel<S>& at) {
+  CameraSurfel<S> s;
   s.a = rotate(cam.R, at.rot.tu), s.b = rotate(cam.R, at.rot.tv), s.n = rotate(cam.R, at.rot.n);
   s.np = dot(s.n, at.p);
   s.sign = s.np < S(0) ? S(-1) : S(1);
@@ -173,12 +173,12 @@ template <class Kernel, class S>
 BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, S* geom, S* frame) {
   const S* log_scales = in.log_scales + 2 * i;
   const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
-  const Place<S> at = place(cam, in, i);
+  const WorldSurfel<S> at = world_surfel(cam, in, i);
   const auto& [rot, su, sv, p] = at;
   if (!rot.ok || !finite_(p.x) || !finite_(p.y) || !finite_(p.z) || !(p.z > near)) return false;
   if (!finite_(log_scales[0]) || !finite_(log_scales[1])) return false;
   if (!finite_(opacity_logit) || !finite_(beta_raw)) return false;
-  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, at);
+  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = camera_surfel(cam, at);
   const Vec3<S> pa = cross(p, a), pb = cross(p, b);
   S g[kGeom];
   g[kCx] = cam.fx * p.x * iz + cam.cx;
@@ -218,9 +218,9 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   const S none[kFrame] = {};
   if (!dframe) dframe = none;
   const S* log_scales = in.log_scales + 2 * i;
-  const Place<S> at = place(cam, in, i);
+  const WorldSurfel<S> at = world_surfel(cam, in, i);
   const auto& [rot, su, sv, p] = at;
-  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = pose(cam, at);
+  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = camera_surfel(cam, at);
 
   const Vec3<S> dpb = {-sign * ifx * isu * dgeom[kU1], -sign * ify * isu * dgeom[kU2], S(0)};
   const Vec3<S> dpa = {sign * ifx * isv * dgeom[kV1], sign * ify * isv * dgeom[kV2], S(0)};

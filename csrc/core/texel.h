@@ -22,10 +22,10 @@ BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
-// Surfel coordinate of the centre of texel i, eq. (texel centres).
+// Surfel coordinate of the centre of texel i, eq. (texel centres), rounded as bake/texels.py does.
 template <class S>
 BT_HD S texel_centre(int i, int r, S extent) {
-  return (S(i) + S(0.5)) * (S(2) * extent / S(r)) - extent;
+  return extent * (S(2 * i + 1) / S(r) - S(1));
 }
 
 // The texels between which the fetch interpolates, as offsets from the tile's first (rows along v), and their weights.

@@ -1,7 +1,7 @@
 // View-dependent surfel colour f_view(d), without the offset 0.5: Spherical Voronoi (sv, Di Sario et al. 2025),
 // spherical harmonics (sh, as in 3D Gaussian Splatting, Kerbl et al. 2023), Spherical Beta (sb, Deformable Beta
 // Splatting, Liu et al. 2025) and spherical Gaussians (sg), each with its vector-Jacobian product. d is the unit vector
-// from the camera centre to the surfel, world frame.
+// from the camera centre to the surfel, world frame. A kind is one struct; for_view_color finds it.
 #pragma once
 
 #include "core/common.h"
@@ -31,74 +31,98 @@ BT_HD S temperature(S log_tau) {
   return exp_(min_(log_tau, S(kLogTauMax)));
 }
 
-// c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
+// Numbers per surfel of the parameters a, b and c.
+struct ViewColorWidths {
+  int64_t a, b, c;
+};
+// Those of one surfel.
 template <class S>
-BT_HD Vec3<S> sv_color(int K, const S* sites, const S* log_tau, const S* rgb, Vec3<S> d) {
-  S logits[kMaxTerms], top = S(-1e30);
-  for (int k = 0; k < K; ++k) {
-    logits[k] = temperature(log_tau[k]) * dot(normalize(load3(sites + 3 * k)).n, d);
-    top = max_(top, logits[k]);
+struct ViewColorRow {
+  S *a, *b, *c;
+};
+
+// What a kind's struct has: its name, the fewest terms, and those of its preset, for which kernels that unroll their
+// loops are compiled; the widths of its parameters; the colour, and its vector-Jacobian product, which writes the
+// gradients of the parameters and adds to that of d; and its lean form: terms of kLeanWidth numbers, and the colour of
+// a base and K of them.
+
+// Spherical Voronoi. a = sites [K, 3], b = log tau [K], c = rgb [K, 3].
+struct SphericalVoronoi {
+  static constexpr const char* kName = "sv";
+  static constexpr int kLeastTerms = 1, kPresetTerms = 7, kLeanWidth = 6;
+  BT_HD static ViewColorWidths widths(int K) { return {3 * K, K, 3 * K}; }
+
+  // c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
+  template <class S>
+  BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
+    const S *sites = p.a, *log_tau = p.b, *rgb = p.c;
+    S logits[kMaxTerms], top = S(-1e30);
+    for (int k = 0; k < K; ++k) {
+      logits[k] = temperature(log_tau[k]) * dot(normalize(load3(sites + 3 * k)).n, d);
+      top = max_(top, logits[k]);
+    }
+    Vec3<S> c = {S(0), S(0), S(0)};
+    S total = S(0);
+    for (int k = 0; k < K; ++k) {
+      const S w = exp_(logits[k] - top);
+      total += w;
+      c = c + w * load3(rgb + 3 * k);
+    }
+    return (S(1) / total) * c;
   }
-  Vec3<S> c = {S(0), S(0), S(0)};
-  S total = S(0);
-  for (int k = 0; k < K; ++k) {
-    const S w = exp_(logits[k] - top);
-    total += w;
-    c = c + w * load3(rgb + 3 * k);
+  // The same relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
+  // c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)). Without terms this is one colour.
+  template <class S>
+  BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
+    Vec3<S> c = load3(base);
+    if (K == 0) return c;
+    S top = S(0);
+    for (int k = 0; k < K; ++k) top = max_(top, dot(load3(terms + 6 * k), d));
+    S total = exp_(-top);
+    c = total * c;
+    for (int k = 0; k < K; ++k) {
+      const S w = exp_(dot(load3(terms + 6 * k), d) - top);
+      total += w;
+      c = c + w * load3(terms + 6 * k + 3);
+    }
+    return (S(1) / total) * c;
   }
-  return (S(1) / total) * c;
-}
-// The same relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
-// c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)). Without terms this is one colour.
-template <class S>
-BT_HD Vec3<S> sv_relative_color(int K, const S* base, const S* terms, Vec3<S> d) {
-  Vec3<S> c = load3(base);
-  if (K == 0) return c;
-  S top = S(0);
-  for (int k = 0; k < K; ++k) top = max_(top, dot(load3(terms + 6 * k), d));
-  S total = exp_(-top);
-  c = total * c;
-  for (int k = 0; k < K; ++k) {
-    const S w = exp_(dot(load3(terms + 6 * k), d) - top);
-    total += w;
-    c = c + w * load3(terms + 6 * k + 3);
+  // dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the heaviest site: where one site
+  // takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not the difference of two equal
+  // colours, whose rounding a temperature of 1e4 would multiply.
+  template <class S>
+  BT_HD static void color_vjp(int K, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp, Vec3<S>& dd) {
+    const S *sites = p.a, *log_tau = p.b, *rgb = p.c;
+    S *dsites = dp.a, *dlog_tau = dp.b, *drgb = dp.c;
+    S w[kMaxTerms], tau[kMaxTerms], top = S(-1e30), total = S(0);
+    Unit<S> site[kMaxTerms];
+    Vec3<S> c = {S(0), S(0), S(0)};  // relative to the pivot
+    int first = 0;
+    for (int k = 0; k < K; ++k) {
+      site[k] = normalize(load3(sites + 3 * k));
+      tau[k] = temperature(log_tau[k]);
+      w[k] = tau[k] * dot(site[k].n, d);
+      if (w[k] > top) top = w[k], first = k;
+    }
+    const Vec3<S> pivot = load3(rgb + 3 * first);
+    for (int k = 0; k < K; ++k) {
+      w[k] = exp_(w[k] - top);
+      total += w[k];
+    }
+    for (int k = 0; k < K; ++k) {
+      w[k] /= total;
+      c = c + w[k] * (load3(rgb + 3 * k) - pivot);
+    }
+    for (int k = 0; k < K; ++k) {
+      store3(drgb + 3 * k, w[k] * dc);
+      const S dlogit = w[k] * dot(dc, (load3(rgb + 3 * k) - pivot) - c);
+      const S along = dot(site[k].n, d);
+      dlog_tau[k] = log_tau[k] < S(kLogTauMax) ? dlogit * tau[k] * along : S(0);
+      store3(dsites + 3 * k, normalize_vjp(site[k], (dlogit * tau[k]) * d));
+      dd = dd + (dlogit * tau[k]) * site[k].n;
+    }
   }
-  return (S(1) / total) * c;
-}
-// Adds to dd; writes the rest. dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the
-// heaviest site: where one site takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not
-// the difference of two equal colours, whose rounding a temperature of 1e4 would multiply.
-template <class S>
-BT_HD void sv_color_vjp(int K, const S* sites, const S* log_tau, const S* rgb, Vec3<S> d, Vec3<S> dc, S* dsites,
-                        S* dlog_tau, S* drgb, Vec3<S>& dd) {
-  S w[kMaxTerms], tau[kMaxTerms], top = S(-1e30), total = S(0);
-  Unit<S> site[kMaxTerms];
-  Vec3<S> c = {S(0), S(0), S(0)};  // relative to the pivot
-  int first = 0;
-  for (int k = 0; k < K; ++k) {
-    site[k] = normalize(load3(sites + 3 * k));
-    tau[k] = temperature(log_tau[k]);
-    w[k] = tau[k] * dot(site[k].n, d);
-    if (w[k] > top) top = w[k], first = k;
-  }
-  const Vec3<S> pivot = load3(rgb + 3 * first);
-  for (int k = 0; k < K; ++k) {
-    w[k] = exp_(w[k] - top);
-    total += w[k];
-  }
-  for (int k = 0; k < K; ++k) {
-    w[k] /= total;
-    c = c + w[k] * (load3(rgb + 3 * k) - pivot);
-  }
-  for (int k = 0; k < K; ++k) {
-    store3(drgb + 3 * k, w[k] * dc);
-    const S dlogit = w[k] * dot(dc, (load3(rgb + 3 * k) - pivot) - c);
-    const S along = dot(site[k].n, d);
-    dlog_tau[k] = log_tau[k] < S(kLogTauMax) ? dlogit * tau[k] * along : S(0);
-    store3(dsites + 3 * k, normalize_vjp(site[k], (dlogit * tau[k]) * d));
-    dd = dd + (dlogit * tau[k]) * site[k].n;
-  }
-}
+};
 
 // Real spherical harmonics up to degree 3 in the order and sign convention of 3DGS; out has 16 entries, `terms` are
 // set.
@@ -150,26 +174,42 @@ BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) {
   }
   return r;
 }
-template <class S>
-BT_HD Vec3<S> sh_color(int terms, const S* dc, const S* rest, Vec3<S> d) {
-  S basis[16];
-  sh_basis(terms, d, basis);
-  Vec3<S> c = basis[0] * load3(dc);
-  for (int k = 1; k < terms; ++k) c = c + basis[k] * load3(rest + 3 * (k - 1));
-  return c;
-}
-template <class S>
-BT_HD void sh_color_vjp(int terms, const S* rest, Vec3<S> d, Vec3<S> dc, S* ddc, S* drest, Vec3<S>& dd) {
-  S basis[16], g[16];
-  sh_basis(terms, d, basis);
-  store3(ddc, basis[0] * dc);
-  g[0] = S(0);
-  for (int k = 1; k < terms; ++k) {
-    store3(drest + 3 * (k - 1), basis[k] * dc);
-    g[k] = dot(dc, load3(rest + 3 * (k - 1)));
+// Spherical harmonics of `terms` coefficients. a = dc [3], b = rest [terms - 1, 3].
+struct SphericalHarmonics {
+  static constexpr const char* kName = "sh";
+  static constexpr int kLeastTerms = 1, kPresetTerms = 16, kLeanWidth = 3;
+  BT_HD static ViewColorWidths widths(int terms) { return {3, 3 * (terms - 1), 0}; }
+
+  template <class S>
+  BT_HD static Vec3<S> color(int terms, ViewColorRow<const S> p, Vec3<S> d) {
+    const S *dc = p.a, *rest = p.b;
+    S basis[16];
+    sh_basis(terms, d, basis);
+    Vec3<S> c = basis[0] * load3(dc);
+    for (int k = 1; k < terms; ++k) c = c + basis[k] * load3(rest + 3 * (k - 1));
+    return c;
   }
-  dd = dd + sh_basis_vjp(terms, d, g);
-}
+  // The terms are the coefficients from the first degree on.
+  template <class S>
+  BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
+    return color(K + 1, ViewColorRow<const S>{base, terms, nullptr}, d);
+  }
+  template <class S>
+  BT_HD static void color_vjp(int terms, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp,
+                              Vec3<S>& dd) {
+    const S* rest = p.b;
+    S *ddc = dp.a, *drest = dp.b;
+    S basis[16], g[16];
+    sh_basis(terms, d, basis);
+    store3(ddc, basis[0] * dc);
+    g[0] = S(0);
+    for (int k = 1; k < terms; ++k) {
+      store3(drest + 3 * (k - 1), basis[k] * dc);
+      g[k] = dot(dc, load3(rest + 3 * (k - 1)));
+    }
+    dd = dd + sh_basis_vjp(terms, d, g);
+  }
+};
 
 // softplus with slope 10 ln 2, which is 0.1 at 0 (Deformable Beta Splatting's lobe colours)
 constexpr double kLobeSlope = 6.931471805599453;
@@ -180,7 +220,7 @@ BT_HD S lobe_softplus(S x) {
   return (big + log_(S(1) + exp_(a > S(0) ? -a : a))) / S(kLobeSlope);
 }
 
-// c = base + sum_k softplus(rgb_k) max(0, d . mu_k)^(4 exp(b_k)); a lobe is r, g, b, theta, phi, b
+// softplus(rgb) max(0, d . mu)^(4 exp(b)); a lobe is r, g, b, theta, phi, b
 template <class S>
 struct BetaLobe {
   Vec3<S> mu, color;
@@ -197,83 +237,117 @@ BT_HD BetaLobe<S> beta_lobe(const S* lobe, Vec3<S> d) {
   l.value = l.cosine > S(0) ? exp_(l.power * log_(l.cosine)) : S(0);
   return l;
 }
-template <class S>
-BT_HD Vec3<S> sb_color(int K, const S* base, const S* lobes, Vec3<S> d) {
-  Vec3<S> c = load3(base);
-  for (int k = 0; k < K; ++k) {
-    const BetaLobe<S> l = beta_lobe(lobes + 6 * k, d);
-    c = c + l.value * l.color;
-  }
-  return c;
-}
-template <class S>
-BT_HD void sb_color_vjp(int K, const S* lobes, Vec3<S> d, Vec3<S> dc, S* dbase, S* dlobes, Vec3<S>& dd) {
-  store3(dbase, dc);
-  for (int k = 0; k < K; ++k) {
-    const S* lobe = lobes + 6 * k;
-    S* g = dlobes + 6 * k;
-    const BetaLobe<S> l = beta_lobe(lobe, d);
-    g[0] = l.value * dc.x * sigmoid(S(kLobeSlope) * lobe[0]);
-    g[1] = l.value * dc.y * sigmoid(S(kLobeSlope) * lobe[1]);
-    g[2] = l.value * dc.z * sigmoid(S(kLobeSlope) * lobe[2]);
-    const S dvalue = dot(dc, l.color);
-    const bool lit = l.cosine > S(0);
-    // value / cosine stays finite: the power is above 0 and a tiny cosine gives value 0 first
-    const S dcos = lit ? dvalue * l.power * l.value / max_(l.cosine, S(1e-6)) : S(0);
-    g[5] = lit && lobe[5] < S(kLogPowerMax) ? dvalue * l.value * log_(l.cosine) * l.power : S(0);
-    const Vec3<S> dmu = dcos * d;
-    g[3] = dmu.x * l.ct * l.cp + dmu.y * l.ct * l.sp - dmu.z * l.st;
-    g[4] = -dmu.x * l.st * l.sp + dmu.y * l.st * l.cp;
-    dd = dd + dcos * l.mu;
-  }
-}
+// Spherical Beta: c = base + the sum of the lobes. a = base [3], b = lobes [K, 6].
+struct SphericalBeta {
+  static constexpr const char* kName = "sb";
+  static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 6;
+  BT_HD static ViewColorWidths widths(int K) { return {3, 6 * K, 0}; }
 
-// c = base + sum_k rgb_k exp(exp(l_k) (d . mu_k - 1)); a lobe is mu (3, normalised), log sharpness, r, g, b
-template <class S>
-BT_HD Vec3<S> sg_color(int K, const S* base, const S* lobes, Vec3<S> d) {
-  Vec3<S> c = load3(base);
-  for (int k = 0; k < K; ++k) {
-    const S* lobe = lobes + 7 * k;
-    const S sharp = temperature(lobe[3]);
-    c = c + exp_(sharp * (dot(normalize(load3(lobe)).n, d) - S(1))) * load3(lobe + 4);
+  template <class S>
+  BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
+    const S *base = p.a, *lobes = p.b;
+    Vec3<S> c = load3(base);
+    for (int k = 0; k < K; ++k) {
+      const BetaLobe<S> l = beta_lobe(lobes + 6 * k, d);
+      c = c + l.value * l.color;
+    }
+    return c;
   }
-  return c;
-}
-template <class S>
-BT_HD void sg_color_vjp(int K, const S* lobes, Vec3<S> d, Vec3<S> dc, S* dbase, S* dlobes, Vec3<S>& dd) {
-  store3(dbase, dc);
-  for (int k = 0; k < K; ++k) {
-    const S* lobe = lobes + 7 * k;
-    S* g = dlobes + 7 * k;
-    const Unit<S> mu = normalize(load3(lobe));
-    const S sharp = temperature(lobe[3]), away = dot(mu.n, d) - S(1);
-    const S value = exp_(sharp * away);
-    store3(g + 4, value * dc);
-    const S dexponent = value * dot(dc, load3(lobe + 4));
-    g[3] = lobe[3] < S(kLogTauMax) ? dexponent * sharp * away : S(0);
-    store3(g, normalize_vjp(mu, (dexponent * sharp) * d));
-    dd = dd + (dexponent * sharp) * mu.n;
+  template <class S>
+  BT_HD static Vec3<S> lean_color(int K, const S* base, const S* lobes, Vec3<S> d) {
+    return color(K, ViewColorRow<const S>{base, lobes, nullptr}, d);
   }
-}
-
-enum ViewColorKind { kSv, kSh, kSb, kSg };
-constexpr const char* kViewColorNames[] = {"sv", "sh", "sb", "sg"};
-// Numbers per surfel of a, b and c.
-struct ViewColorWidths {
-  int64_t a, b, c;
+  template <class S>
+  BT_HD static void color_vjp(int K, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp, Vec3<S>& dd) {
+    const S* lobes = p.b;
+    S *dbase = dp.a, *dlobes = dp.b;
+    store3(dbase, dc);
+    for (int k = 0; k < K; ++k) {
+      const S* lobe = lobes + 6 * k;
+      S* g = dlobes + 6 * k;
+      const BetaLobe<S> l = beta_lobe(lobe, d);
+      g[0] = l.value * dc.x * sigmoid(S(kLobeSlope) * lobe[0]);
+      g[1] = l.value * dc.y * sigmoid(S(kLobeSlope) * lobe[1]);
+      g[2] = l.value * dc.z * sigmoid(S(kLobeSlope) * lobe[2]);
+      const S dvalue = dot(dc, l.color);
+      const bool lit = l.cosine > S(0);
+      // value / cosine stays finite: the power is above 0 and a tiny cosine gives value 0 first
+      const S dcos = lit ? dvalue * l.power * l.value / max_(l.cosine, S(1e-6)) : S(0);
+      g[5] = lit && lobe[5] < S(kLogPowerMax) ? dvalue * l.value * log_(l.cosine) * l.power : S(0);
+      const Vec3<S> dmu = dcos * d;
+      g[3] = dmu.x * l.ct * l.cp + dmu.y * l.ct * l.sp - dmu.z * l.st;
+      g[4] = -dmu.x * l.st * l.sp + dmu.y * l.st * l.cp;
+      dd = dd + dcos * l.mu;
+    }
+  }
 };
-BT_HD ViewColorWidths view_color_widths(int kind, int K) {
-  return {kind == kSv ? 3 * K : 3,
-          kind == kSv   ? K
-          : kind == kSh ? 3 * (K - 1)
-                        : (kind == kSb ? 6 : 7) * K,
-          kind == kSv ? 3 * K : 0};
+
+// Spherical Gaussians: c = base + sum_k rgb_k exp(exp(l_k) (d . mu_k - 1)). a = base [3], b = lobes [K, 7]: mu (3,
+// normalised), log sharpness, r, g, b.
+struct SphericalGaussians {
+  static constexpr const char* kName = "sg";
+  static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 7;
+  BT_HD static ViewColorWidths widths(int K) { return {3, 7 * K, 0}; }
+
+  template <class S>
+  BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
+    const S *base = p.a, *lobes = p.b;
+    Vec3<S> c = load3(base);
+    for (int k = 0; k < K; ++k) {
+      const S* lobe = lobes + 7 * k;
+      const S sharp = temperature(lobe[3]);
+      c = c + exp_(sharp * (dot(normalize(load3(lobe)).n, d) - S(1))) * load3(lobe + 4);
+    }
+    return c;
+  }
+  template <class S>
+  BT_HD static Vec3<S> lean_color(int K, const S* base, const S* lobes, Vec3<S> d) {
+    return color(K, ViewColorRow<const S>{base, lobes, nullptr}, d);
+  }
+  template <class S>
+  BT_HD static void color_vjp(int K, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp, Vec3<S>& dd) {
+    const S* lobes = p.b;
+    S *dbase = dp.a, *dlobes = dp.b;
+    store3(dbase, dc);
+    for (int k = 0; k < K; ++k) {
+      const S* lobe = lobes + 7 * k;
+      S* g = dlobes + 7 * k;
+      const Unit<S> mu = normalize(load3(lobe));
+      const S sharp = temperature(lobe[3]), away = dot(mu.n, d) - S(1);
+      const S value = exp_(sharp * away);
+      store3(g + 4, value * dc);
+      const S dexponent = value * dot(dc, load3(lobe + 4));
+      g[3] = lobe[3] < S(kLogTauMax) ? dexponent * sharp * away : S(0);
+      store3(g, normalize_vjp(mu, (dexponent * sharp) * d));
+      dd = dd + (dexponent * sharp) * mu.n;
+    }
+  }
+};
+
+constexpr const char* kViewColorNames[] = {SphericalVoronoi::kName, SphericalHarmonics::kName, SphericalBeta::kName,
+                                           SphericalGaussians::kName};
+// What f gives for the struct of a kind, a number in that list.
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable  // f may be for one of host and device alone
+#endif
+template <class F>
+BT_HD auto for_view_color(int kind, F&& f) {
+  switch (kind) {
+    case 0:
+      return f(SphericalVoronoi());
+    case 1:
+      return f(SphericalHarmonics());
+    case 2:
+      return f(SphericalBeta());
+    default:
+      return f(SphericalGaussians());
+  }
 }
-// Terms of the presets: kernels that unroll their loops are compiled for these.
-constexpr int preset_terms(int kind) { return kind == kSv ? 7 : kind == kSh ? 16 : 2; }
-// The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes:
-// sv a = sites [n,K,3], b = log tau [n,K], c = rgb [n,K,3]; sh a = dc [n,3], b = rest [n,terms-1,3];
-// sb, sg a = base [n,3], b = lobes [n,K,6 or 7].
+BT_HD ViewColorWidths view_color_widths(int kind, int K) {
+  return for_view_color(kind, [=](auto view_color) { return view_color.widths(K); });
+}
+
+// The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes.
 template <class S>
 struct ViewColorArrays {
   int kind, terms;
@@ -287,25 +361,34 @@ struct ViewColorArrays {
   }
   template <class R>
   void arrays(R& r, int64_t n, const char* name_a, const char* name_b, const char* name_c) {
-    if (terms < (kind == kSv || kind == kSh) || terms > kMaxTerms) r.refuse("a view colour has 1 to 32 terms");
+    const int least = for_view_color(kind, [](auto view_color) { return view_color.kLeastTerms; });
+    if (terms < least || terms > kMaxTerms) r.refuse("a view colour has 1 to 32 terms");
     const ViewColorWidths w = view_color_widths(kind, terms);
     r.array(name_a, a, w.a * n);
     r.array(name_b, b, w.b * n);
     if (w.c) r.array(name_c, c, w.c * n);
   }
+  // Of surfel i.
+  BT_HD ViewColorRow<S> row(ViewColorWidths w, int64_t i) const { return {a + w.a * i, b + w.b * i, c + w.c * i}; }
 };
-// Colour of surfel i. kind and K are those of p; a kernel that knows them when it is compiled unrolls its loops.
-template <class S>
-BT_HD Vec3<S> view_color(int kind, int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d) {
-  const ViewColorWidths w = view_color_widths(kind, K);
-  const S *a = p.a + w.a * i, *b = p.b + w.b * i;
-  if (kind == kSv) return sv_color(K, a, b, p.c + w.c * i, d);
-  if (kind == kSh) return sh_color(K, a, b, d);
-  return kind == kSb ? sb_color(K, a, b, d) : sg_color(K, a, b, d);
+// Colour of surfel i. K is p.terms; a kernel that knows it when it is compiled unrolls its loops.
+template <class ViewColor, class S>
+BT_HD Vec3<S> view_color(int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d) {
+  return ViewColor::color(K, p.row(ViewColor::widths(K), i), d);
 }
-BT_HD int lean_width(int kind) { return kind == kSh ? 3 : kind == kSg ? 7 : 6; }
-// View colours of which only what a surfel needs is left: a base colour, and as many terms as its span says. Terms are
-// b, rgb (sv_relative_color), coefficients from the first degree on (sh), or lobes (sb, sg).
+// Writes the gradients of the parameters of surfel i and returns that of d.
+template <class ViewColor, class S>
+BT_HD Vec3<S> view_color_vjp(int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d, Vec3<S> dc,
+                             const ViewColorArrays<S>& dp) {
+  const ViewColorWidths w = ViewColor::widths(K);
+  Vec3<S> dd = {S(0), S(0), S(0)};
+  ViewColor::color_vjp(K, p.row(w, i), d, dc, dp.row(w, i), dd);
+  return dd;
+}
+BT_HD int lean_width(int kind) {
+  return for_view_color(kind, [](auto view_color) { return view_color.kLeanWidth; });
+}
+// View colours of which only what a surfel needs is left: a base colour, and as many terms as its span says.
 template <class S>
 struct LeanColors {
   int kind;
@@ -322,25 +405,10 @@ struct LeanColors {
 };
 template <class S>
 BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, Vec3<S> d) {
-  const int K = p.span[2 * i + 1];
-  const S *base = p.base + 3 * i, *terms = p.terms + int64_t(p.span[2 * i]) * lean_width(p.kind);
-  if (p.kind == kSv) return sv_relative_color(K, base, terms, d);
-  if (p.kind == kSh) return sh_color(K + 1, base, terms, d);
-  return p.kind == kSb ? sb_color(K, base, terms, d) : sg_color(K, base, terms, d);
-}
-// Writes the gradients of the parameters of surfel i and returns that of d.
-template <class S>
-BT_HD Vec3<S> view_color_vjp(int kind, int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d, Vec3<S> dc,
-                             const ViewColorArrays<S>& dp) {
-  const ViewColorWidths w = view_color_widths(kind, K);
-  const S *a = p.a + w.a * i, *b = p.b + w.b * i;
-  S *da = dp.a + w.a * i, *db = dp.b + w.b * i;
-  Vec3<S> dd = {S(0), S(0), S(0)};
-  if (kind == kSv) sv_color_vjp(K, a, b, p.c + w.c * i, d, dc, da, db, dp.c + w.c * i, dd);
-  if (kind == kSh) sh_color_vjp(K, b, d, dc, da, db, dd);
-  if (kind == kSb) sb_color_vjp(K, b, d, dc, da, db, dd);
-  if (kind == kSg) sg_color_vjp(K, b, d, dc, da, db, dd);
-  return dd;
+  return for_view_color(p.kind, [&](auto view_color) {
+    constexpr int kWidth = decltype(view_color)::kLeanWidth;
+    return view_color.lean_color(p.span[2 * i + 1], p.base + 3 * i, p.terms + int64_t(p.span[2 * i]) * kWidth, d);
+  });
 }
 
 }  // namespace bt

@@ -119,17 +119,17 @@ void shade_backward(const ShadeBackward<S>& a) {
   Mlp<S, Pack<S>> m;
   std::vector<Mlp<S, Pack<S>>> sums;
   TableScatter<S> scatter;
-  const bool learn = a.learns();
-  if (learn) {
+  const bool trains_field = a.trains_field();
+  if (trains_field) {
     m = load_mlp(*field);
     sums.resize(threads);
     for (auto& g : sums) clear(g);
     clear_gradients(*field, *dfield);
   }
   if (geometry) std::fill(duv, duv + 2 * fragments, S(0));
-  for (int64_t block = 0; block < fragments; block += learn ? kBlock : fragments) {
-    const int64_t size = learn ? std::min(kBlock, fragments - block) : fragments;
-    if (learn) scatter.resize(size, threads);
+  for (int64_t block = 0; block < fragments; block += trains_field ? kBlock : fragments) {
+    const int64_t size = trains_field ? std::min(kBlock, fragments - block) : fragments;
+    if (trains_field) scatter.resize(size, threads);
     parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
       std::vector<S>& own = partial[part];
       Encoder<S> enc;
@@ -145,7 +145,7 @@ void shade_backward(const ShadeBackward<S>& a) {
         const Vec3<S> g = residual_gradient(load3(colors + 3 * i), load3(dcolors + 3 * i));
         S* sum = own.data() + id * columns;
         store3(sum, load3(sum) + base_gradient(load3(base + 3 * id), g));
-        if (learn && f.weight[i] >= bound) {
+        if (trains_field && f.weight[i] >= bound) {
           enc.set(count, world_point(frames + id * kFrame, f.uv[i], f.uv[fragments + i]));
           drho[count] = g;
           who[count++] = i;
@@ -168,9 +168,9 @@ void shade_backward(const ShadeBackward<S>& a) {
         }
       }
     });
-    if (learn) scatter.add(*field, dfield->table);
+    if (trains_field) scatter.add(*field, dfield->table);
   }
-  if (learn) add_mlp_gradient(sums, threads, field->levels * kFeatures, *dfield);
+  if (trains_field) add_mlp_gradient(sums, threads, field->levels * kFeatures, *dfield);
   parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       S total[3 + kFrame] = {};

@@ -51,7 +51,7 @@ struct TileState {
         if (!bits(open[pack])) continue;
         const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
         if (filtered<Kernel>(g)) {
-          const FilteredPlace<P> at = filtered_place<S, P>(g, dx, dy);
+          const FilteredHit<P> at = filtered_hit<S, P>(g, dx, dy);
           if (bits(open[pack] & in_support(at))) take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
           continue;
         }
@@ -67,7 +67,7 @@ struct TileState {
   template <class F>
   void take_fragment(int pack, const Fragment<P>& f, F& fn) {
     const Blend<P> b = bt::blend(f.sigma, transmittance[pack]);
-    const Verdict<P> v = judge(open[pack], f.sigma, b.behind, P(stop));
+    const BlendTest<P> v = blend_test(open[pack], f.sigma, b.behind, P(stop));
     if (!bits(v.takes | v.ends)) return;
     open[pack] = open[pack] & ~v.ends;
     transmittance[pack] = select(v.takes, b.behind, transmittance[pack]);

@@ -12,12 +12,15 @@ namespace bt {
 template <class S>
 void view_color_forward(const ViewColorForward<S>& a) {
   const ViewColorArrays<const S>& p = a.colors;
-  parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      Vec3<S> c = {S(0), S(0), S(0)};
-      if (a.to.active[i]) c = view_color(p.kind, p.terms, p, i, view_direction(a.to.means + 3 * i, a.to.center).n);
-      store3(a.out + 3 * i, c);
-    }
+  for_view_color(p.kind, [&](auto kind) {
+    parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        Vec3<S> c = {S(0), S(0), S(0)};
+        if (a.to.active[i])
+          c = view_color<decltype(kind)>(p.terms, p, i, view_direction(a.to.means + 3 * i, a.to.center).n);
+        store3(a.out + 3 * i, c);
+      }
+    });
   });
 }
 
@@ -41,20 +44,23 @@ template <class S>
 void view_color_backward(const ViewColorBackward<S>& a) {
   const ViewColorArrays<const S>& p = a.colors;
   const ViewColorArrays<S>& dp = a.dcolors;
-  const auto [na, nb, nc] = view_color_widths(p.kind, p.terms);
-  parallel_parts(a.to.n, 256, [&, na = na, nb = nb, nc = nc](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      if (!a.to.active[i]) {
-        std::fill(dp.a + na * i, dp.a + na * (i + 1), S(0));
-        std::fill(dp.b + nb * i, dp.b + nb * (i + 1), S(0));
-        if (nc) std::fill(dp.c + nc * i, dp.c + nc * (i + 1), S(0));
-        store3(a.dmeans + 3 * i, Vec3<S>{S(0), S(0), S(0)});
-        continue;
+  for_view_color(p.kind, [&](auto kind) {
+    const ViewColorWidths w = kind.widths(p.terms);
+    parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        if (!a.to.active[i]) {
+          const ViewColorRow<S> none = dp.row(w, i);
+          std::fill(none.a, none.a + w.a, S(0));
+          std::fill(none.b, none.b + w.b, S(0));
+          std::fill(none.c, none.c + w.c, S(0));
+          store3(a.dmeans + 3 * i, Vec3<S>{S(0), S(0), S(0)});
+          continue;
+        }
+        const Unit<S> d = view_direction(a.to.means + 3 * i, a.to.center);
+        const Vec3<S> dd = view_color_vjp<decltype(kind)>(p.terms, p, i, d.n, load3(a.dout + 3 * i), dp);
+        store3(a.dmeans + 3 * i, normalize_vjp(d, dd));
       }
-      const Unit<S> d = view_direction(a.to.means + 3 * i, a.to.center);
-      const Vec3<S> dd = view_color_vjp(p.kind, p.terms, p, i, d.n, load3(a.dout + 3 * i), dp);
-      store3(a.dmeans + 3 * i, normalize_vjp(d, dd));
-    }
+    });
   });
 }
 

@@ -17,17 +17,11 @@ constexpr int kThreads = 128;
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
   if (s.lean.base) return view_color(s.lean, i, d);
   const ViewColorArrays<const float>& p = s.colors;
-  const int K = p.terms;
-  switch (p.kind) {
-    case kSv:
-      return K == preset_terms(kSv) ? view_color(kSv, preset_terms(kSv), p, i, d) : view_color(kSv, K, p, i, d);
-    case kSh:
-      return K == preset_terms(kSh) ? view_color(kSh, preset_terms(kSh), p, i, d) : view_color(kSh, K, p, i, d);
-    case kSb:
-      return K == preset_terms(kSb) ? view_color(kSb, preset_terms(kSb), p, i, d) : view_color(kSb, K, p, i, d);
-    default:
-      return K == preset_terms(kSg) ? view_color(kSg, preset_terms(kSg), p, i, d) : view_color(kSg, K, p, i, d);
-  }
+  return for_view_color(p.kind, [&](auto kind) {
+    using Kind = decltype(kind);
+    constexpr int kPreset = Kind::kPresetTerms;
+    return p.terms == kPreset ? view_color<Kind>(kPreset, p, i, d) : view_color<Kind>(p.terms, p, i, d);
+  });
 }
 
 __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color, float* row) {
@@ -72,13 +66,13 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
     if (seen) {
       LevelSet<float> level;
       if (filtered<Kernel>(geom))
-        level = {filtered_reach(geom).visible, 0, -geom[kArea]};
+        level = {filtered_bounds(geom).visible, 0, -geom[kArea]};
       else
         level = level_set(geom);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
       const Footprint area = footprint<Kernel>(row, v.height);
-      const Reach<float>& e = area.reach;
+      const PlaneBounds<float>& e = area.bounds;
       const Interval<float> x = columns_of(e);
       const float pad = e.ellipse ? area.pad : 0;
       seen = level.visible && area.top <= area.bottom &&

@@ -52,12 +52,12 @@ struct Row {
 // their way before one is used.
 template <bool kMaps>
 __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
-                                    const float (&weight)[kPixels], const Fragment<Fast> (&f)[kPixels],
+                                    const float (&weight)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
                                     Pixel (&p)[kPixels]) {
   const float4 c = s.rest[0];
-  Vec3<Fast> color[kPixels];
+  Vec3<FastFloat> color[kPixels];
   BT_UNROLL
-  for (int j = 0; j < kPixels; ++j) color[j] = {Fast(s.red), Fast(s.green), Fast(c.x)};
+  for (int j = 0; j < kPixels; ++j) color[j] = {FastFloat(s.red), FastFloat(s.green), FastFloat(c.x)};
   bool textured[kPixels], any = false;
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) any |= textured[j] = weight[j] >= a.weight_bound;
@@ -76,13 +76,13 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j)
         if (textured[j])
-          color[j] = {shaded(color[j].x + Fast(a.offset), Fast(a.scale * texel[j].x)),
-                      shaded(color[j].y + Fast(a.offset), Fast(a.scale * texel[j].y)),
-                      shaded(color[j].z + Fast(a.offset), Fast(a.scale * texel[j].z))};
+          color[j] = {shaded(color[j].x + FastFloat(a.offset), FastFloat(a.scale * texel[j].x)),
+                      shaded(color[j].y + FastFloat(a.offset), FastFloat(a.scale * texel[j].y)),
+                      shaded(color[j].z + FastFloat(a.offset), FastFloat(a.scale * texel[j].z))};
     } else {
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j)
-        if (textured[j]) color[j] = {Fast(t.x), Fast(t.y), Fast(t.z)};
+        if (textured[j]) color[j] = {FastFloat(t.x), FastFloat(t.y), FastFloat(t.z)};
     }
   }
   BT_UNROLL
@@ -104,34 +104,34 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 // PixelKernel is for the rows that it filters alone.
 template <bool kMaps, class Kernel, bool kBlur>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
-  Planes<Fast> at[kPixels];
-  Fast y[kPixels];
+  Planes<FastFloat> at[kPixels];
+  FastFloat y[kPixels];
   bool taken[kPixels], any = false;
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
-    y[j] = Fast(j ? dy + kBandRows * j : dy);
+    y[j] = FastFloat(j ? dy + kBandRows * j : dy);
     taken[j] = p[j].transmittance > 0;
     if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
-      at[j] = planes(s.g, Fast(dx), y[j]);
-      bool inside = within_in_front(at[j], Fast(s.r2)) & behind_near(s.g, a.near, at[j].W);
+      at[j] = planes(s.g, FastFloat(dx), y[j]);
+      bool inside = within_in_front(at[j], FastFloat(s.r2)) & behind_near(s.g, a.near, at[j].W);
       if (kBlur) inside |= dx * dx + y[j].v * y[j].v < s.blur2;
       taken[j] &= inside;
     }
     any |= taken[j];
   }
   if (!any) return;
-  Fragment<Fast> f[kPixels];
+  Fragment<FastFloat> f[kPixels];
   float weight[kPixels];
   any = false;
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
     if (Kernel::kPixel || kBlur)
-      f[j] = fragment<Kernel, true>(s.g, a.near, Fast(dx), y[j]);
+      f[j] = fragment<Kernel, true>(s.g, a.near, FastFloat(dx), y[j]);
     else
       f[j] = fragment_within(s.g, at[j]);
     const float sigma = f[j].sigma.v;
     const Blend<float> b = bt::blend(sigma, p[j].transmittance);
-    const Verdict<float> v = judge(taken[j], sigma, b.behind, a.transmittance_min);
+    const BlendTest<float> v = blend_test(taken[j], sigma, b.behind, a.transmittance_min);
     p[j].transmittance = v.takes ? b.behind : v.ends ? -p[j].transmittance : p[j].transmittance;
     weight[j] = v.takes ? b.weight : 0;
     taken[j] = v.takes;

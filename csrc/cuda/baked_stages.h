@@ -1,7 +1,7 @@
 // What the stages of the baked renderer share: working memory, a surfel's row, and the tiles it touches.
 #pragma once
 
-#include "core/reach.h"
+#include "core/plane_bounds.h"
 #include "cuda/baked.h"
 
 namespace bt::cuda {
@@ -52,7 +52,7 @@ void baked_draw(const BakedScene& surfels, const BakedImages& images, const Bake
 
 // The pixels that a surfel can touch, by tile.
 struct Footprint {
-  Reach<float> reach;
+  PlaneBounds<float> bounds;
   float cx, cy, pad;
   int top, bottom;  // rows of tiles, none when top > bottom
 };
@@ -75,13 +75,13 @@ BT_HD Footprint footprint(const float* row, int height) {
   if (Kernel::kPixel && row[kBlur2] < 0) {
     float geom[kGeom];
     geom_of(row, geom);
-    f.reach = filtered_reach<float>(geom).reach;
+    f.bounds = filtered_bounds<float>(geom).bounds;
   } else {
-    f.reach = reach(row, row[kR2], row[kBlur2]);
+    f.bounds = plane_bounds(row, row[kR2], row[kBlur2]);
   }
   f.cx = row[kCx], f.cy = row[kCy];
   f.pad = float(kBoundPad) + 1e-6f * (abs_(f.cx) + abs_(f.cy));
-  const Reach<float>& e = f.reach;
+  const PlaneBounds<float>& e = f.bounds;
   Interval<float> y;
   if (e.ellipse) y.add(e.y0 - f.pad, e.y1 + f.pad);
   if (e.blur > 0) y.add(-e.blur, e.blur);
@@ -99,7 +99,7 @@ struct TileRow {
 };
 BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
   TileRow r;
-  const Reach<float>& e = f.reach;
+  const PlaneBounds<float>& e = f.bounds;
   int from = width, to = -1;
   Interval<float> upper;  // crossings with the line above a band; below it those of the next
   if (e.ellipse && !e.whole) add_crossings(e, ty * kTile - f.cy, upper);

@@ -6,7 +6,7 @@ namespace bt::cuda {
 
 namespace {
 template <class S>
-struct Taken {
+struct BlendInput {
   S weight, color[3], beta;
   S depth, normal[3];  // with maps
 };
@@ -15,11 +15,11 @@ template <class S, bool kMaps>
 __global__ void __launch_bounds__(kTileThreads)
     forward_kernel(const S* geom, Pairs p, FragmentArrays<S> f, const S* colors, S* image) {
   constexpr int kChannels = kMaps ? kMapChannels : kImageChannels;
-  const Spot s = spot(p.width);
+  const TileThread s = tile_thread(p.width);
   S sum[kChannels];
   for (int c = 0; c < kChannels; ++c) sum[c] = S(0);
   const auto load = [&](int64_t, int32_t id, bool mine, int64_t i) {
-    Taken<S> t = {};
+    BlendInput<S> t = {};
     if (!mine) return t;
     const S* g = geom + int64_t(id) * kGeom;
     t.weight = f.weight[i], t.beta = g[kBeta];
@@ -30,8 +30,10 @@ __global__ void __launch_bounds__(kTileThreads)
     }
     return t;
   };
-  const auto use = [&](const Taken<S>& t) { add_blended<kMaps>(t.weight, t.color, t.beta, t.depth, t.normal, sum); };
-  walk<4, false>(p, s, load, use);
+  const auto use = [&](const BlendInput<S>& t) {
+    add_blended<kMaps>(t.weight, t.color, t.beta, t.depth, t.normal, sum);
+  };
+  for_each_fragment<4, false>(p, s, load, use);
   if (s.x >= p.width || s.y >= p.height) return;
   S* to = image + (int64_t(s.y) * p.width + s.x) * kChannels;
   for (int c = 0; c < kChannels; ++c) to[c] = sum[c];
@@ -118,7 +120,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
 
 // Columns beta and normal of a row that is 0 elsewhere.
 template <class S>
-struct PutGeometry {
+struct StoreGeomGradient {
   S* dgeom;
   __device__ void operator()(int64_t surfel, int column, S sum) const { dgeom[surfel * kGeom + kBeta + column] = sum; }
 };
@@ -130,7 +132,7 @@ void backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
     BT_LAUNCH((backward_kernel<S, kMaps>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.geom, p,
               a.fragments.f, a.colors, a.dimage, a.partial, a.dweight, a.dcolors, a.ddepth);
   fill_zero(a.dgeom, p.surfels * kGeom, stream);
-  sum_slots<kMaps ? 4 : 1>(p, static_cast<const S*>(a.partial), PutGeometry<S>{a.dgeom}, stream);
+  sum_slots<kMaps ? 4 : 1>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom}, stream);
 }
 }  // namespace
 

@@ -9,36 +9,36 @@
 
 namespace bt::cuda {
 
-struct Fast {
+struct FastFloat {
   float v;
-  Fast() = default;
-  BT_HD explicit Fast(float value) : v(value) {}
+  FastFloat() = default;
+  BT_HD explicit FastFloat(float value) : v(value) {}
 #if defined(__CUDACC__)
   // In place of those of core/common.h, of which these take one instruction, or none. Here, so that floats do not see
   // them.
-  friend __device__ __forceinline__ Fast clamp_(Fast x, Fast low, Fast high) {
-    return Fast(fminf(fmaxf(x.v, low.v), high.v));
+  friend __device__ __forceinline__ FastFloat clamp_(FastFloat x, FastFloat low, FastFloat high) {
+    return FastFloat(fminf(fmaxf(x.v, low.v), high.v));
   }
-  friend __device__ __forceinline__ Fast abs_(Fast x) { return Fast(fabsf(x.v)); }
-  friend __device__ __forceinline__ Fast relu(Fast x) {  // NaN stays NaN
+  friend __device__ __forceinline__ FastFloat abs_(FastFloat x) { return FastFloat(fabsf(x.v)); }
+  friend __device__ __forceinline__ FastFloat relu(FastFloat x) {  // NaN stays NaN
 #if __CUDA_ARCH__ >= 800
     float y;
     asm("max.NaN.f32 %0, %1, 0f00000000;" : "=f"(y) : "f"(x.v));
-    return Fast(y);
+    return FastFloat(y);
 #else
-    return Fast(x.v < 0 ? 0 : x.v);
+    return FastFloat(x.v < 0 ? 0 : x.v);
 #endif
   }
 #endif
 };
-BT_HD Fast operator+(Fast a, Fast b) { return Fast(a.v + b.v); }
-BT_HD Fast operator-(Fast a, Fast b) { return Fast(a.v - b.v); }
-BT_HD Fast operator-(Fast a) { return Fast(-a.v); }
-BT_HD Fast operator*(Fast a, Fast b) { return Fast(a.v * b.v); }
-BT_HD Fast& operator+=(Fast& a, Fast b) { return a = a + b; }
-BT_HD Fast& operator-=(Fast& a, Fast b) { return a = a - b; }
-BT_HD bool operator<(Fast a, Fast b) { return a.v < b.v; }
-BT_HD bool operator>(Fast a, Fast b) { return a.v > b.v; }
+BT_HD FastFloat operator+(FastFloat a, FastFloat b) { return FastFloat(a.v + b.v); }
+BT_HD FastFloat operator-(FastFloat a, FastFloat b) { return FastFloat(a.v - b.v); }
+BT_HD FastFloat operator-(FastFloat a) { return FastFloat(-a.v); }
+BT_HD FastFloat operator*(FastFloat a, FastFloat b) { return FastFloat(a.v * b.v); }
+BT_HD FastFloat& operator+=(FastFloat& a, FastFloat b) { return a = a + b; }
+BT_HD FastFloat& operator-=(FastFloat& a, FastFloat b) { return a = a - b; }
+BT_HD bool operator<(FastFloat a, FastFloat b) { return a.v < b.v; }
+BT_HD bool operator>(FastFloat a, FastFloat b) { return a.v > b.v; }
 
 #if defined(__CUDACC__)
 __device__ __forceinline__ float exp2_approx(float x) {
@@ -51,33 +51,35 @@ __device__ __forceinline__ float log2_approx(float x) {
   asm("lg2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
 }
-__device__ __forceinline__ Fast operator/(Fast a, Fast b) { return Fast(__fdividef(a.v, b.v)); }
+__device__ __forceinline__ FastFloat operator/(FastFloat a, FastFloat b) { return FastFloat(__fdividef(a.v, b.v)); }
 // 1 / x; infinite below 1.2e-38
-__device__ __forceinline__ Fast inverse_(Fast x) {
+__device__ __forceinline__ FastFloat inverse_(FastFloat x) {
   float y;
   asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x.v));
-  return Fast(y);
+  return FastFloat(y);
 }
-__device__ __forceinline__ Fast exp_(Fast x) { return Fast(exp2_approx(x.v * 1.44269504f)); }
-__device__ __forceinline__ Fast log_(Fast x) { return Fast(log2_approx(x.v) * 0.693147181f); }
-__device__ __forceinline__ Fast sqrt_(Fast x) {
+__device__ __forceinline__ FastFloat exp_(FastFloat x) { return FastFloat(exp2_approx(x.v * 1.44269504f)); }
+__device__ __forceinline__ FastFloat log_(FastFloat x) { return FastFloat(log2_approx(x.v) * 0.693147181f); }
+__device__ __forceinline__ FastFloat sqrt_(FastFloat x) {
   float y;
   asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x.v));
-  return Fast(y);
+  return FastFloat(y);
 }
-__device__ __forceinline__ Fast power_(Fast x, Fast y) { return Fast(exp2_approx(y.v * log2_approx(x.v))); }
+__device__ __forceinline__ FastFloat power_(FastFloat x, FastFloat y) {
+  return FastFloat(exp2_approx(y.v * log2_approx(x.v)));
+}
 #else
-inline Fast operator/(Fast a, Fast b) { return Fast(a.v / b.v); }
-inline Fast exp_(Fast x) { return Fast(exp2f(x.v * 1.44269504f)); }
-inline Fast log_(Fast x) { return Fast(logf(x.v)); }
-inline Fast sqrt_(Fast x) { return Fast(sqrtf(x.v)); }
-inline Fast power_(Fast x, Fast y) { return Fast(exp2f(y.v * log2f(x.v))); }
+inline FastFloat operator/(FastFloat a, FastFloat b) { return FastFloat(a.v / b.v); }
+inline FastFloat exp_(FastFloat x) { return FastFloat(exp2f(x.v * 1.44269504f)); }
+inline FastFloat log_(FastFloat x) { return FastFloat(logf(x.v)); }
+inline FastFloat sqrt_(FastFloat x) { return FastFloat(sqrtf(x.v)); }
+inline FastFloat power_(FastFloat x, FastFloat y) { return FastFloat(exp2f(y.v * log2f(x.v))); }
 #endif
 
 // The real of a training kernel's pixels: doubles stay exact.
 template <class S>
-using FastOr = std::conditional_t<std::is_same_v<S, float>, Fast, S>;
-BT_HD float plain(Fast x) { return x.v; }
+using FastFloatOr = std::conditional_t<std::is_same_v<S, float>, FastFloat, S>;
+BT_HD float plain(FastFloat x) { return x.v; }
 BT_HD double plain(double x) { return x; }
 
 }  // namespace bt::cuda

@@ -43,10 +43,10 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
       const Vec3<S> zero = {S(0), S(0), S(0)};
       const Vec3<S> at = active ? load3(x + 3 * i) : zero, d = active ? load3(drho + 3 * i) : zero;
       const Vec3<S> g =
-          learn(field, shared->mlp, at, d, active, lane, shared->stage[warp], weights, table, dx != nullptr);
+          field_vjp(field, shared->mlp, at, d, active, lane, shared->stage[warp], weights, table, dx != nullptr);
       if (dx && active) store3(dx + 3 * i, g);
     }
-  give_weights(*shared, weights, warp, lane, partial);
+  store_weight_sums(*shared, weights, warp, lane, partial);
 }
 
 // A warp takes 32 texels of a tile in the order of memory: a row, a part of one, or several short ones.

@@ -145,8 +145,8 @@ __device__ void scatter(Stage<S>& stage, int turn, int level, int64_t first_entr
 // The table's gradient, and d loss / d grid position if asked for, of 32 look-ups whose gradients of the features stand
 // in the stage. Lanes that are not active come after the others; their gradients are 0.
 template <class S, bool kExact>
-__device__ Vec3<S> learn_table(const FieldArrays<S>& f, Vec3<S> c, bool active, int lane, Stage<S>& stage,
-                               const Adder<S, kExact>& table, bool positions) {
+__device__ Vec3<S> encode_vjp(const FieldArrays<S>& f, Vec3<S> c, bool active, int lane, Stage<S>& stage,
+                              const Adder<S, kExact>& table, bool positions) {
   const uint32_t mask = f.hash_mask();
   const unsigned actives = __ballot_sync(kFullMask, active);
   const bool followed = lane < kWarp - 1 && (actives >> (lane + 1) & 1u);
@@ -183,8 +183,9 @@ __device__ Vec3<S> learn_table(const FieldArrays<S>& f, Vec3<S> c, bool active, 
 // One backward look-up per lane; all 32 lanes take part. Those that are not active come after the others and add
 // nothing. Returns d loss / d x if asked for.
 template <class S, bool kExact>
-__device__ Vec3<S> learn(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active, int lane,
-                         Stage<S>& stage, WeightSums<S>& weights, const Adder<S, kExact>& table, bool positions) {
+__device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active,
+                             int lane, Stage<S>& stage, WeightSums<S>& weights, const Adder<S, kExact>& table,
+                             bool positions) {
   using At = Stage<S>;
   encode(f, grid_position(f, x), active, stage.row(lane) + At::kX);
   *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kD) = {{drho.x, drho.y, drho.z, S(0)}};
@@ -219,7 +220,7 @@ __device__ Vec3<S> learn(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x
   x = load3(stage.row(lane) + At::kPoint);
   __syncwarp();
   store_rows(g, lane, [&](int p) { return stage.feature_gradients(p); });
-  const Vec3<S> dc = learn_table(f, grid_position(f, x), active, lane, stage, table, positions);
+  const Vec3<S> dc = encode_vjp(f, grid_position(f, x), active, lane, stage, table, positions);
   __syncwarp();  // the next look-ups write where these are read
   if (!positions || !active) return {S(0), S(0), S(0)};
   return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
@@ -246,7 +247,7 @@ struct BackwardShared {
 
 // Sums of the block's warps, in their order, to the block's row of `out`.
 template <class S>
-__device__ void give_weights(BackwardShared<S>& shared, WeightSums<S>& weights, int warp, int lane, S* out) {
+__device__ void store_weight_sums(BackwardShared<S>& shared, WeightSums<S>& weights, int warp, int lane, S* out) {
   constexpr int kThreads = kBackwardWarps<S> * kWarp;
   static_assert(kMlpWeights <= kWarp * Stage<S>::kColumns, "the sums take the place of the first warp's stage");
   S* sums = shared.stage[0].number;
@@ -254,7 +255,7 @@ __device__ void give_weights(BackwardShared<S>& shared, WeightSums<S>& weights, 
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) sums[k] = S(0);
   __syncthreads();
   for (int w = 0; w < kBackwardWarps<S>; ++w) {
-    if (w == warp) weights.give(sums, lane);
+    if (w == warp) weights.add_to(sums, lane);
     __syncthreads();
   }
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) out[int64_t(blockIdx.x) * kMlpWeights + k] = sums[k];

@@ -65,13 +65,13 @@ void take(R& r, const char* name, Pairs& to) {
 }
 
 // Where a thread of a tile's block stands.
-struct Spot {
+struct TileThread {
   int warp, lane;
   int left, top;  // first pixel of the warp
   int x, y;       // the thread's pixel; may lie outside the image
 };
-__device__ inline Spot spot(int width) {
-  Spot s;
+__device__ inline TileThread tile_thread(int width) {
+  TileThread s;
   s.warp = int(threadIdx.x) / kWarp, s.lane = int(threadIdx.x) % kWarp;
   const int across = tiles_across(width), tile = int(blockIdx.x);
   s.left = tile % across * kTile + s.warp % (kTile / kWarpWidth) * kWarpWidth;
@@ -106,7 +106,7 @@ __device__ inline void load_shape(const S* row, S* g) {
 // k, i is its place in the list. kAhead loads are under way before the first is used: a warp has about ten fragments of
 // a pair, far too few bytes to keep the memory busy one at a time. Warps go their own way: nothing waits for the block.
 template <int kAhead, bool kBack, class Load, class Use>
-__device__ inline void walk(const Pairs& p, const Spot& s, Load&& load, Use&& use) {
+__device__ inline void for_each_fragment(const Pairs& p, const TileThread& s, Load&& load, Use&& use) {
   const int64_t begin = p.tile_pairs[blockIdx.x], end = p.tile_pairs[blockIdx.x + 1];
   const int64_t batches = ceil_div(end - begin, kWarp);
   const unsigned below = (1u << s.lane) - 1;

@@ -128,15 +128,15 @@ __device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S,
   for (int k = 0; k < M; ++k) to.add(int64_t(row) * M + k, value[k]);
 }
 
-// kLearn: the field gets gradients, too.
-template <class S, bool kExact, bool kLearn>
+// kTrainsField: the field gets gradients, too.
+template <class S, bool kExact, bool kTrainsField>
 __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>)
     backward_kernel(FragmentArrays<S> f, S bound, const S* __restrict__ base, const S* __restrict__ frames,
                     FieldArrays<S> field, const S* __restrict__ colors, const S* __restrict__ dcolors,
                     ShadeGradients<S> out, ExactSums exact) {
   constexpr int kWarps = kBackwardWarps<S>;
   BT_DYNAMIC_SHARED(BackwardShared<S>, shared);
-  if constexpr (kLearn) {
+  if constexpr (kTrainsField) {
     if (threadIdx.x == 0) shared->taken = kWarps;
     load_mlp(field, threadIdx.x, kWarps * kWarp, shared->mlp);
   }
@@ -163,7 +163,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
       d = residual_gradient(load3(colors + 3 * j), load3(dcolors + 3 * j));
     }
     const bool moves = out.uv != nullptr;
-    const Vec3<S> dx = learn(field, shared->mlp, x, d, active, lane, shared->stage[warp], weights, dtable, moves);
+    const Vec3<S> dx = field_vjp(field, shared->mlp, x, d, active, lane, shared->stage[warp], weights, dtable, moves);
     if (moves) {
       S g[kFrame] = {};
       int32_t surfel = -1;
@@ -192,7 +192,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
       for (int k = 0; k < kRows; ++k) {
         const int64_t i = first + k * kWarp + lane, j = i < f.total ? i : f.total - 1;
         surfel[k] = f.surfel[j];
-        if constexpr (kLearn) textured[k] = f.weight[j] >= bound;
+        if constexpr (kTrainsField) textured[k] = f.weight[j] >= bound;
         d[k] = residual_gradient(load3(colors + 3 * j), load3(dcolors + 3 * j));
       }
       BT_UNROLL
@@ -204,7 +204,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
         S g[3] = {};
         if (in) store3(g, base_gradient(f_view[k], d[k]));
         add_to_rows(in ? surfel[k] : -1, lane, g, dbase);
-        if constexpr (kLearn) {
+        if constexpr (kTrainsField) {
           const bool looks_up = in && textured[k];
           if (in && !looks_up && out.uv) out.uv[i] = out.uv[f.total + i] = S(0);
           put(shared->queue[warp], count, looks_up, next + k * kWarp + lane, lane);
@@ -213,19 +213,19 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
       __syncwarp();
       next += kStep;
       if (next % kChunk == 0) {
-        if constexpr (kLearn && !kExact)
+        if constexpr (kTrainsField && !kExact)
           next = take_chunk(&shared->taken, lane) * kChunk;
         else
           next += (kWarps - 1) * kChunk;
       }
     }
-    if constexpr (kLearn) {
+    if constexpr (kTrainsField) {
       while (count - looked_up >= kWarp || (!more && looked_up < count)) look_up();
       if (looked_up) drop(shared->queue[warp], count, looked_up, lane);
       looked_up = 0;
     }
   }
-  if constexpr (kLearn) give_weights(*shared, weights, warp, lane, out.partial);
+  if constexpr (kTrainsField) store_weight_sums(*shared, weights, warp, lane, out.partial);
 }
 }  // namespace
 
@@ -241,14 +241,14 @@ void shade_forward(const ShadeForward<S>& a, Stream stream) {
 
 template <class S>
 void shade_backward(const ShadeBackward<S>& a, Stream stream) {
-  const bool learns = a.learns();
-  const FieldArrays<S>* learned = learns ? a.field : nullptr;
+  const bool trains_field = a.trains_field();
+  const FieldArrays<S>* learned = trains_field ? a.field : nullptr;
   FieldArrays<S> arrays = {};
-  if (learns) arrays = *a.field;
-  const ShadeGradients<S> out = {a.dbase, learns ? a.dfield.table : nullptr, a.duv, a.dframes, a.work.mlp};
+  if (trains_field) arrays = *a.field;
+  const ShadeGradients<S> out = {a.dbase, trains_field ? a.dfield.table : nullptr, a.duv, a.dframes, a.work.mlp};
   // without the field a block's threads need few registers and wait for memory: more of them
-  const int blocks = backward_blocks<S>(a.f.total, learns ? kMostBlocks : 4 * kMostBlocks);
-  const size_t shared = learns ? sizeof(BackwardShared<S>) : 0;
+  const int blocks = backward_blocks<S>(a.f.total, trains_field ? kMostBlocks : 4 * kMostBlocks);
+  const size_t shared = trains_field ? sizeof(BackwardShared<S>) : 0;
   const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
   const auto run = [&](auto kernel, const ExactSums& exact) {
     BT_ALLOW_SHARED(kernel, shared);
@@ -257,15 +257,16 @@ void shade_backward(const ShadeBackward<S>& a, Stream stream) {
   };
   if (a.work.exact) {
     const ExactSums exact = begin_exact(a.work, learned, a.n, a.dframes != nullptr, a.f.total, a.dcolors, stream);
-    learns ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
+    trains_field ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
     end_exact(exact, learned, a.n, out.table, a.dbase, a.dframes, stream);
   } else {
     fill_zero(a.dbase, 3 * a.n, stream);
     if (a.dframes) fill_zero(a.dframes, kFrame * a.n, stream);
-    if (learns) fill_zero(out.table, arrays.table_size(), stream);
-    learns ? run(backward_kernel<S, false, true>, ExactSums()) : run(backward_kernel<S, false, false>, ExactSums());
+    if (trains_field) fill_zero(out.table, arrays.table_size(), stream);
+    trains_field ? run(backward_kernel<S, false, true>, ExactSums())
+                 : run(backward_kernel<S, false, false>, ExactSums());
   }
-  if (learns) sum_weights(a.work.mlp, blocks, arrays.levels, a.dfield, stream);
+  if (trains_field) sum_weights(a.work.mlp, blocks, arrays.levels, a.dfield, stream);
 }
 
 #define BT_INSTANTIATE(S)                                      \

@@ -30,8 +30,8 @@ template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
                 const int64_t* tile_pairs, uint32_t* masks) {
-  using T = FastOr<S>;
-  const Spot s = spot(width);
+  using T = FastFloatOr<S>;
+  const TileThread s = tile_thread(width);
   const int64_t end = tile_pairs[blockIdx.x + 1];
   int64_t first = tile_pairs[blockIdx.x];
   uint32_t* row = masks + s.warp * pairs;
@@ -60,12 +60,12 @@ __global__ void __launch_bounds__(kTileThreads)
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       // a cheap look first: does any open pixel lie in the support or near the centre?
       const bool close = near_centre(dx, dy);
-      const bool reached = filtered<Kernel>(g) ? in_support(filtered_place<S, T>(g, dx, dy))
+      const bool reached = filtered<Kernel>(g) ? in_support(filtered_hit<S, T>(g, dx, dy))
                                                : close || in_support(planes<S, T>(g, dx, dy));
       if (!__any_sync(kFullMask, open && reached)) continue;
       const S sigma = plain(fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma);
       const S behind = blend(sigma, transmittance).behind;
-      const Verdict<S> v = judge(open, sigma, behind, S(kTransmittanceMin));
+      const BlendTest<S> v = blend_test(open, sigma, behind, S(kTransmittanceMin));
       open = open && !v.ends;
       if (v.takes) transmittance = behind;
       const unsigned taken = __ballot_sync(kFullMask, v.takes);
@@ -104,7 +104,7 @@ constexpr int kHeld = 4096 / sizeof(S);
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
     fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
-  using T = FastOr<S>;
+  using T = FastFloatOr<S>;
   struct alignas(16) Row {
     S g[kGeom];
   };
@@ -114,7 +114,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
   __shared__ int32_t ids[kWarp], surfels[kHeld<S>], pixels[kHeld<S>];
   __shared__ S weights[kHeld<S>], us[kHeld<S>], vs[kHeld<S>], depths[kHeld<S>], sigmas[kHeld<S>];
   constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
-  const Spot s = spot(p.width);
+  const TileThread s = tile_thread(p.width);
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   const int32_t pixel = int32_t(s.y * p.width + s.x);
   const unsigned below = (1u << s.lane) - 1;
@@ -185,7 +185,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
 
 // Which of a surfel's fragments lie on masked pixels is known from the marks: the list itself is not read.
 __global__ void __launch_bounds__(kTileThreads) counts_kernel(Pairs p, const uint8_t* mask, int32_t* counts) {
-  const Spot s = spot(p.width);
+  const TileThread s = tile_thread(p.width);
   const bool on = s.x < p.width && s.y < p.height && mask[int64_t(s.y) * p.width + s.x];
   const unsigned pixels = __ballot_sync(kFullMask, on);
   if (!pixels) return;

@@ -21,8 +21,8 @@ struct Step {
 template <class S>
 __global__ void __launch_bounds__(kTileThreads)
     dsigma_kernel(Pairs p, FragmentArrays<S> f, const S* dweight, S* dsigma) {
-  using T = FastOr<S>;
-  const Spot s = spot(p.width);
+  using T = FastFloatOr<S>;
+  const TileThread s = tile_thread(p.width);
   T later = T(S(0));  // sum of w dL/dw
   const auto load = [&](int64_t, int32_t, bool mine, int64_t i) {
     Step<S> t = {mine, i, S(0), S(0), S(0)};
@@ -33,14 +33,14 @@ __global__ void __launch_bounds__(kTileThreads)
     if (!t.mine) return;
     dsigma[t.i] = plain(blend_vjp(T(t.weight), T(abs_(t.sigma)), T(t.dweight), later));
   };
-  walk<4, true>(p, s, load, use);
+  for_each_fragment<4, true>(p, s, load, use);
 }
 
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kRunThreads)
     surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, const S* dsigma, const S* duv,
                   const S* ddepth, S* partial) {
-  using T = FastOr<S>;
+  using T = FastFloatOr<S>;
   const Run r = run(p);
   T d[kTraceSums], ax = T(S(0)), ay = T(S(0));
   BT_UNROLL
@@ -78,7 +78,7 @@ __global__ void __launch_bounds__(kRunThreads)
 }
 
 template <class S>
-struct PutGeometry {
+struct StoreGeomGradient {
   S *dgeom, *absgrad;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
     dgeom[surfel * kGeom + column] = column < kShape || column == kArea ? sum : S(0);
@@ -99,7 +99,7 @@ void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream) {
       BT_LAUNCH((surfel_kernel<decltype(kernel), S>), run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom,
                 a.view.near, a.rim, p, f, given, a.duv, a.ddepth, a.partial);
     });
-  sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), PutGeometry<S>{a.dgeom, a.absgrad}, stream);
+  sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }
 
 #define BT_INSTANTIATE(S) template void trace_backward(const TraceBackward<S, Pairs>&, Stream);

@@ -10,14 +10,14 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 128;
 
-template <class S, int kKind, int kTerms>
+template <class S, class ViewColor, int kTerms>
 __global__ void __launch_bounds__(kThreads)
     forward_kernel(int64_t n, ViewColorArrays<const S> p, const S* __restrict__ means,
                    const double* __restrict__ center, const uint8_t* __restrict__ active, S* __restrict__ out) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   Vec3<S> c = {S(0), S(0), S(0)};
-  if (active[i]) c = view_color(kKind, kTerms ? kTerms : p.terms, p, i, view_direction(means + 3 * i, center).n);
+  if (active[i]) c = view_color<ViewColor>(kTerms ? kTerms : p.terms, p, i, view_direction(means + 3 * i, center).n);
   store3(out + 3 * i, c);
 }
 
@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(kThreads)
   store3(out + 3 * i, c);
 }
 
-template <class S, int kKind, int kTerms>
+template <class S, class ViewColor, int kTerms>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(int64_t n, ViewColorArrays<const S> p, const S* __restrict__ means,
                     const double* __restrict__ center, const uint8_t* __restrict__ active, const S* __restrict__ dout,
@@ -42,7 +42,7 @@ __global__ void __launch_bounds__(kThreads)
   if (i >= n) return;
   const int K = kTerms ? kTerms : p.terms;
   if (!active[i]) {
-    const ViewColorWidths w = view_color_widths(kKind, K);
+    const ViewColorWidths w = ViewColor::widths(K);
     for (int k = 0; k < w.a; ++k) dp.a[w.a * i + k] = S(0);
     for (int k = 0; k < w.b; ++k) dp.b[w.b * i + k] = S(0);
     for (int k = 0; k < w.c; ++k) dp.c[w.c * i + k] = S(0);
@@ -50,22 +50,21 @@ __global__ void __launch_bounds__(kThreads)
     return;
   }
   const Unit<S> d = view_direction(means + 3 * i, center);
-  const Vec3<S> dd = view_color_vjp(kKind, K, p, i, d.n, load3(dout + 3 * i), dp);
+  const Vec3<S> dd = view_color_vjp<ViewColor>(K, p, i, d.n, load3(dout + 3 * i), dp);
   store3(dmeans + 3 * i, normalize_vjp(d, dd));
 }
 
-// Calls f<kind, terms> with the sizes of the presets, which the compiler unrolls, or with 0 for any other.
+// Calls f with the kind's struct, and with its preset's number of terms, for which the compiler unrolls, or 0 for any
+// other.
 template <class F>
 void dispatch(int kind, int terms, F&& f) {
-  using std::integral_constant;
-#define BT_CASE(k, t) f(integral_constant<int, k>(), integral_constant<int, t>())
-#define BT_KIND(k) return terms == preset_terms(k) ? BT_CASE(k, preset_terms(k)) : BT_CASE(k, 0)
-  if (kind == kSv) BT_KIND(kSv);
-  if (kind == kSh) BT_KIND(kSh);
-  if (kind == kSb) BT_KIND(kSb);
-  BT_KIND(kSg);
-#undef BT_KIND
-#undef BT_CASE
+  for_view_color(kind, [&](auto view_color) {
+    constexpr int kPreset = decltype(view_color)::kPresetTerms;
+    if (terms == kPreset)
+      f(view_color, std::integral_constant<int, kPreset>());
+    else
+      f(view_color, std::integral_constant<int, 0>());
+  });
 }
 }  // namespace
 
@@ -74,7 +73,7 @@ void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
   const Directions<S>& to = a.to;
   if (!to.n) return;
   dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
-    const auto kernel = forward_kernel<S, decltype(kind)::value, decltype(terms)::value>;
+    const auto kernel = forward_kernel<S, decltype(kind), decltype(terms)::value>;
     BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
               to.center, to.active, a.out);
   });
@@ -94,7 +93,7 @@ void view_color_backward(const ViewColorBackward<S>& a, Stream stream) {
   const Directions<S>& to = a.to;
   if (!to.n) return;
   dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
-    const auto kernel = backward_kernel<S, decltype(kind)::value, decltype(terms)::value>;
+    const auto kernel = backward_kernel<S, decltype(kind), decltype(terms)::value>;
     BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
               to.center, to.active, a.dout, a.dcolors, a.dmeans);
   });

@@ -253,7 +253,7 @@ struct WeightSums {
     }
   }
   // Adds to a block's sums [kMlpWeights] in shared memory.
-  __device__ void give(S* to, int lane) {
+  __device__ void add_to(S* to, int lane) {
     constexpr int kMatrix = kWidth * kWidth;
     const int g = lane / 4, t = lane % 4;
     BT_UNROLL

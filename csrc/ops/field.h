@@ -26,8 +26,8 @@ struct FieldWork {
   int64_t* exact;  // null, or for sums that do not depend on the order: [exact_size(...)]
 
   template <class R>
-  void fields(R& r, bool learns, int64_t size) {
-    if (learns) r.work("mlp_work", mlp, int64_t(kMostBlocks) * kMlpWeights);
+  void fields(R& r, bool trains_field, int64_t size) {
+    if (trains_field) r.work("mlp_work", mlp, int64_t(kMostBlocks) * kMlpWeights);
     if (r.given("exact_work")) r.work("exact_work", exact, size);
   }
 };
@@ -105,7 +105,7 @@ struct ShadeBackward {
   S *duv, *dframes;
   FieldWork<S> work;
 
-  bool learns() const { return field && dfield.table; }
+  bool trains_field() const { return field && dfield.table; }
   template <class R>
   void fields(R& r) {
     f.fields(r);
@@ -119,9 +119,9 @@ struct ShadeBackward {
     if (field && r.given("dtable")) dfield.fields(r, *field);
     r.maybe("duv", duv, 2 * f.total);
     r.maybe("dframes", dframes, n * kFrame);
-    if ((duv != nullptr) != (dframes != nullptr) || (duv && !learns()))
+    if ((duv != nullptr) != (dframes != nullptr) || (duv && !trains_field()))
       r.refuse("duv and dframes come together, with the field's gradients");
-    work.fields(r, learns(), exact_size(learns() ? field->table_size() : 0, n, dframes != nullptr));
+    work.fields(r, trains_field(), exact_size(trains_field() ? field->table_size() : 0, n, dframes != nullptr));
   }
 };
 

@@ -15,7 +15,7 @@ from bitymi_ns.bake.tune import TexelScene, TexelView, TexelViews, coverage
 from bitymi_ns.ops import fitting_lists, project, trace_cpu
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.memory import Room
+from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
@@ -94,7 +94,7 @@ def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
 
 def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
     scene = TexelScene(wrong, BACKGROUND)
-    seen = coverage(scene, TexelViews(scene, [v for i, v in enumerate(views) if i % 4], Room(1 << 30)))[:, 0]
+    seen = coverage(scene, TexelViews(scene, [v for i, v in enumerate(views) if i % 4], MemoryBudget(1 << 30)))[:, 0]
     tuned = TexelScene(tune_atlas(wrong, views, BACKGROUND, OPTIONS), BACKGROUND).texels
     moved = (tuned - 0.1).abs().amax(1)
     last = scene.tiles.first[59]
@@ -108,7 +108,9 @@ def test_masked_pixels_are_not_seen(wrong: Baked, views: list[View]) -> None:
     scene = TexelScene(wrong, BACKGROUND)
     hidden = torch.zeros(40, 48, 1, dtype=torch.bool)
     masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
-    one, all_but_masked = (coverage(scene, TexelViews(scene, each, Room(1 << 30))) for each in (views[:1], masked))
+    one, all_but_masked = (
+        coverage(scene, TexelViews(scene, each, MemoryBudget(1 << 30))) for each in (views[:1], masked)
+    )
     assert torch.equal(one, all_but_masked) and one.any()
 
 
@@ -171,14 +173,14 @@ def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], mon
         traced.append(next(i for i, v in enumerate(views) if v.image is view.image))
         return trace(self, view)
 
-    def keep(self: Room, nbytes: int) -> bool:
+    def keep(self: MemoryBudget, nbytes: int) -> bool:
         fits = take(self, nbytes)
         kept.append(nbytes if fits else 0)
         return fits
 
-    take = Room.take
+    take = MemoryBudget.take
     monkeypatch.setattr(TexelScene, "view", counted)
-    monkeypatch.setattr(Room, "take", keep)
+    monkeypatch.setattr(MemoryBudget, "take", keep)
     budget = sum(view.nbytes for view in set_aside)
     tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, steps=8, cache_bytes=budget))
     assert all(traced.count(i) == 1 for i in range(0, 12, 4)), "looked at most often, and traced once"
@@ -226,13 +228,13 @@ def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, vie
         bare = view._replace(correction=log.exp().expand(3))
         exposed.append(bare._replace(image=bare.shown(view.image, alpha, BACKGROUND)))
     scene = TexelScene(truth, BACKGROUND)
-    alike = TexelViews(scene, exposed, Room(1 << 30))
+    alike = TexelViews(scene, exposed, MemoryBudget(1 << 30))
     assert alike.psnr(scene.texels) > 55  # background and all
     blind = [view._replace(correction=None) for view in exposed]
     after = {}
     for name, each in (("known", exposed), ("unknown", blind)):
         tuned = tune_atlas(wrong, each, BACKGROUND, OPTIONS)
-        after[name] = TexelViews(TexelScene(tuned, BACKGROUND), views, Room(1 << 30)).psnr(
+        after[name] = TexelViews(TexelScene(tuned, BACKGROUND), views, MemoryBudget(1 << 30)).psnr(
             TexelScene(tuned, BACKGROUND).texels
         )
     assert after["known"] > after["unknown"] + 1.0

@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("nerfstudio")
 
 from bitymi_ns.sample import generate
+from tests.host.captures import colmap_model
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +27,15 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def capture(original: Path, tmp_path: Path) -> Path:
     """A copy of it to spoil."""
     return Path(shutil.copytree(original, tmp_path / "room"))
+
+
+@pytest.fixture
+def project(capture: Path) -> Path:
+    """The room as a COLMAP project, a model in text in sparse/0."""
+    colmap_model(capture, capture / "sparse/0")
+    for name in ("transforms.json", "sparse_pc.ply"):
+        (capture / name).unlink()
+    return capture
 
 
 def edit_transforms(capture: Path, change: Any) -> None:

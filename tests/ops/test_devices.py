@@ -71,10 +71,10 @@ def test_the_tracers_refuse_each_others_tensors() -> None:
     _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
     geom = projection.geom.detach()
     with pytest.raises(RuntimeError, match=r"trace_cuda.tile_lists runs on a CUDA device only, .* call `trace`"):
-        trace_cuda.find(geom, projection)
+        trace_cuda.find_fragments(geom, projection)
     with emulated_cuda():
-        with pytest.raises(RuntimeError, match=r"trace_cpu.find runs on the CPU only, .* call `trace`"):
-            trace_cpu.find(geom, projection)
+        with pytest.raises(RuntimeError, match=r"trace_cpu.find_fragments runs on the CPU only, .* call `trace`"):
+            trace_cpu.find_fragments(geom, projection)
         with pytest.raises(RuntimeError, match=r"trace_cpu.count runs on the CPU only"):
             trace_cpu.count(projection)
         with pytest.raises(RuntimeError, match="there is no kernel texel_image_forward_f64 for tensors on 'cpu'"):

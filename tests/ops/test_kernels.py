@@ -148,7 +148,7 @@ def test_random_scenes_in_single_precision(seed: int) -> None:
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in ("means", "quats", "log_scales", "opacity_logits", "beta_raw")]
-    want = reference_render.render(*geometry, colors, case.viewmat, case.K, case.width, case.height, case.background)
+    want = reference_render.render(geometry, colors, case, case.background)
     generator = torch.Generator().manual_seed(seed)
     loss, reference_loss = 0.0, 0.0
     for key, attribute in {**OUTPUTS, "normal": "normal"}.items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch import Tensor
@@ -25,8 +27,7 @@ EXTREME = {case.name: case for case in extreme_scenes()}
 
 def render_case(case: SceneCase, params: dict[str, Tensor], tiles: list[Tensor] | None) -> Render:
     colors = sv(*(params[key] for key in SV_KEYS), view_directions(params["means"], case.viewmat))
-    surfels = (params[key] for key in SURFEL_KEYS)
-    return render(*surfels, colors, case.viewmat, case.K, case.width, case.height, case.background, tiles)
+    return render([params[key] for key in SURFEL_KEYS], colors, case, case.background, tiles)
 
 
 def leaves(case: SceneCase) -> tuple[dict[str, Tensor], list[Tensor] | None]:
@@ -117,19 +118,16 @@ def test_a_disc_facing_the_camera_has_a_normal_towards_it() -> None:
     """A disc in the plane z = 2 in front of a camera at the origin: its normal is (0, 0, -1) wherever it is seen."""
     one = torch.ones(1, dtype=torch.float64)
     K = torch.tensor([[10.0, 0, 8], [0, 10, 8], [0, 0, 1]], dtype=torch.float64)
+    camera = SimpleNamespace(viewmat=torch.eye(4, dtype=torch.float64), K=K, width=16, height=16)
     for quat in ([1.0, 0, 0, 0], [0.0, 1, 0, 0]):
-        images = render(
+        geometry = (
             torch.tensor([[0.0, 0, 2]], dtype=torch.float64),
             torch.tensor([quat], dtype=torch.float64),
             torch.zeros(1, 2, dtype=torch.float64),
             100 * one,
             -100 * one,
-            torch.zeros(1, 3, dtype=torch.float64),
-            torch.eye(4, dtype=torch.float64),
-            K,
-            16,
-            16,
         )
+        images = render(geometry, torch.zeros(1, 3, dtype=torch.float64), camera)
         center = images.normal[8, 8] / images.alpha[8, 8]
         assert torch.allclose(center, torch.tensor([0.0, 0, -1], dtype=torch.float64))
         assert torch.allclose(images.alpha[8, 8], 0.99 * one[0])
@@ -141,7 +139,7 @@ def test_a_residual_field_equal_to_a_tile_gives_the_same_picture() -> None:
     case = random_scene(10, 5)
     add = torch.tensor([0.2, -0.3, 0.1], dtype=torch.float64)
     colors = sv(*(case.params[key] for key in SV_KEYS), view_directions(case.params["means"], case.viewmat))
-    arguments = [case.params[key] for key in SURFEL_KEYS] + [colors, case.viewmat, case.K, case.width, case.height]
+    arguments = ([case.params[key] for key in SURFEL_KEYS], colors, case)
     tiled = render(*arguments, tiles=[add.expand(4, 4, 3)] * 10)
     with_field = render(*arguments, residual=lambda x: add.expand(x.shape[0], 3))
     assert torch.allclose(tiled.rgb, with_field.rgb, atol=1e-14)

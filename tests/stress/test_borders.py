@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -83,8 +84,7 @@ def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend
         *(doubles[key] for key in SV_KEYS), reference_render.view_directions(doubles["means"], case.viewmat)
     )
     geometry = [doubles[key] for key in SURFEL_KEYS]
-    view = (case.viewmat, case.K.float().double(), case.width, case.height)
-    want = reference_render.render(*geometry, colors, *view, tiles=patches)
+    want = reference_render.render(geometry, colors, replace(case, K=case.K.float().double()), tiles=patches)
     drawn = set(want.trace.blended.nonzero()[:, 1].tolist())
     assert len(drawn) == n, "every tile is seen"
     assert got.isfinite().all()

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pycolmap
 
-from bitymi_ns.capture.sfm.job import CameraGroup, Job, Tell
+from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
 
 SMALL = 1000
 """Photographs whose longer side has fewer pixels are doubled before features are found; larger ones have enough."""
 
 
-def extract(job: Job, database: Path, tell: Tell) -> None:
+def extract(job: Job, database: Path, tell: StageProgress) -> None:
     """Find the features of the photographs that have none yet."""
     total = len(job.order)
     tell("finding features", 0, total, counts="keypoints")

@@ -12,7 +12,7 @@ MODEL = "model"
 """Names within the folder of the work: COLMAP's database, the pairs to be compared, and the model that comes out."""
 
 
-class Tell(Protocol):
+class StageProgress(Protocol):
     """Gets the stage, how much of it is done, how much there is, and the table of the database whose rows say how much
     is done from now on."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pycolmap
 
-from bitymi_ns.capture.sfm.job import Job, Tell
+from bitymi_ns.capture.sfm.job import Job, StageProgress
 from bitymi_ns.capture.sfm.refine import refined
 
 ENOUGH = 0.9
@@ -17,7 +17,7 @@ GOOD_ERROR = 1.0
 """... and their reprojection error is below so many pixels of the photographs as features were found on them."""
 
 
-def reconstruct(job: Job, database: Path, connected: int, tell: Tell) -> pycolmap.Reconstruction | None:
+def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
     """The best model of the photographs, or None where there is none.
 
     Args:
@@ -68,7 +68,7 @@ def _in_folder(
 
 
 def _best(
-    models: dict[int, pycolmap.Reconstruction], job: Job, database: Path, tell: Tell
+    models: dict[int, pycolmap.Reconstruction], job: Job, database: Path, tell: StageProgress
 ) -> pycolmap.Reconstruction | None:
     """The largest component, refined."""
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
@@ -80,7 +80,7 @@ def _best(
     return model
 
 
-def _global(job: Job, database: Path, folder: Path, tell: Tell) -> dict[int, pycolmap.Reconstruction]:
+def _global(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict[int, pycolmap.Reconstruction]:
     stage = "placing all cameras at once"
     tell(stage, 0, 1)
     options = pycolmap.GlobalPipelineOptions()
@@ -95,7 +95,7 @@ def _global(job: Job, database: Path, folder: Path, tell: Tell) -> dict[int, pyc
     return models
 
 
-def _incremental(job: Job, database: Path, folder: Path, tell: Tell) -> dict[int, pycolmap.Reconstruction]:
+def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict[int, pycolmap.Reconstruction]:
     stage = "placing one camera after the other"
     placed = 0
     total = len(job.order)

@@ -10,7 +10,7 @@ import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from bitymi_ns.capture.sfm.job import PAIRS, Job, Tell
+from bitymi_ns.capture.sfm.job import PAIRS, Job, StageProgress
 from bitymi_ns.files import write_file
 
 FEW = 30
@@ -30,7 +30,7 @@ SEQUENCE_SHARE = 0.8
 """Photographs are a sequence if so many neighbours in their order are among the most alike."""
 
 
-def match(job: Job, database: Path, tell: Tell) -> None:
+def match(job: Job, database: Path, tell: StageProgress) -> None:
     """Choose pairs, and compare those that have not been compared yet."""
     listed = Path(job.work) / PAIRS
     if not listed.exists():
@@ -40,14 +40,14 @@ def match(job: Job, database: Path, tell: Tell) -> None:
     compare(listed, database, tell)
 
 
-def match_rest(job: Job, database: Path, tell: Tell) -> None:
+def match_rest(job: Job, database: Path, tell: StageProgress) -> None:
     """Compare all with all."""
     listed = Path(job.work) / PAIRS
     write_file(listed, "".join(f"{first} {second}\n" for first, second in combinations(job.order, 2)).encode())
     compare(listed, database, tell)
 
 
-def compare(listed: Path, database: Path, tell: Tell) -> None:
+def compare(listed: Path, database: Path, tell: StageProgress) -> None:
     """Compare the pairs of a list; those in the database are passed over."""
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = listed
@@ -57,7 +57,7 @@ def compare(listed: Path, database: Path, tell: Tell) -> None:
     tell("comparing photographs", total, total)
 
 
-def choose(job: Job, database: Path, tell: Tell) -> list[tuple[int, int]]:
+def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int]]:
     """Pairs of indices into `job.order`, the first index the smaller one."""
     count = len(job.order)
     if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
@@ -74,7 +74,7 @@ def choose(job: Job, database: Path, tell: Tell) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def likeness(job: Job, database: Path, tell: Tell) -> np.ndarray:
+def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
     """How many of their largest features two photographs share.
 
     Returns:

@@ -8,14 +8,14 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.capture.sfm import features, pairs
-from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses, Tell
+from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses, StageProgress
 from bitymi_ns.files import complete_folder
 
 LEAST = 10
 """Fewer points are none to start from."""
 
 
-def triangulate(job: Job, tell: Tell) -> dict[str, object]:
+def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:
     """Triangulate points from a job's photographs with their poses as they are, and write the model.
 
     Raises:

@@ -134,16 +134,18 @@ def _train(at: Layout, stage: Stage) -> dict[str, Any]:
 
 
 def _export(at: Layout, stage: Stage) -> dict[str, Any]:
+    from bitymi_ns.bundle.manifest import MANIFEST  # with torch, which the stages of other methods do without
+    from bitymi_ns.bundle.read import read_manifest
+
     folder = at.place("bundles", stage.form)
-    info = json.loads((folder / "bundle.json").read_text("utf8"))
-    files = {name: int(entry["bytes"]) for name, entry in info["files"].items()}
-    atlas = info.get("atlas")
+    info = read_manifest(folder)
+    files = {name: entry.bytes for name, entry in info.files.items()}
     return {
         "folder": at.relative(folder),
-        "bytes": sum(files.values()) + (folder / "bundle.json").stat().st_size,
+        "bytes": sum(files.values()) + (folder / MANIFEST).stat().st_size,
         "files": files,
-        "format": atlas["format"] if atlas else None,
-        "statistics": info["statistics"],
+        "format": info.atlas.format if info.atlas else None,
+        "statistics": info.statistics.model_dump(mode="json"),
     }
 
 

@@ -146,9 +146,7 @@ def _by_reference(case: SceneCase, near: float, rim: float = RIM) -> _Result:
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in SURFEL_KEYS]
-    result = reference_render.render(
-        *geometry, colors, case.viewmat, case.K, case.width, case.height, near=near, rim=rim
-    )
+    result = reference_render.render(geometry, colors, case, near=near, rim=rim)
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
     return _Result(images, result.trace.blended, result.trace.low_pass, leaves)
 
@@ -202,7 +200,7 @@ def _order(error: float) -> float:
 
 
 @dataclass(frozen=True)
-class Trust:
+class ExtendedErrors:
     """Errors against extended precision (`ops.reference.extended`), where even float64 may lose figures."""
 
     forward: float
@@ -212,7 +210,7 @@ class Trust:
     the root of the sum of squares of the products that it sums."""
 
 
-def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> Trust:
+def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> ExtendedErrors:
     """The float64 reference, or a backend in float64, against extended precision.
 
     Args:
@@ -230,8 +228,7 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
     plain = {key: rounded.params[key].numpy() for key in SURFEL_KEYS}
 
     def run(params: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], extended.Extended]:
-        view = (rounded.viewmat.numpy(), rounded.K.numpy(), case.width, case.height, near)
-        result = extended.render(*(params[key] for key in SURFEL_KEYS), *view)
+        result = extended.render([params[key] for key in SURFEL_KEYS], rounded, near)
         arrays = (result.alpha[:, None], result.depth[:, None], result.normal, result.beta[:, None])
         return dict(zip(names, arrays, strict=True)), result
 
@@ -252,4 +249,4 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
         products = grads[key].numpy() * direction
         size, error = math.sqrt((products**2).sum()), abs(slope - products.sum())
         worst = max(worst, error / size if size > NOTHING else error, key=_order)
-    return Trust(forward, worst)
+    return ExtendedErrors(forward, worst)

@@ -16,7 +16,7 @@ from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.stability.backends import BACKENDS, Backend
 from bitymi_ns.measure.stability.cases import cases
-from bitymi_ns.measure.stability.errors import PROBES, RIM, ROUNDING, Errors, Trust, against_extended, measure
+from bitymi_ns.measure.stability.errors import PROBES, RIM, ROUNDING, Errors, ExtendedErrors, against_extended, measure
 from bitymi_ns.measure.stability.scenes import SceneCase
 from bitymi_ns.measure.stability.sweeps import SWEEPS, Sweep
 from bitymi_ns.measure.templates import rendered
@@ -38,7 +38,7 @@ class Row:
     label: str
     single: Errors
     double: Errors
-    trust: Trust | None
+    trust: ExtendedErrors | None
 
     @property
     def verdict(self) -> str:

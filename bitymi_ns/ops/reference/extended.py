@@ -6,12 +6,14 @@ Trapp 1998): the imaginary part of the result over that of the input is exact to
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from bitymi_ns.ops.reference.project import BETA_MAX, LOG_SCALE_MAX
+from bitymi_ns.ops.reference.render import Camera
 from bitymi_ns.ops.reference.trace import ALPHA_MAX, ALPHA_MIN, SUPPORT, TRANSMITTANCE_MIN
 
 Array = npt.NDArray[np.clongdouble]
@@ -30,22 +32,12 @@ class Extended:
     low_pass: npt.NDArray[np.bool_]  # [P, N]
 
 
-def render(
-    means: npt.ArrayLike,
-    quats: npt.ArrayLike,
-    log_scales: npt.ArrayLike,
-    opacity_logits: npt.ArrayLike,
-    beta_raw: npt.ArrayLike,
-    viewmat: npt.ArrayLike,
-    K: npt.ArrayLike,
-    width: int,
-    height: int,
-    near: float = 0.2,
-) -> Extended:
+def render(geometry: Sequence[npt.ArrayLike], camera: Camera, near: float = 0.2) -> Extended:
     """Every pixel against every surfel, as `reference.render`; arguments as there, real or complex, no colours."""
     mean, q, logs, logit, raw, view, k = (
-        np.asarray(a, dtype=np.clongdouble) for a in (means, quats, log_scales, opacity_logits, beta_raw, viewmat, K)
+        np.asarray(a, dtype=np.clongdouble) for a in (*geometry, camera.viewmat, camera.K)
     )
+    width, height = camera.width, camera.height
     known = (q.real != 0).any(-1)
     q = np.where(known[:, None], q, np.clongdouble(1))
     q = q / np.abs(q.real).max(-1, keepdims=True)

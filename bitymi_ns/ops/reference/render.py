@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -11,6 +12,15 @@ from torch import Tensor
 from bitymi_ns.ops.reference.project import project, unit
 from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.ops.reference.trace import Trace, trace
+
+
+class Camera(Protocol):
+    """A pinhole camera: viewmat [4, 4] world to camera with OpenCV axes, K [3, 3] in pixels, and the image's size."""
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
 
 
 @dataclass
@@ -32,16 +42,9 @@ def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
 
 
 def render(
-    means: Tensor,
-    quats: Tensor,
-    log_scales: Tensor,
-    opacity_logits: Tensor,
-    beta_raw: Tensor,
+    geometry: Sequence[Tensor],
     colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
+    camera: Camera,
     background: Tensor | None = None,
     tiles: Sequence[Tensor] | None = None,
     residual: Callable[[Tensor], Tensor] | None = None,
@@ -52,14 +55,17 @@ def render(
     """Render surfels; colour of a fragment: ReLU(f_view + 0.5), then ReLU(that + texture) where there is a texture.
 
     Args:
-        means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near: see `project`.
-        rim, prefilter: see `trace`.
+        geometry: means, quats, log_scales, opacity_logits, beta_raw, see `project`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
+        camera: viewmat, K, see `project`, and the size of the image in pixels.
         background: [3], black if not given.
         tiles: one texture tile [r_v, r_u, 3] per surfel.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
+        near: see `project`.
+        rim, prefilter: see `trace`.
     """
-    p = project(means, quats, log_scales, opacity_logits, beta_raw, viewmat, K, near)
+    width, height = camera.width, camera.height
+    p = project(*geometry, camera.viewmat, camera.K, near)
     t = trace(p, width, height, near, rim, prefilter)
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]

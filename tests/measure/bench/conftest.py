@@ -7,9 +7,13 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from bitymi_ns.bake.quantise import Format
+from bitymi_ns.bundle import World
+from bitymi_ns.bundle.manifest import describe, dump
 from bitymi_ns.measure.bench import Bundle, Matrix, Row, SceneSpec
 
 FAKE = """#!{python} -SE
@@ -40,11 +44,7 @@ if name == "ns-train":
 elif name == "ns-export":
     bundle = pathlib.Path(given("--output-dir"))
     bundle.mkdir(parents=True)
-    files = dict(zip(["surfels.ply", "atlas.ktx2"], [dict(bytes=1000), dict(bytes=5000)]))
-    info = dict(files=files, atlas=dict(format=given("--format"), file="atlas.ktx2"), statistics=dict(
-        surfels=dict(kept=100), texels=dict(nyquist=9999, after_cap_by_views=1600),
-        held_out=dict(psnr_baked_against_neural=50.0)))
-    (bundle / "bundle.json").write_text(json.dumps(info))
+    (bundle / "bundle.json").write_text({manifests!r}[given("--format")])
     (bundle / "config.yml").write_text("config")
 elif name == "ns-eval":
     assert pathlib.Path(given("--load-config")).is_file()
@@ -65,6 +65,28 @@ else:
                  psnr_exact=60.0, psnr=21.0, ms=5.0, cpu_ms=9.0, bytes=5000)
     pathlib.Path(given("--output")).write_text(json.dumps(point) + "\\n")
 """
+
+
+def manifest(format: str) -> str:
+    """bundle.json of a scene of 100 surfels."""
+    files = {name: {"bytes": size, "sha256": "0" * 64} for name, size in (("surfels.ply", 1000), ("atlas.ktx2", 5000))}
+    info = {
+        "version": "1.3",
+        "surfels": {"count": 100, "view_color": "sv", "sites": 7},
+        "atlas": {"format": format, "width": 64, "height": 64, "layers": 1, "offset": 0.0, "scale": 1.0},
+        "render": {"near": 0.2, "weight_bound": 0.02, "background": [0.0, 0.0, 0.0]},
+        "world": World().described(),
+        "bounds": {"min": [0.0] * 3, "max": [1.0] * 3},
+        "statistics": {
+            "surfels": {"kept": 100},
+            "texels": {"nyquist": 9999, "after_cap_by_views": 1600},
+            "held_out": {"psnr_baked_against_neural": 50.0},
+        },
+        "files": files,
+    }
+    return dump(describe(info)).decode()
+
+
 TOOLS = ("ns-train", "ns-export", "ns-eval", "bitymi")
 
 
@@ -76,7 +98,8 @@ class Fakes:
         self.log, self.plan, self.slow = folder / "log", folder / "fail", folder / "slow"
         for file in (self.log, self.plan, self.slow):
             file.write_text("")
-        text = FAKE.format(python=sys.executable, log=str(self.log), plan=str(self.plan), slow=str(self.slow))
+        paths = {"log": str(self.log), "plan": str(self.plan), "slow": str(self.slow)}
+        text = FAKE.format(python=sys.executable, manifests={f: manifest(f) for f in get_args(Format)}, **paths)
         for name in TOOLS:
             (folder / name).write_text(text)
             (folder / name).chmod(0o755)

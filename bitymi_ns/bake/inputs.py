@@ -19,7 +19,7 @@ from bitymi_ns.scene.camera import Camera
 
 
 @dataclass(frozen=True)
-class Subject:
+class BakeInput:
     """Surfels and the views of them.
 
     Attributes:
@@ -48,12 +48,12 @@ class Subject:
         nothing = torch.zeros(0, len(means), dtype=torch.bool, device=means.device)
         return nothing if self.views is None else self.views.seen
 
-    def of(self, rows: Tensor) -> Subject:
+    def of(self, rows: Tensor) -> BakeInput:
         """Some of the surfels."""
         surfels = {name: value[rows] for name, value in self.surfels.items()}
         return replace(self, surfels=surfels, views=None if self.views is None else self.views.of(rows))
 
-    def looked_at(self, options: BakeOptions, progress: Progress = no_progress) -> Subject:
+    def looked_at(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
         """With what the cameras see, where there are any and the options need it."""
         if not self.cameras or not options.looks_at_views:
             return self

@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
 from bitymi_ns.bake.lean_field import lean_field
 from bitymi_ns.bake.options import BakeOptions
@@ -16,7 +17,6 @@ from bitymi_ns.bake.pages import tile_means
 from bitymi_ns.bake.plan import Field, Plan, kernel_parameters, make_plan
 from bitymi_ns.bake.reduce import reduce_tiles
 from bitymi_ns.bake.statistics import FieldLevels, ViewColorError
-from bitymi_ns.bake.subject import Subject
 from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.progress import Progress
@@ -47,68 +47,68 @@ class Tiles:
         return cls(pack(torch.zeros(count, 2)), None, torch.full((count,), extent), torch.zeros(count, 3))
 
 
-class Way(Protocol):
+class BakeMethod(Protocol):
     """How a scene is baked, step by step."""
 
-    def field(self, field: Field, subject: Subject) -> tuple[Field, FieldLevels | None]:
+    def field(self, field: Field, inputs: BakeInput) -> tuple[Field, FieldLevels | None]:
         """The field that the bake evaluates, and what was left out of it; None = nothing is looked for."""
 
-    def plan(self, field: Field, subject: Subject) -> Plan:
+    def plan(self, field: Field, inputs: BakeInput) -> Plan:
         """What the tiles have to hold."""
 
-    def tiles(self, field: Field, plan: Plan, subject: Subject, progress: Progress) -> Tiles:
+    def tiles(self, field: Field, plan: Plan, inputs: BakeInput, progress: Progress) -> Tiles:
         """The tiles, packed, with their texels."""
 
-    def view_color(self, subject: Subject, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError | None]:
+    def view_color(self, inputs: BakeInput, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError | None]:
         """The surfels with the view colours that are kept, and what that costs; None = all are."""
 
 
 @dataclass(frozen=True)
-class ByTheRule:
+class PaperBake:
     """The paper's bake: sizes by the Nyquist rule, the field at the texel centres, all of the view colours."""
 
     options: BakeOptions
 
-    def field(self, field: Field, subject: Subject) -> tuple[Field, None]:
+    def field(self, field: Field, inputs: BakeInput) -> tuple[Field, None]:
         """The field as it is."""
         return field, None
 
-    def plan(self, field: Field, subject: Subject) -> Plan:
+    def plan(self, field: Field, inputs: BakeInput) -> Plan:
         """Tiles of the extent and the texels that the options give."""
-        return _plan(field, subject, self.options, whole=True)
+        return _plan(field, inputs, self.options, whole=True)
 
-    def tiles(self, field: Field, plan: Plan, subject: Subject, progress: Progress) -> Tiles:
+    def tiles(self, field: Field, plan: Plan, inputs: BakeInput, progress: Progress) -> Tiles:
         """One for every surfel."""
-        o, p = self.options, subject.surfels
+        o, p = self.options, inputs.surfels
         packing = pack(plan.limit.cpu(), o.page_width, o.page_rows)
         geometry = (p["means"], p["quats"], p["log_scales"].exp())
         texels, nonfinite = evaluate_tiles(field, *geometry, packing, o.extent, o.chunk, progress)
         extent = torch.full((len(plan),), o.extent)
         return Tiles(packing, texels, extent, tile_means(texels, packing), nonfinite)
 
-    def view_color(self, subject: Subject, progress: Progress) -> tuple[dict[str, Tensor], None]:
+    def view_color(self, inputs: BakeInput, progress: Progress) -> tuple[dict[str, Tensor], None]:
         """All of it."""
-        return dict(subject.surfels), None
+        return dict(inputs.surfels), None
 
 
 @dataclass(frozen=True)
-class WithinTolerance:
+class ToleranceBake:
     """The least that keeps the tolerance: levels of the field, extents and grids of tiles, sites of view colours."""
 
     options: BakeOptions
 
-    def field(self, field: Field, subject: Subject) -> tuple[Field, FieldLevels | None]:
+    def field(self, field: Field, inputs: BakeInput) -> tuple[Field, FieldLevels | None]:
         """The levels that some surfel needs."""
         if not isinstance(field, HashField):
             return field, None
-        at = (subject.surfels, subject.transmittance, subject.weight_bound)
+        at = (inputs.surfels, inputs.transmittance, inputs.weight_bound)
         return lean_field(field, *at, self.options.tolerance)
 
-    def plan(self, field: Field, subject: Subject) -> Plan:
+    def plan(self, field: Field, inputs: BakeInput) -> Plan:
         """Tiles of what can be seen."""
-        return _plan(field, subject, self.options, whole=False)
+        return _plan(field, inputs, self.options, whole=False)
 
-    def tiles(self, field: Field, plan: Plan, subject: Subject, progress: Progress) -> Tiles:
+    def tiles(self, field: Field, plan: Plan, inputs: BakeInput, progress: Progress) -> Tiles:
         """Of the smallest grid that holds the field, or none."""
         o = self.options
         reduced = reduce_tiles(field, plan, o.tolerance, o.r_min, o.chunk, progress)
@@ -118,23 +118,23 @@ class WithinTolerance:
         means = tile_means(texels, packing, reduced.constant)
         return Tiles(packing, texels if packing.texels else None, extent, means, reduced.nonfinite)
 
-    def view_color(self, subject: Subject, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError]:
+    def view_color(self, inputs: BakeInput, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError]:
         """As few sites as hold every surfel's colour; see `lean_color.reduce_view_color`."""
-        surfels, tolerance = subject.surfels, self.options.tolerance
+        surfels, tolerance = inputs.surfels, self.options.tolerance
         kind, means = kind_of(surfels), surfels["means"]
-        opacity, _ = kernel_parameters(surfels, subject.transmittance)
-        at = (subject.seen, centers_of(subject.cameras, means), opacity)
+        opacity, _ = kernel_parameters(surfels, inputs.transmittance)
+        at = (inputs.seen, centers_of(inputs.cameras, means), opacity)
         lean = reduce_view_color(surfels, kind, *at, tolerance, progress)
         error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
         kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind].names}
         return kept | lean.parameters(), describe(kind, surfels, lean, error, tolerance)
 
 
-def way_of(options: BakeOptions) -> Way:
+def bake_method(options: BakeOptions) -> BakeMethod:
     """The way that the options ask for: nothing after this asks whether there is a tolerance."""
-    return WithinTolerance(options) if options.tolerance > 0 else ByTheRule(options)
+    return ToleranceBake(options) if options.tolerance > 0 else PaperBake(options)
 
 
-def _plan(field: Field, subject: Subject, options: BakeOptions, whole: bool) -> Plan:
-    at = (subject.cameras, subject.transmittance, subject.near, subject.weight_bound)
-    return make_plan(subject.surfels, field, options, *at, whole)
+def _plan(field: Field, inputs: BakeInput, options: BakeOptions, whole: bool) -> Plan:
+    at = (inputs.cameras, inputs.transmittance, inputs.near, inputs.weight_bound)
+    return make_plan(inputs.surfels, field, options, *at, whole)

@@ -39,13 +39,13 @@ BT_HD LevelSet<S> level_set(const S* g) {
 }
 
 template <class S>
-struct Reach : Outline<S> {
+struct PlaneBounds : Outline<S> {
   S xu = S(0), xv = S(0), yu = S(0), yv = S(0), cu = S(0), cv = S(0);  // X, Y, C
 };
 
 // Box and outermost points from X, Y and C.
 template <class S>
-BT_HD void enclose(Reach<S>& e) {
+BT_HD void bounding_box(PlaneBounds<S>& e) {
   const S cc = e.cu * e.cu + e.cv * e.cv, rest = S(1) - cc;
   const S xx = e.xu * e.xu + e.xv * e.xv, yy = e.yu * e.yu + e.yv * e.yv;
   e.whole = !(rest > S(1e-3) && xx < S(1e16) && yy < S(1e16));  // also for NaN
@@ -67,8 +67,8 @@ BT_HD void enclose(Reach<S>& e) {
 
 // r2 and blur2 are those of level_set.
 template <class S>
-BT_HD Reach<S> reach(const S* g, S r2, S blur2) {
-  Reach<S> e;
+BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2) {
+  PlaneBounds<S> e;
   if (blur2 > S(0)) e.blur = low_pass_radius(blur2);
   if (!(g[kW0] > S(0))) return e;  // seen exactly edge-on: no ray hits it
   e.ellipse = true;
@@ -82,37 +82,37 @@ BT_HD Reach<S> reach(const S* g, S r2, S blur2) {
   e.yu = -ku * v1, e.yv = kv * u1;
   e.cu = (g[kW2] * v1 - g[kW1] * v2) * mu * inv * r;
   e.cv = (g[kW1] * u2 - g[kW2] * u1) * mv * inv * r;
-  enclose(e);
+  bounding_box(e);
   e.whole = e.whole || !(angle > S(1e-6));
   return e;
 }
 
 // Seen through a pixel: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
 template <class S>
-struct FilteredReach {
+struct FilteredBounds {
   bool visible;
-  Reach<S> reach;
+  PlaneBounds<S> bounds;
 };
 template <class S>
-BT_HD FilteredReach<S> filtered_reach(const S* geom) {
+BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
   const Extent x = filtered_extent(g);
-  FilteredReach<S> f;
+  FilteredBounds<S> f;
   f.visible = x.visible;
-  Reach<S>& e = f.reach;
+  PlaneBounds<S>& e = f.bounds;
   e.whole = x.visible && x.whole, e.ellipse = x.visible;
   if (!x.visible || x.whole) return f;
   // d^T Q d <= r^2 is the disc's image under r L with L L^T = Q^-1
   const double r2 = -x.qf * 1.0003, inv = r2 / (x.qa * x.qc - x.qb * x.qb), top = x.qc * inv;
   e.xu = S(sqrt_(top)), e.yu = S(-x.qb * inv / sqrt_(top)), e.yv = S(sqrt_(r2 / x.qc));
-  enclose(e);
+  bounding_box(e);
   return f;
 }
 
 // Adds where the line y crosses the ellipse.
 template <class S>
-BT_HD void add_crossings(const Reach<S>& e, S y, Interval<S>& r) {
+BT_HD void add_crossings(const PlaneBounds<S>& e, S y, Interval<S>& r) {
   const S mu = e.yu - y * e.cu, mv = e.yv - y * e.cv, mm = mu * mu + mv * mv;
   if (!(mm > S(0)) || !(y * y <= mm)) return;
   const S k = S(1) / mm, at = y * k, half = sqrt_(max_(S(1) - y * at, S(0)) * k);

@@ -1,0 +1,56 @@
+"""Scenes and bounds of the tests of the baked renderer."""
+
+from __future__ import annotations
+
+import torch
+
+from bitymi_ns.scene import Camera
+from bitymi_ns.scene.baked import BakedScene
+from tests.bake.conftest import make_surfels
+from tests.ops.golden import SceneCase
+
+FLIP = 4 / 255
+"""By which a colour on a card may differ: its special function unit takes exponentials and logarithms to about 2^-21. A
+fragment whose opacity is 1/255 to within that is drawn there and not here, and colours are below 4."""
+
+
+def camera_of(case: SceneCase) -> Camera:
+    return Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
+
+
+def scene_of(case: SceneCase, **kwargs) -> BakedScene:
+    params = {name: value.float() for name, value in case.params.items()}
+    return BakedScene(params, "sv", torch.zeros(len(params["means"]), 5, dtype=torch.int32), None, **kwargs)
+
+
+def textured(count: int, seed: int, dtype: torch.dtype = torch.uint8, kind: str = "sv") -> BakedScene:
+    """Surfels about the origin, two thirds with a tile of random texels, on two pages, with random extents."""
+    g = torch.Generator().manual_seed(seed)
+    atlas = torch.rand(2, 16, 16 * count, 4, generator=g)
+    atlas = (atlas * 255).to(torch.uint8) if dtype == torch.uint8 else atlas
+    i = torch.arange(count)
+    sizes = 4 << torch.randint(0, 3, (count, 2), generator=g)
+    tiles = torch.stack([16 * i, 0 * i, i % 2, *sizes.unbind(1)], dim=1)
+    tiles[::3] = 0
+    return BakedScene(
+        make_surfels(count, kind, seed),
+        kind,
+        tiles.int(),
+        atlas,
+        offset=-0.4,
+        scale=0.9,
+        extent=1.5 + 2 * torch.rand(count, generator=g),
+        mean_residual=0.5 * torch.randn(count, 3, generator=g) * (i % 2 == 0)[:, None],
+        weight_bound=0.02,
+    )
+
+
+def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = distance
+    return Camera(viewmat, torch.tensor([[60.0, 0, width / 2], [0, 55.0, height / 2], [0, 0, 1]]), width, height)
+
+
+def most(device: torch.device, emulated: float, card: float) -> float:
+    """The bound for that device."""
+    return card if device.type == "cuda" else emulated

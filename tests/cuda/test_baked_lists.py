@@ -1,0 +1,139 @@
+"""The baked renderer on CUDA: which surfels each tile lists, in which order, and what does not fit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked_renderer import BakedRenderer
+from tests.bake.conftest import make_surfels
+from tests.cuda.baked_scenes import FLIP, camera_of, front, most, scene_of
+from tests.ops.golden import random_scene
+
+
+def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, views: int) -> list[Tensor]:
+    """The surfels that each tile lists after a frame, numbered through all views.
+
+    They must be front to back, those of one depth by their number, each once; the lists must not overlap and hold all
+    pairs that fit.
+    """
+    memory, at = renderer.workspace.memory.cpu(), 256
+    tiles, rows, capacity = -(-width // 16) * -(-height // 16) * views, surfels * views, renderer.workspace.capacity
+
+    def take(count: int) -> Tensor:
+        nonlocal at
+        values = memory[at : at + 4 * count].view(torch.int32)
+        at += -(-4 * count // 256) * 256
+        return values
+
+    ranges = take(2 * tiles).view(tiles, 2)
+    take(24 * rows)
+    depth, pairs = take(rows).long() & 0xFFFFFFFF, take(-(-capacity // 8) * 8).long() & 0xFFFFFFFF
+    order = ranges[ranges[:, 0].argsort(stable=True)]
+    order = order[order[:, 0] < order[:, 1]]
+    assert order[0, 0] == 0 and torch.equal(order[1:, 0], order[:-1, 1])
+    assert order[-1, 1] == min(renderer.workspace.pairs, len(pairs))
+    lists = [pairs[begin:end] >> 8 for begin, end in ranges.tolist()]
+    for rows_of_tile in lists:
+        keys = depth[rows_of_tile] * 2**24 + rows_of_tile
+        assert (keys.diff() > 0).all()
+    return lists
+
+
+@pytest.mark.parametrize("count", [5, 140])
+def test_large_surfels(count: int, device: torch.device, cpu) -> None:
+    """More rows of tiles per surfel, and per block, than the block has threads, between small surfels."""
+    case = random_scene(count, 20, width=90, height=360)
+    case.params["log_scales"][::2] += 3.0
+    case.params["opacity_logits"] -= 4.0  # so that few pixels end before the last surfel
+    scene, camera = scene_of(case), camera_of(case)
+    renderer = BakedRenderer(scene.to(device), camera.width, camera.height, images=("overdraw",))
+    got = renderer.draw([camera])["overdraw"].cpu()
+    assert renderer.workspace.pairs > 40 * count
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
+
+
+@pytest.mark.parametrize("seed, prefilter", [*((i, "low_pass") for i in range(6)), (0, "pixel"), (1, "pixel")])
+def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: str, device: torch.device, cpu) -> None:
+    """The bounds in single precision (core/plane_bounds.h) against the CPU's in double: the same fragments."""
+    case = random_scene(150, 100 + seed, width=72, height=56)
+    g = torch.Generator().manual_seed(seed)
+    case.params["log_scales"] += 2.0 * torch.randn(150, 2, generator=g, dtype=torch.float64)
+    case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
+    scene, camera = scene_of(case, prefilter=prefilter), camera_of(case)
+    got = scene.to(device).render(camera, maps=True).overdraw.cpu()
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
+
+
+def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu) -> None:
+    case = random_scene(12, 0, width=70, height=60)
+    case.params["log_scales"] += 3.0  # every surfel on nearly every tile
+    case.params["opacity_logits"] -= 3.0
+    scene, camera = scene_of(case).to(device), camera_of(case)
+    renderer = BakedRenderer(scene, camera.width, camera.height, images=("rgb",))
+    small = renderer.workspace.capacity
+    renderer.draw([camera], check=False)
+    assert not renderer.complete() and renderer.workspace.pairs > small
+    lists_of(renderer, 12, camera.width, camera.height, 1)
+    rgb = renderer.draw([camera])["rgb"].clone()
+    assert renderer.complete() and renderer.workspace.capacity > renderer.workspace.pairs
+    again = renderer.draw([camera])["rgb"]
+    assert torch.equal(rgb, again) and again.data_ptr() == renderer.images["rgb"].data_ptr()
+    with cpu():
+        want = scene_of(case).render(camera).rgb
+    off = (rgb[0].cpu() - want).abs()
+    assert off.max() < most(device, 1e-4, FLIP) and (off < 1e-4).double().mean() > 0.999
+    torch.testing.assert_close(scene.render(camera).rgb, rgb[0], atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("count", [1, 31, 33, 65, 128, 300, 600, 1024, 1025, 3000])
+def test_lists_of_all_lengths_are_in_order(count: int, views: int, device: torch.device, cpu) -> None:
+    """Up to several runs of what a block sorts at once, with ties in depth, beside tiles without a surfel."""
+    surfels = make_surfels(count, seed=30)
+    surfels["means"] *= 0.05  # in the middle
+    surfels["means"][count // 2 :, 2] = surfels["means"][0, 2]
+    surfels["log_scales"] += 1.0
+    surfels["opacity_logits"] = surfels["opacity_logits"] - 3.0
+    scene = BakedScene(surfels, "sv", torch.zeros(count, 5, dtype=torch.int32), None, transmittance_min=0.0)
+    camera = front(170, 20)
+    renderer = BakedRenderer(scene.to(device), 170, 20, views, images=("rgb", "overdraw"))
+    images = renderer.draw([camera] * views)
+    lists = lists_of(renderer, count, 170, 20, views)
+    lengths = [len(each) for each in lists]
+    assert max(lengths) > 0.9 * count and min(lengths) == 0
+    with cpu():
+        want = scene.render(camera, maps=True)
+    for view in range(views):
+        off = (images["rgb"][view].cpu() - want.rgb).abs()
+        assert off.max() < most(device, 1e-4, FLIP) and (off < 1e-4).double().mean() > 0.999
+        assert ((images["overdraw"][view].cpu() != want.overdraw).double().mean()) < 2e-3
+        per_view = len(lists) // views
+        assert [len(each) for each in lists[view * per_view : (view + 1) * per_view]] == lengths[:per_view]
+
+
+def test_many_tiles(device: torch.device) -> None:
+    """The tiles that a narrower image has as well must get the same lists."""
+    case = random_scene(30, 9, 1_000, 20)
+    scene, ranges = scene_of(case).to(device), []
+    for width in (1_000, 600_000):
+        renderer = BakedRenderer(scene, width, 20)
+        renderer._resize(2_000)
+        renderer._viewmats.copy_(case.viewmat)
+        renderer._Ks.copy_(case.K)
+        renderer.run(Stage.PREPARE)
+        renderer.run(Stage.BIN)
+        assert 100 < renderer.workspace.pairs <= renderer.workspace.capacity
+        across = -(-width // 16)
+        all_ranges = renderer.workspace.memory[256 : 256 + 8 * 2 * across].view(torch.int32).view(2, across, 2)
+        ranges.append(all_ranges.diff(dim=-1)[..., 0].cpu())
+        assert ranges[-1].sum() == renderer.workspace.pairs and (ranges[-1] >= 0).all()
+    narrow = ranges[0].shape[1] - 1  # the last tile is cut by the narrow image
+    assert torch.equal(ranges[0][:, :narrow], ranges[1][:, :narrow])

@@ -32,7 +32,7 @@ from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.host.poses import check_cloud, check_places, warn_of_mirrored
 from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
 from bitymi_ns.host.transforms import corrected_files
-from bitymi_ns.train.memory import OnDemand, Room
+from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.views import View, training_order
 
 FEW_VIEWS = 10
@@ -101,7 +101,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         local_rank: int = 0,
         **kwargs: Any,
     ) -> None:
-        self._room = Room(PHOTOGRAPH_BYTES)
+        self._budget = MemoryBudget(PHOTOGRAPH_BYTES)
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         allow_large_photographs()
         cloud = check_capture(config, images=test_mode != "inference")
@@ -224,7 +224,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         if torch.device(self.device).type == "cpu":
             images = Photographs(
-                dataset, self.config.cache_images_type, self._room, self.config, f"Reading the {split} images"
+                dataset, self.config.cache_images_type, self._budget, self.config, f"Reading the {split} images"
             )
         else:
             with reporting_input_errors(self.config):

@@ -14,7 +14,7 @@ from rich.progress import track
 
 from bitymi_ns.host.capture import reporting_input_errors
 from bitymi_ns.host.dataset import BitymiDataset
-from bitymi_ns.train.memory import Room
+from bitymi_ns.train.memory import MemoryBudget
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the photographs of a capture, training and held-out views together."""
@@ -34,7 +34,7 @@ class Photographs(Sequence):
     Args:
         dataset: with the cameras of the files.
         image_type: of the pixels.
-        room: for the pictures, shared with other datasets.
+        budget: for the pictures, shared with other datasets.
         config: of the data manager, for messages.
         description: of what is being read, for the progress bar.
     """
@@ -43,7 +43,7 @@ class Photographs(Sequence):
         self,
         dataset: BitymiDataset,
         image_type: Literal["uint8", "float32"],
-        room: Room,
+        budget: MemoryBudget,
         config: Any,
         description: str,
     ) -> None:
@@ -58,7 +58,7 @@ class Photographs(Sequence):
                 indices = range(len(dataset))[start : start + AT_ONCE]
                 for index, (batch, K) in zip(indices, list(readers.map(self._read, indices)), strict=True):
                     _set_camera(dataset, index, batch["image"], K)
-                    if room.take(sum(value.nbytes for value in batch.values() if isinstance(value, torch.Tensor))):
+                    if budget.reserve(sum(value.nbytes for value in batch.values() if isinstance(value, torch.Tensor))):
                         self._kept[index] = batch
 
     def __len__(self) -> int:

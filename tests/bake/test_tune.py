@@ -178,9 +178,9 @@ def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], mon
         kept.append(nbytes if fits else 0)
         return fits
 
-    take = MemoryBudget.take
+    take = MemoryBudget.reserve
     monkeypatch.setattr(TexelScene, "view", counted)
-    monkeypatch.setattr(MemoryBudget, "take", keep)
+    monkeypatch.setattr(MemoryBudget, "reserve", keep)
     budget = sum(view.nbytes for view in set_aside)
     tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, steps=8, cache_bytes=budget))
     assert all(traced.count(i) == 1 for i in range(0, 12, 4)), "looked at most often, and traced once"

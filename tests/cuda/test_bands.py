@@ -31,7 +31,7 @@ def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: 
     want = scene.render(camera)
     assert want.fragments.layout.pairs < 500
     monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
-    monkeypatch.setattr(trace_cuda, "room", lambda geom: 2 * fit)
+    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: 2 * fit)
     if fit == 500:
         with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments.*, and there is room for 1,000"):
             scene.render(camera)

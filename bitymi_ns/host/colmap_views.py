@@ -19,7 +19,7 @@ from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from bitymi_ns.capture.masks import USUAL_FOLDERS, mask_folder, mask_of, smaller_masks
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS, of_header
@@ -47,11 +47,13 @@ class Origin:
         path: the folder that was searched for photographs, or the video, seen from the capture.
         photographs: folder of the photographs, seen from the capture; None = those of the model are upright copies or
             frames, in a folder that can go.
+        settings: with which the poses were found; None = they are not known.
     """
 
     kind: Literal["photographs", "video"]
     path: str
     photographs: str | None
+    settings: SfmSettings | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -24,7 +23,7 @@ from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS, of_header
 from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
-from bitymi_ns.host.poses import check_spread
+from bitymi_ns.host.poses import check_spread, oriented
 
 
 @dataclass(frozen=True)
@@ -250,8 +249,7 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
     if place.auto_scale_poses:
         check_spread(c2w[:, :3, 3], str(source.folder))
     there = torch.from_numpy(c2w.astype(np.float32))
-    _, transform = auto_orient_and_center_poses(there, place.orientation_method, place.center_method)
-    poses = transform @ there  # nerfstudio 1.1.5 turns two of its own the wrong way round with pca
+    poses, transform = oriented(there, place.orientation_method, place.center_method)
     scale = place.scale_factor
     if place.auto_scale_poses:
         scale /= float(poses[:, :3, 3].abs().max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,7 +27,9 @@ FEWEST, MOST = 20, 300
 STILL = 0.02
 """Motion over the whole video, in units of the longer side, below which the camera stood still."""
 PER_SECOND = 15
-"""Frames looked at per second; of faster videos every second or third."""
+"""Frames looked at per second by their times, because phones film with a rate that varies with the light."""
+LOOKED_AT = 60
+"""Frames looked at where a video has as many: all of a clip of a second or two."""
 
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress) -> Path:
@@ -90,10 +93,13 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
     motion: list[float] = []
     sharp: list[float] = []
     before: np.ndarray | None = None
-    step, total = _step(video)
+    last = -math.inf
+    gap, rate, total = _pace(video)
     for number, frame, _ in _frames(video):
-        if number % step:
+        time = number / rate if frame.time is None else frame.time
+        if 0.0 <= time - last < gap:  # times that run backwards are no reason to pass over what follows
             continue
+        last = time
         small = frame.reformat(*_size(frame, FINE), format="gray8").to_ndarray().astype(np.float32)
         sharp.append(sharpness(small) * float(np.sqrt(np.mean(np.diff(small, axis=1) ** 2))))
         factor = max(1, round(max(small.shape) / SMALL))
@@ -138,13 +144,16 @@ def _between(line: np.ndarray, at: int) -> float:
     return float(at + (0.5 * (low - high) / curve if curve < 0 else 0.0))
 
 
-def _step(video: Path) -> tuple[int, int]:
-    """Every how many frames one is looked at, and how many frames there are, roughly."""
+def _pace(video: Path) -> tuple[float, float, int]:
+    """Seconds from one frame that is looked at to the next one at least, the mean rate in frames per second, and how
+    many frames there are, roughly."""
     with _opened(video) as container:
         stream = container.streams.video[0]
         rate = float(stream.average_rate or 30)
         length = float(container.duration or 0) / 1e6
-        return max(1, round(rate / PER_SECOND)), max(1, stream.frames or round(rate * length))
+        total = max(1, stream.frames or round(rate * length))
+        gap = min(1.0 / PER_SECOND, total / rate / LOOKED_AT)
+        return gap - 0.5 * min(gap, 1.0 / rate), rate, total  # the nearest frame to the due time, not the next one
 
 
 def _opened(video: Path) -> av.container.InputContainer:

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -19,12 +18,12 @@ from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from bitymi_ns.capture.masks import USUAL_FOLDERS, mask_folder, mask_of, smaller_masks
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.images import THREADS, of_header
 from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
-from bitymi_ns.host.poses import check_spread
+from bitymi_ns.host.poses import check_spread, oriented
 
 
 @dataclass(frozen=True)
@@ -47,11 +46,13 @@ class Origin:
         path: the folder that was searched for photographs, or the video, seen from the capture.
         photographs: folder of the photographs, seen from the capture; None = those of the model are upright copies or
             frames, in a folder that can go.
+        settings: with which the poses were found; None = they are not known.
     """
 
     kind: Literal["photographs", "video"]
     path: str
     photographs: str | None
+    settings: SfmSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -248,8 +249,7 @@ def views(source: Source, place: Place, points: bool, look: bool, announce: bool
     if place.auto_scale_poses:
         check_spread(c2w[:, :3, 3], str(source.folder))
     there = torch.from_numpy(c2w.astype(np.float32))
-    _, transform = auto_orient_and_center_poses(there, place.orientation_method, place.center_method)
-    poses = transform @ there  # nerfstudio 1.1.5 turns two of its own the wrong way round with pca
+    poses, transform = oriented(there, place.orientation_method, place.center_method)
     scale = place.scale_factor
     if place.auto_scale_poses:
         scale /= float(poses[:, :3, 3].abs().max())

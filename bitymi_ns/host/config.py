@@ -148,6 +148,10 @@ class BitymiTrainerConfig(TrainerConfig):
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
             self._take_poses_of(Path(checkpoints_of).expanduser().absolute().parent)
+            dataparser = self.pipeline.datamanager.dataparser
+            poses = getattr(dataparser, "poses", None)
+            if poses is not None and kept_poses.are_in(Path(poses)):
+                dataparser.sfm = kept_poses.settings_in(Path(poses), dataparser.sfm)
         elif isinstance(self.pipeline.datamanager.dataparser, BitymiDataParserConfig):
             self.pipeline.datamanager.dataparser.poses = None
 

@@ -29,7 +29,7 @@ from bitymi_ns.host.images import allow_large_photographs, check_orientation, fi
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES, Photographs
 from bitymi_ns.host.ply import colours
 from bitymi_ns.host.point_cloud import reporting_time
-from bitymi_ns.host.poses import check_cloud, check_places, warn_of_mirrored
+from bitymi_ns.host.poses import check_cloud, check_places, orienting_all, warn_of_mirrored
 from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
@@ -108,6 +108,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         with (
             reporting_input_errors(config),
             corrected_files(config.dataparser),
+            orienting_all(),
             checked_models(config.dataparser),
             reporting_time("Reading", cloud.points),
         ):

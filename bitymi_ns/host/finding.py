@@ -48,7 +48,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the folder of the work
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
-    origin = Origin(found.format, os.path.relpath(found.path, found.folder), photographs)
+    origin = Origin(found.format, os.path.relpath(found.path, found.folder), photographs, settings)
     return replace(source, report=poses.report, origin=origin)
 
 

@@ -7,14 +7,15 @@ import os
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from bitymi_ns.capture.recognise import Found
+from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.colmap_views import Origin, Source
-from bitymi_ns.host.errors import fail, listed
+from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import THREADS, of_header
 
 MODEL = Path("sparse/0")
@@ -72,7 +73,10 @@ def read(folder: Path) -> KeptPoses | None:
         return None
     try:
         values: dict[str, Any] = json.loads(path.read_text("utf8"))
-        origin, left_out = Origin(**values["origin"]), dict(values["left_out"])
+        entries, left_out = dict(values["origin"]), dict(values["left_out"])
+        if entries.get("settings") is not None:  # runs of earlier versions do not state them
+            entries["settings"] = SfmSettings(**entries["settings"])
+        origin = Origin(**entries)
         if origin.kind not in ("photographs", "video"):
             raise ValueError(f"it is of {origin.kind}")
     except (OSError, ValueError, LookupError, TypeError) as error:
@@ -82,6 +86,29 @@ def read(folder: Path) -> KeptPoses | None:
             error,
         )
     return KeptPoses(folder, origin, left_out)
+
+
+def settings_in(folder: Path, given: SfmSettings) -> SfmSettings:
+    """The settings with which the poses in this folder were found; says which of those that were given are not used.
+
+    Args:
+        folder: of kept poses.
+        given: settings of a run that reads them; a default counts as not given.
+    """
+    kept = read(folder)
+    found = None if kept is None else kept.origin.settings
+    unused = []
+    for each in fields(SfmSettings):
+        value = getattr(given, each.name)
+        if value not in (each.default, getattr(found, each.name, each.default)):
+            unused.append(f"--sfm.{each.name.replace('_', '-')} {value}")
+    if unused:
+        warn(
+            f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
+            f"was trained with, in {folder}, because what it has learned fits no others. To have poses found anew, "
+            "start a new run: leave out --load-dir and --load-checkpoint."
+        )
+    return found or given
 
 
 def write(folder: Path, source: Source, origin: Origin) -> None:

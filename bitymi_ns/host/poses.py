@@ -1,11 +1,16 @@
-"""Whether the poses of a capture are poses: rotations (or mirrored ones) at places that belong together."""
+"""Whether the poses of a capture are poses: rotations (or mirrored ones) at places that belong together. And the turn
+that brings a capture to its place."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from nerfstudio.cameras import camera_utils
 
 from bitymi_ns.host.errors import fail, listed, warn
 
@@ -164,3 +169,38 @@ def check_cloud(
 
 def _rounded(ratio: float) -> str:
     return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"
+
+
+_nerfstudios = camera_utils.auto_orient_and_center_poses
+
+
+def oriented(
+    poses: torch.Tensor, method: Any = "up", center_method: Any = "poses"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """nerfstudio's orienting and centring of a capture, with all cameras turned alike.
+
+    With `pca`, nerfstudio 1.1.5 turns a capture that comes out upside down by half a turn, but of its cameras the
+    second and the third alone, which it mirrors as well. The transform is right, and the cameras are made of it; where
+    nothing is upside down that is the same product.
+
+    Args:
+        poses: [N, 4, 4] camera to world.
+        method: pca, up, vertical or none.
+        center_method: poses, focus or none.
+
+    Returns:
+        poses [N, 3 or 4, 4] and transform [3, 4].
+    """
+    found, transform = _nerfstudios(poses, method, center_method)
+    return (transform @ poses if method == "pca" else found), transform
+
+
+@contextmanager
+def orienting_all() -> Iterator[None]:
+    """While it lasts, nerfstudio's readers orient captures by `oriented`."""
+    before = camera_utils.auto_orient_and_center_poses
+    camera_utils.auto_orient_and_center_poses = oriented
+    try:
+        yield
+    finally:
+        camera_utils.auto_orient_and_center_poses = before

@@ -9,19 +9,25 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import CaptureError, SfmOptions, find_poses
-from bitymi_ns.capture.video import choose, displacement, extract_frames
+from bitymi_ns.capture.video import PER_SECOND, _survey, choose, displacement, extract_frames
 
 
 def silent(step: str, done: int, total: int) -> None: ...
 
 
-def write_video(path: Path, frames: list[np.ndarray], rate: int = 10) -> None:
+def write_video(path: Path, frames: list[np.ndarray], rate: int = 10, times: list[int] | None = None) -> None:
+    """Frames at a constant rate, or at these times in milliseconds."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=Fraction(rate))
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
+        if times is not None:
+            stream.codec_context.time_base = Fraction(1, 1000)
+        for i, frame in enumerate(frames):
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            if times is not None:
+                picture.pts, picture.time_base = times[i], Fraction(1, 1000)
+            container.mux(stream.encode(picture))
         container.mux(stream.encode())
 
 
@@ -90,6 +96,62 @@ def test_the_rotation_of_a_phone_is_applied(tmp_path: Path, wide: np.ndarray) ->
     number = int(taken[0].stem.split("_")[1])
     assert picture.shape == (320, 240, 3)
     assert np.abs(picture - np.rot90(frames[number], -1)).mean() < 12  # turned clockwise to be seen
+
+
+def test_frames_of_a_varying_rate_are_looked_at_by_their_times(tmp_path: Path, wide: np.ndarray) -> None:
+    """Half a second at 250 frames per second without motion, then four at 8, over which the camera moves."""
+    times = [*range(0, 500, 4), *range(500, 4500, 125)]
+    still = sum(time < 500 for time in times)
+    write_video(tmp_path / "a.mp4", pan(wide, [0] * still + [25] * (len(times) - still)), times=times)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert float(container.streams.video[0].average_rate) > 30  # every other frame, if that were the rate of all
+        assert [round(1000 * frame.time) for frame in container.decode(video=0)] == times
+    seen, _, _ = _survey(tmp_path / "a.mp4", silent)
+    assert [number for number in seen if number > still] == list(range(still + 1, len(times)))
+    assert 7 <= sum(number <= still for number in seen) <= 11
+    taken = numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, silent))
+    assert len(taken) >= 20 and sum(number < still for number in taken) <= 1
+
+
+def test_all_frames_of_a_clip_of_a_second_are_looked_at(tmp_path: Path, wide: np.ndarray) -> None:
+    write_video(tmp_path / "a.mp4", pan(wide, [25] * 30), rate=30)
+    assert len(numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, silent))) >= 20
+    with pytest.raises(CaptureError, match="holds 2 frames: film for at least ten seconds"):
+        write_video(tmp_path / "b.mp4", pan(wide, [25] * 2), rate=30)
+        extract_frames(tmp_path / "b.mp4", tmp_path / "b", None, silent)
+
+
+@pytest.mark.parametrize("rate", [24, 30, 60])
+def test_of_a_longer_video_about_fifteen_frames_per_second_are_looked_at(
+    tmp_path: Path, wide: np.ndarray, rate: int
+) -> None:
+    write_video(tmp_path / "a.mp4", pan(wide[:, ::4], [0] * (5 * rate)), rate=rate)
+    seen, _, _ = _survey(tmp_path / "a.mp4", silent)
+    assert seen == list(range(0, 5 * rate, round(rate / PER_SECOND)))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1), ((1, 0, 0, 1), 0)]
+)
+def test_every_rotation_is_applied(
+    tmp_path: Path, wide: np.ndarray, matrix: tuple[int, int, int, int], turns: int
+) -> None:
+    frames = pan(wide, [16] * 12)
+    write_video(tmp_path / "a.mp4", frames)
+    data = (tmp_path / "a.mp4").read_bytes()
+    at = data.index(entries(1, 0, 0, 1), data.index(b"tkhd"))
+    stored = entries(*matrix)
+    (tmp_path / "a.mp4").write_bytes(data[:at] + stored + data[at + len(stored) :])
+    for path in extract_frames(tmp_path / "a.mp4", tmp_path, 4, silent).iterdir():
+        expected = np.rot90(frames[int(path.stem.split("_")[1])], turns)
+        picture = np.asarray(Image.open(path), float)
+        assert picture.shape == expected.shape and np.abs(picture - expected).mean() < 12
+
+
+def entries(a: int, b: int, c: int, d: int) -> bytes:
+    """The matrix in the header of a track, without a shift."""
+    values = (a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
+    return b"".join(value.to_bytes(4, "big", signed=True) for value in values)
 
 
 def test_a_video_without_motion_is_refused(tmp_path: Path, wide: np.ndarray) -> None:

@@ -21,6 +21,7 @@ from PIL import Image
 
 import bitymi_ns.capture
 from bitymi_ns.capture.frame import WorldFrame, write_frame
+from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import kept_poses
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.errors import InputError
@@ -86,8 +87,9 @@ def never(*arguments: Any) -> Any:
 def shoot(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Shot]:
     """Trains on photographs; after that no poses can be found any more."""
 
-    def make(upright: bool = False, **options: Any) -> Shot:
+    def make(upright: bool = False, sfm: SfmSettings | None = None, **options: Any) -> Shot:
         shot = Shot(room, tmp_path, upright, **options)
+        shot.config.pipeline.datamanager.dataparser.sfm = sfm or SfmSettings()
         monkeypatch.setattr(bitymi_ns.capture, "find_poses", shot.find_poses, raising=False)
         ns_train.main(shot.config)
         monkeypatch.setattr(bitymi_ns.capture, "find_poses", never)
@@ -180,6 +182,38 @@ def test_a_resumed_run_goes_on_in_the_same_world(shoot: Callable[..., Shot]) -> 
         assert (config.get_base_dir() / POSES / "sparse/0/images.txt").is_file()
     shutil.rmtree(shot.run)
     eval_setup(config.get_base_dir() / "config.yml")
+
+
+def test_options_for_poses_that_are_not_found_anew(
+    shoot: Callable[..., Shot], capsys: pytest.CaptureFixture[str]
+) -> None:
+    shot = shoot(sfm=SfmSettings(mapper="global", max_features=500))
+
+    def go_on(name: str, sfm: SfmSettings) -> str:
+        config = small_run(shot.photographs, shot.outputs, name)
+        config.load_dir = shot.config.get_checkpoint_dir()
+        config.pipeline.datamanager.dataparser.sfm = sfm
+        capsys.readouterr()
+        config.set_timestamp()
+        assert config.pipeline.datamanager.dataparser.sfm == SfmSettings(mapper="global", max_features=500)
+        return said(capsys)
+
+    for same in (SfmSettings(), SfmSettings(mapper="global"), SfmSettings(mapper="global", max_features=500)):
+        assert "--sfm" not in go_on("same", same)
+    text = go_on("other", SfmSettings(mapper="incremental", max_features=500, frames=7))
+    assert "--sfm.mapper incremental and --sfm.frames 7 are not used" in text and "leave out --load-dir" in text
+    assert str(shot.run / POSES) in text
+    origin = shot.run / POSES / "origin.json"
+    values = json.loads(origin.read_text())
+    del values["origin"]["settings"]  # as of an earlier version
+    origin.write_text(json.dumps(values))
+    config = small_run(shot.photographs, shot.outputs, "earlier")
+    config.load_dir, config.pipeline.datamanager.dataparser.sfm = (
+        shot.config.get_checkpoint_dir(),
+        SfmSettings(frames=7),
+    )
+    config.set_timestamp()
+    assert "--sfm.frames 7 is not used" in said(capsys)
 
 
 def test_a_run_that_goes_on_in_its_own_folder(shoot: Callable[..., Shot]) -> None:

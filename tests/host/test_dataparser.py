@@ -66,6 +66,31 @@ def test_options_and_entries_mean_what_they_mean_to_nerfstudio(capture: Path, ed
     equal(load_any(capture, eval_mode="fraction"), load(capture, eval_mode="fraction", train_split_fraction=0.9))
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_every_camera_is_turned_with_its_capture(capture: Path, edit: Any, turned: bool) -> None:
+    given = {}
+
+    def change(meta: dict[str, Any]) -> None:
+        turn = np.diag([1.0, -1.0, -1.0, 1.0]) if not turned else np.eye(4)
+        for frame in meta["frames"]:
+            pose = turn @ np.array(frame["transform_matrix"])
+            frame["transform_matrix"] = pose.tolist()
+            given[Path(frame["file_path"]).name] = pose[:3, :3]
+
+    edit(capture, change)
+    manager = load_any(capture, eval_mode="all", orientation_method="pca")
+    cameras = manager.train_dataset.cameras.camera_to_worlds
+    stock = NerfstudioDataParserConfig(data=capture, eval_mode="all", orientation_method="pca").setup()
+    nerfstudios = stock.get_dataparser_outputs("train")  # not by way of our data manager
+    transform = manager.train_dataparser_outputs.dataparser_transform
+    assert torch.equal(transform, nerfstudios.dataparser_transform)
+    for path, found in zip(manager.train_dataset.image_filenames, cameras[:, :, :3].numpy(), strict=True):
+        np.testing.assert_allclose(found, transform[:3, :3].numpy() @ given[path.name], atol=1e-5)
+    works = bool((torch.linalg.det(nerfstudios.cameras.camera_to_worlds[:, :, :3]) > 0).all())
+    assert torch.equal(cameras, nerfstudios.cameras.camera_to_worlds) is works
+    assert works is not turned  # else one of the two captures shows nothing
+
+
 def test_the_captures_own_lists_decide_what_is_held_out(capture: Path, edit: Any) -> None:
     names = [f"images/{path.name}" for path in images_of(capture)]
     edit(capture, lambda meta: meta.update(train_filenames=names[3:], val_filenames=names[1:3]))

@@ -1,6 +1,6 @@
 // A surfel's pixels are bounded in two ways: in double (core/bounds.h), and in the reals of the fragments
-// (core/plane_bounds.h). This is what both share: the level set, the padding, and which x offsets a box, an ellipse and the
-// low pass have between two lines.
+// (core/plane_bounds.h). This is what both share: the level set, the padding, and which x offsets a box, an ellipse and
+// the low pass have between two lines.
 #pragma once
 
 #include "core/surfel.h"

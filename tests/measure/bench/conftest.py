@@ -118,7 +118,11 @@ class Fakes:
         """A Python that finds the stand-ins beside it, for code in other processes."""
         link = self.folder / "python"
         link.symlink_to(Path(sys.executable).resolve())
-        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+        started = self.folder / "site"
+        started.mkdir()
+        hooks = [path for path in sys.path if path.endswith("site-packages")]  # with those of an editable installation
+        (started / "sitecustomize.py").write_text(f"import site\nfor path in {hooks}:\n    site.addsitedir(path)\n")
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(started), *filter(None, sys.path)]))
         return str(link)
 
 

@@ -103,6 +103,8 @@ void bind_operations(nb::module_& m) {
   bind_operation(m, name("shade_backward"), &shade_backward<S>);
   bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
   bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
+  bind_operation(m, name("texel_colors_forward"), &texel_colors_forward<S>);
+  bind_operation(m, name("texel_colors_backward"), &texel_colors_backward<S>);
   bind_operation(m, name("ssim"), &ssim<S>);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }

@@ -1,7 +1,8 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image`,
-`texel_colors` and their gradients run on the CPU only, `field_tiles` on a CUDA device only: elsewhere they raise a RuntimeError that says so.
+Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image`, `texel_colors`
+and their gradients run on the CPU only, `field_tiles` on a CUDA device only: elsewhere they raise a RuntimeError that
+says so.
 `baked.draw` draws a baked scene on both, by `baked_cpu` or `baked_cuda`.
 """
 

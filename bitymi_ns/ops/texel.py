@@ -228,9 +228,7 @@ class _TexelColors(torch.autograd.Function):
         )
         inputs = {"bound": ctx.bound, "base": base, "texels": texels, **ctx.tiles.arrays}
         given = {"colors": colors, "dcolors": dense(dcolors, texels)}
-        kernel("texel_colors_backward", texels)(
-            **arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv
-        )
+        kernel("texel_colors_backward", texels)(**arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv)
         return dbase, dtexels, duv, None, None, None
 
 

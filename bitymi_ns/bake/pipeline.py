@@ -227,6 +227,8 @@ def with_reduced_colors(baked: Baked, cameras: Sequence[Camera], progress: Progr
     )
     if statistics.texels is not None:
         statistics = statistics.but(texels=statistics.texels.but(kept=result.packing.texels))
+    if result.texels is None:
+        statistics = statistics.but(atlas=None)
     return replace(result, statistics=statistics)
 
 

@@ -9,7 +9,7 @@ import copy
 import io
 import pickle
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,18 @@ from PIL import Image
 from rich.markup import escape
 from rich.table import Table
 
-from bitymi_ns.bake import BakeOptions, TuneOptions, bake, rich_progress, tune_atlas
+from bitymi_ns.bake import (
+    Baked,
+    BakeOptions,
+    PolishOptions,
+    Progress,
+    TuneOptions,
+    bake,
+    polish_scene,
+    rich_progress,
+    tune_atlas,
+    with_reduced_colors,
+)
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.bake.statistics import FineTuning, HeldOut, Percentiles
 from bitymi_ns.bundle import BundleError, export, read_bundle
@@ -40,8 +51,10 @@ from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
@@ -65,6 +78,10 @@ class ExportAtlas(BakeOptions):
     exact: bool = False
     """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
+    polish_steps: int = 0
+    """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
+    after the bake and without the network, before the view colours are reduced; 0 = surfels stay as they were
+    trained."""
     finetune_steps: int = TuneOptions.steps
     """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
@@ -76,12 +93,12 @@ class ExportAtlas(BakeOptions):
     def main(self) -> None:
         """Run the export."""
         earlier = None
-        bake_options, tune_options = self._options()
+        bake_options, polish_options, tune_options = self._options()
         try:
             with bundle_place(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 check_room(self.output_dir, self.load_config, self, self.exact)
-                self._run(bake_options, tune_options)
+                self._run(bake_options, polish_options, tune_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
             state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
@@ -90,13 +107,15 @@ class ExportAtlas(BakeOptions):
         except BundleError as error:
             fail(str(error), error)
 
-    def _options(self) -> tuple[BakeOptions, TuneOptions]:
-        """Those of bake and fine-tuning; stops where one is out of its range, before anything is loaded."""
+    def _options(self) -> tuple[BakeOptions, PolishOptions, TuneOptions]:
+        """Those of bake, polish and fine-tuning; stops where one is out of its range, before anything is loaded."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
         if self.finetune_steps < 0:
             fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
+        if self.polish_steps < 0:
+            fail(f"--polish-steps must not be negative, it is {self.polish_steps}; 0 = no polish")
         if not 0 <= self.finetune_memory <= 1e6:
             fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
         tune = TuneOptions(steps=self.finetune_steps, cache_bytes=int(self.finetune_memory * 1e9))
@@ -104,31 +123,36 @@ class ExportAtlas(BakeOptions):
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
-        return options, tune
+        return options, PolishOptions(steps=self.polish_steps), tune
 
-    def _run(self, options: BakeOptions, tune: TuneOptions) -> None:
+    def _run(self, options: BakeOptions, polish: PolishOptions, tune: TuneOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        finetunes = self.finetune_steps != 0 and not self.exact and model.scene.field is not None
+        learns = not self.exact and model.scene.field is not None
+        finetunes, polishes = learns and self.finetune_steps != 0, learns and self.polish_steps != 0
         if finetunes and self.finetune_steps < FEWEST_PASSES * len(views):
             passes = self.finetune_steps / len(views)
             say(
                 f"Fine-tuning has {self.finetune_steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
                 "for each: more may gain (--finetune-steps)."
             )
-        if finetunes and model.device.type != "cpu":
-            say("The texels are fine-tuned on the CPU: the kernels for it exist there alone.")
+        if (finetunes or polishes) and model.device.type != "cpu":
+            say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
             state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
         try:
             with rich_progress() as progress:
-                baked = bake(model.scene, views, options, progress)
-                if finetunes and baked.atlas is not None:
-                    held_out = datamanager.eval_views if self.compare else ()
-                    background = model.background.cpu()
-                    photographs = corrected(datamanager.train_views, model.resume_state.get("exposure"))
+                held_out = datamanager.eval_views if self.compare else ()
+                background = model.background.cpu()
+                photographs = datamanager.train_views
+                if polishes or finetunes:
+                    photographs = corrected(photographs, model.resume_state.get("exposure"))
+                baked = bake(model.scene, views, options, progress, not polishes)
+                if polishes:
+                    baked = polished(baked, photographs, background, polish, model.train_config, progress, held_out)
+                if finetunes and baked.texels is not None:
                     baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
@@ -150,6 +174,23 @@ class ExportAtlas(BakeOptions):
             bundle.info.statistics.held_out = held_out
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
+
+
+def polished(
+    baked: Baked,
+    photographs: Sequence[View],
+    background: torch.Tensor,
+    options: PolishOptions,
+    train: TrainConfig,
+    progress: Progress,
+    held_out: Sequence[View],
+) -> Baked:
+    """A bake with all of its view colours after the polish, with reduced ones and an encoded atlas. One without an
+    atlas has no texels that could learn: its view colours alone are reduced."""
+    if baked.texels is not None:
+        baked = polish_scene(baked, photographs, background, options, train, progress, held_out)
+    baked = with_reduced_colors(baked, [view.camera.to("cpu") for view in photographs], progress)
+    return baked if baked.texels is None or baked.atlas is not None else baked.with_texels(baked.texels, progress)
 
 
 def default_export() -> ExportAtlas:
@@ -295,8 +336,9 @@ def print_summary(folder: Path, info: Manifest) -> None:
         table.add_row("Occupancy", f"{100 * atlas.occupancy:.1f} %")
         if atlas.psnr is not None:
             table.add_row("Quantisation", f"{atlas.psnr:.2f} dB over the texels")
-    if statistics.finetune is not None:
-        print_tuning(table, statistics.finetune)
+    for name, learned in (("Polish", statistics.polish), ("Fine-tuning", statistics.finetune)):
+        if learned is not None:
+            print_tuning(table, name, learned)
     table.add_row("Files", f"{sum(entry.bytes for entry in info.files.values()) / 1e6:.2f} MB in total")
     held_out = statistics.held_out
     if held_out is not None:
@@ -314,8 +356,9 @@ def print_summary(folder: Path, info: Manifest) -> None:
 def print_savings(table: Table, info: Manifest) -> None:
     """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
     statistics, options = info.statistics, info.statistics.options
-    texels, tuned = statistics.texels, statistics.finetune
-    error = statistics.error or tuned.error_before
+    texels = statistics.texels
+    learned = [part.error_before for part in (statistics.polish, statistics.finetune) if part is not None]
+    error = statistics.error or next(each for each in learned if each is not None)
     kept, count = texels.kept, info.surfels.count
     table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
     table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
@@ -329,7 +372,7 @@ def print_savings(table: Table, info: Manifest) -> None:
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
     table.add_row("Error of a tile", percentiles_text(error.rms))
-    when = "before the fine-tuning" if statistics.error is None else "as stored"
+    when = "before the texels learned" if statistics.error is None else "as stored"
     table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
 
 
@@ -350,12 +393,12 @@ def print_view_color(table: Table, info: Manifest) -> None:
     table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
 
 
-def print_tuning(table: Table, tuned: FineTuning) -> None:
-    """What the fine-tuning gained, and why it ended."""
+def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
+    """What the polish or the fine-tuning gained, and why it ended."""
     if not tuned.steps:
-        table.add_row("Fine-tuning", f"none: {tuned.views} training views are too few to set some aside")
+        table.add_row(name, f"none: {tuned.views} training views are too few to set some aside")
         return
-    table.add_row("Fine-tuning", f"{tuned.steps} steps, {tuned.seconds:.0f} s")
+    table.add_row(name, f"{tuned.steps} steps, {tuned.seconds:.0f} s")
     if tuned.steps < tuned.steps_asked:
         table.add_row("", f"(stopped early at step {tuned.steps} of {tuned.steps_asked}: no gain on the")
         table.add_row("", f"set-aside training views for {tuned.steps - tuned.best_step} steps)")

@@ -141,7 +141,8 @@ class ExportAtlas(BakeOptions):
         if (finetunes or polishes) and model.device.type != "cpu":
             say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
-            state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
+            learning = len(model.scene) if polishes else 0
+            state_export(model.scene, views, tune.cache_bytes if finetunes else 0, learning)
         try:
             with rich_progress() as progress:
                 held_out = datamanager.eval_views if self.compare else ()

@@ -60,8 +60,8 @@ template <class S>
 BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
   for (int k = 0; k < 4; ++k) store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + c.weight[k] * g);
 }
-// Adds the gradient with respect to u and v. It is 0 beyond the outer texel centres; at a centre, where the slope jumps,
-// it is that of the side of larger coordinates.
+// Adds the gradient with respect to u and v. It is 0 beyond the outer texel centres; at a centre, where the slope
+// jumps, it is that of the side of larger coordinates.
 template <class S>
 BT_HD void texel_fetch_uv_vjp(const S* tile, const TexelCorners<S>& c, int r_u, int r_v, S extent, Vec3<S> g, S& du,
                               S& dv) {

@@ -42,7 +42,7 @@ def test_it_is_what_the_baked_renderer_shows() -> None:
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sv_rgb", "texels"])
 def test_gradients_against_steps_in_a_direction(name: str) -> None:
-    """The picture is piecewise smooth: a small step in the direction of the gradient changes it as the gradient says."""
+    """The picture is piecewise smooth: a small step along the gradient changes it as the gradient says."""
     scene, camera, _ = make(count=12, width=24, height=18)
     weights = torch.linspace(-1, 1, 24 * 18 * 3, dtype=torch.float64).view(18, 24, 3)
     parameter = scene.field.texels if name == "texels" else scene.surfels[name]

@@ -1,8 +1,20 @@
 """Trained field to texture atlas: resolution, plan, evaluation, reduction, packing, quantisation, fine-tuning."""
 
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.pipeline import Baked, bake
+from bitymi_ns.bake.pipeline import Baked, bake, with_reduced_colors
+from bitymi_ns.bake.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.progress import Progress, rich_progress
 
-__all__ = ["BakeOptions", "Baked", "Progress", "TuneOptions", "bake", "rich_progress", "tune_atlas"]
+__all__ = [
+    "BakeOptions",
+    "Baked",
+    "PolishOptions",
+    "Progress",
+    "TuneOptions",
+    "bake",
+    "polish_scene",
+    "rich_progress",
+    "tune_atlas",
+    "with_reduced_colors",
+]

@@ -55,6 +55,22 @@ def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None,
     return means
 
 
+def moved_texels(texels: Tensor, tiles: Tensor, packing: Packing) -> Tensor:
+    """Texels of tiles that lie elsewhere: [layers, height, width, 3] of `packing`, 0 outside of its tiles.
+
+    Args:
+        texels: [layers, height, width, 3] that they are read from.
+        tiles: [N, 5] int32, where each lies there; their sizes are those of `packing`, row by row.
+        packing: where they go.
+    """
+    pages = torch.zeros(packing.layers * packing.height * packing.width, 3)
+    flat, to = texels.reshape(-1, 3), torch.from_numpy(packing.tiles)
+    for r_u, r_v, rows in size_classes(tiles):
+        index = texel_index(to[rows], (r_u, r_v), packing.width, packing.height)
+        pages[index] = flat[texel_index(tiles[rows], (r_u, r_v), texels.shape[2], texels.shape[1])]
+    return pages.reshape(packing.layers, packing.height, packing.width, 3)
+
+
 def coverage(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:
     """Which 4 x 4 blocks belong to a tile: [layers, height / 4, width / 4] bool."""
     blocks = torch.from_numpy(np.ascontiguousarray(tiles)).clone()

@@ -14,8 +14,8 @@ from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.inputs import BakeInput, drawable
 from bitymi_ns.bake.methods import BakeMethod, Tiles, bake_method
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.packing import Packing
-from bitymi_ns.bake.pages import tile_means
+from bitymi_ns.bake.packing import Packing, pack
+from bitymi_ns.bake.pages import moved_texels, tile_means
 from bitymi_ns.bake.plan import Field, paper_texels
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
@@ -89,6 +89,30 @@ class Baked:
         pages = pages if pages.dtype == torch.uint8 else pages.float()
         return replace(self.scene, atlas=pages, offset=atlas.range.offset, scale=atlas.range.scale)
 
+    def with_surfels(self, surfels: Mapping[str, Tensor]) -> Baked:
+        """The same bake with other parameters of its N surfels; tiles and texels are as they are."""
+        given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
+        return replace(self, scene=replace(self.scene, surfels=given))
+
+    def only(self, kept: Tensor) -> Baked:
+        """The bake of some of its surfels, `kept` [N] bool: their tiles, packed anew, with their texels. The atlas is
+        to be encoded by `with_texels`."""
+        if bool(kept.all()):
+            return self
+        surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
+        packing = pack(torch.from_numpy(self.packing.tiles)[kept, 3:], self.options.page_width, self.options.page_rows)
+        scene = replace(
+            self.scene,
+            surfels=surfels,
+            tiles=torch.from_numpy(packing.tiles),
+            extent=self.extent[kept],
+            mean_residual=self.mean_residual[kept],
+        )
+        texels = None
+        if self.texels is not None and packing.texels:
+            texels = moved_texels(self.texels, torch.from_numpy(self.packing.tiles)[kept], packing)
+        return replace(self, scene=scene, rows=self.rows[kept], packing=packing, texels=texels, atlas=None)
+
     def with_texels(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
         """The same bake with other residual colours (fine-tuned ones, say), quantised and encoded anew."""
         if self.texels is None or texels.shape != self.texels.shape:
@@ -107,6 +131,7 @@ def bake(
     cameras: Sequence[Camera] = (),
     options: BakeOptions | None = None,
     progress: Progress | None = None,
+    reduce_colors: bool = True,
 ) -> Baked:
     """Bakes a scene's residual field into an atlas (paper, section Texture Baking).
 
@@ -120,6 +145,8 @@ def bake(
         cameras: training views, for the cap on tile sizes and for what they see; with none nothing is left out for it.
         options: see `BakeOptions`.
         progress: called after every chunk of work.
+        reduce_colors: reduce the view colours as the options say; False leaves that to `with_reduced_colors`, for a
+            bake of which the surfels are going to learn.
 
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
@@ -143,7 +170,7 @@ def bake(
     else:
         paper = paper_texels(candidates.surfels, scene.field, options)
         tiles, atlas, statistics = _textured(method, scene.field, inputs, paper, statistics, options, progress)
-    surfels, view_color = method.view_color(inputs, progress)
+    surfels, view_color = method.view_color(inputs, progress) if reduce_colors else (dict(inputs.surfels), None)
     baked = BakedScene(
         {name: value.cpu() for name, value in surfels.items()},
         kind_of(scene.surfels),
@@ -156,6 +183,53 @@ def bake(
     )
     statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
     return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics)
+
+
+@torch.no_grad()
+def with_reduced_colors(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_progress) -> Baked:
+    """A bake whose surfels have learned, with its view colours reduced as its options say. Surfels that cannot be drawn
+    any more, that a bundle cannot hold, or that no view blends, are left out and counted. The atlas is to be encoded by
+    `with_texels`.
+
+    Args:
+        baked: made with `reduce_colors=False`.
+        cameras: training views.
+
+    Raises:
+        ValueError: no surfel is left.
+    """
+    rows, gone = drawable(baked.scene.surfels)
+    kept = torch.zeros(len(baked.rows), dtype=torch.bool)
+    kept[rows] = True
+    scene, options = baked.scene, baked.options
+    surfels = {name: value[rows] for name, value in scene.surfels.items()}
+    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.through_pixel)
+    inputs = inputs.looked_at(options, progress)
+    unseen = 0
+    if inputs.views is not None and options.drop_unseen:
+        seen = inputs.views.transmittance > 0
+        unseen = int((~seen).sum())
+        kept[rows] = seen
+        inputs = inputs.of(seen)
+    if not bool(kept.any()):
+        raise ValueError("no surfel is left to bake after the polish")
+    reduced, view_color = bake_method(options).view_color(inputs, progress)
+    result = baked.only(kept).with_surfels(reduced)
+    counts = baked.statistics.surfels
+    assert counts is not None and counts.left_out is not None
+    more = gone.but(unseen=unseen)
+    left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in more if n})
+    statistics = baked.statistics.but(
+        surfels=counts.but(
+            kept=len(result.rows), left_out=left_out, without_tile=int((result.packing.tiles[:, 3] == 0).sum())
+        ),
+        view_color=view_color,
+    )
+    if statistics.texels is not None:
+        statistics = statistics.but(texels=statistics.texels.but(kept=result.packing.texels))
+    if result.texels is None:
+        statistics = statistics.but(atlas=None)
+    return replace(result, statistics=statistics)
 
 
 def _inputs(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> BakeInput:

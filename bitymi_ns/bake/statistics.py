@@ -151,7 +151,7 @@ class Gain(Part):
 
 
 class FineTuning(Part):
-    """What the fine-tuning did; no steps where there were too few views."""
+    """What the fine-tuning or the polish did; no steps where there were too few views."""
 
     views: Whole | None = None
     held_in_views: Whole | None = None
@@ -193,6 +193,7 @@ class Statistics(Part):
     """None: all of the view colours is kept."""
     field: FieldLevels | None = None
     atlas: AtlasCost | None = None
+    polish: FineTuning | None = None
     finetune: FineTuning | None = None
     seconds: NotNegative | None = None
     """Of the bake, without the fine-tuning."""

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.looks import Looks, falling, gain, set_aside
 from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
-from bitymi_ns.bake.statistics import FineTuning, Gain
+from bitymi_ns.bake.statistics import FineTuning
 from bitymi_ns.ops import (
     Fragments,
     TexelFragments,
@@ -257,62 +258,48 @@ def tune_atlas(
         return replace(baked, statistics=baked.statistics.but(finetune=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
     scene = TexelScene(baked, background)
-    budget, every = MemoryBudget(options.cache_bytes), options.held_in_every
+    budget = MemoryBudget(options.cache_bytes)
     held_in, tuned = (
         TexelViews(scene, OnDemand(len(rows), lambda i, rows=rows: views[rows[i]]), budget)
-        for rows in (range(0, len(views), every), [i for i in range(len(views)) if i % every])
+        for rows in set_aside(len(views), options.held_in_every)
     )
-    texels, curve = _descend(scene, tuned, held_in, options, progress)
-    statistics = FineTuning(
-        views=len(tuned),
-        held_in_views=len(held_in),
-        steps=curve[-1][0],
-        steps_asked=options.steps,
-        best_step=max(curve, key=lambda point: point[1])[0],
-        psnr_held_in=_gain(curve[0][1], max(psnr for _, psnr in curve)),
-        curve=[(step, round(psnr, 4)) for step, psnr in curve],
-        seconds=round(time.perf_counter() - started, 2),
-        cpu_seconds=round(time.process_time() - cpu_started, 2),
-    )
+    looks = _descend(scene, tuned, held_in, options, progress)
+    spent = time.perf_counter() - started, time.process_time() - cpu_started
+    statistics = looks.statistics(len(tuned), len(held_in), *spent)
     held_out = TexelViews(scene, eval_views, MemoryBudget(0))
     statistics = statistics.but(
         error_before=baked.statistics.error,
-        psnr_held_out=_gain(held_out.psnr(scene.texels), held_out.psnr(texels)) if eval_views else None,
+        psnr_held_out=gain(held_out.psnr(scene.texels), held_out.psnr(looks.best)) if eval_views else None,
     )
-    result = scene.baked(texels, progress)
+    result = scene.baked(looks.best, progress)
     return replace(result, statistics=result.statistics.but(finetune=statistics))
-
-
-def _gain(before: float, after: float) -> Gain:
-    return Gain(before=round(before, 4), after=round(after, 4))
 
 
 def _descend(
     scene: TexelScene, views: TexelViews, held_in: TexelViews, options: TuneOptions, progress: Progress
-) -> tuple[Tensor, list[tuple[int, float]]]:
-    """The texels [T, 3] that show the set-aside views best, and the curve: (step, dB over these views)."""
-    best, curve = scene.texels, [(0, held_in.psnr(scene.texels, progress))]  # first: these views are kept first
+) -> Looks[Tensor]:
+    """The texels [T, 3] that show the set-aside views best, and the looks at these."""
+    looks = Looks(options, held_in.psnr(scene.texels, progress), scene.texels)  # first: these views are kept first
     inverse = 1.0 / (coverage(scene, views, progress) + options.prior)  # [T, 1]
     texels, gradient = scene.texels.clone(), torch.zeros_like(scene.texels)
-    every = -(-options.steps // options.checks)
     for step in range(options.steps):
         view = views[training_order(len(views), options.seed, step)]
         rgb = scene.render(view, texels).requires_grad_()
         photometric(scene.shown(view, rgb), view.target, options.ssim_weight, view.mask).backward()
-        pixels = rgb.numel() if view.mask is None else 3 * int(view.mask.sum())
         gradient.zero_()
-        scene.add_gradient(view, texels, rgb.grad * pixels, gradient)  # the loss is a mean, the step wants a sum
-        rate = options.rate * 0.5 * (1.0 + math.cos(math.pi * step / options.steps))
-        texels.addcmul_(gradient, inverse, value=-rate)
+        # the loss is a mean, the step wants a sum
+        scene.add_gradient(view, texels, rgb.grad * numbers(rgb, view.mask), gradient)
+        texels.addcmul_(gradient, inverse, value=-falling(options.rate, step, options.steps))
         progress("tuning texels", step + 1, options.steps)
-        if (step + 1) % every == 0 or step + 1 == options.steps:
-            curve.append((step + 1, held_in.psnr(texels)))
-            if curve[-1][1] == max(psnr for _, psnr in curve):
-                best = texels.clone()
-            elif all(psnr < max(p for _, p in curve) for _, psnr in curve[-options.patience :]):
-                progress("tuning texels", step + 1, step + 1)  # no more is to come
-                break
-    return best, curve
+        if looks.due(step + 1) and not looks.note(step + 1, held_in.psnr(texels), texels.clone):
+            progress("tuning texels", step + 1, step + 1)  # no more is to come
+            break
+    return looks
+
+
+def numbers(rgb: Tensor, mask: Tensor | None) -> int:
+    """How many numbers of a picture [H, W, 3] the mean of its loss is taken over."""
+    return rgb.numel() if mask is None else 3 * int(mask.sum())
 
 
 @torch.no_grad()

@@ -8,8 +8,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
-import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -19,29 +18,38 @@ import torch
 import tyro
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
-from rich.markup import escape
-from rich.table import Table
 
-from bitymi_ns.bake import BakeOptions, TuneOptions, bake, rich_progress, tune_atlas
-from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
-from bitymi_ns.bake.statistics import FineTuning, HeldOut, Percentiles
+from bitymi_ns.bake import (
+    Baked,
+    BakeOptions,
+    PolishOptions,
+    Progress,
+    TuneOptions,
+    bake,
+    polish_scene,
+    rich_progress,
+    tune_atlas,
+    with_reduced_colors,
+)
+from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import BundleError, export, read_bundle
-from bitymi_ns.bundle.manifest import MANIFEST, SURFELS, Manifest, dump
+from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say, warn
+from bitymi_ns.host.export_summary import print_summary
 from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
-from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
@@ -65,6 +73,10 @@ class ExportAtlas(BakeOptions):
     exact: bool = False
     """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
+    polish_steps: int = 0
+    """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
+    after the bake and without the network, before the view colours are reduced; 0 = surfels stay as they were
+    trained."""
     finetune_steps: int = TuneOptions.steps
     """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
@@ -76,12 +88,12 @@ class ExportAtlas(BakeOptions):
     def main(self) -> None:
         """Run the export."""
         earlier = None
-        bake_options, tune_options = self._options()
+        bake_options, polish_options, tune_options = self._options()
         try:
             with bundle_place(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 check_room(self.output_dir, self.load_config, self, self.exact)
-                self._run(bake_options, tune_options)
+                self._run(bake_options, polish_options, tune_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
             state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
@@ -90,13 +102,15 @@ class ExportAtlas(BakeOptions):
         except BundleError as error:
             fail(str(error), error)
 
-    def _options(self) -> tuple[BakeOptions, TuneOptions]:
-        """Those of bake and fine-tuning; stops where one is out of its range, before anything is loaded."""
+    def _options(self) -> tuple[BakeOptions, PolishOptions, TuneOptions]:
+        """Those of bake, polish and fine-tuning; stops where one is out of its range, before anything is loaded."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
         if self.finetune_steps < 0:
             fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
+        if self.polish_steps < 0:
+            fail(f"--polish-steps must not be negative, it is {self.polish_steps}; 0 = no polish")
         if not 0 <= self.finetune_memory <= 1e6:
             fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
         tune = TuneOptions(steps=self.finetune_steps, cache_bytes=int(self.finetune_memory * 1e9))
@@ -104,31 +118,37 @@ class ExportAtlas(BakeOptions):
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
-        return options, tune
+        return options, PolishOptions(steps=self.polish_steps), tune
 
-    def _run(self, options: BakeOptions, tune: TuneOptions) -> None:
+    def _run(self, options: BakeOptions, polish: PolishOptions, tune: TuneOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        finetunes = self.finetune_steps != 0 and not self.exact and model.scene.field is not None
+        learns = not self.exact and model.scene.field is not None
+        finetunes, polishes = learns and self.finetune_steps != 0, learns and self.polish_steps != 0
         if finetunes and self.finetune_steps < FEWEST_PASSES * len(views):
             passes = self.finetune_steps / len(views)
             say(
                 f"Fine-tuning has {self.finetune_steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
                 "for each: more may gain (--finetune-steps)."
             )
-        if finetunes and model.device.type != "cpu":
-            say("The texels are fine-tuned on the CPU: the kernels for it exist there alone.")
+        if (finetunes or polishes) and model.device.type != "cpu":
+            say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
-            state_export(model.scene, views, tune.cache_bytes if finetunes else 0)
+            learning = len(model.scene) if polishes else 0
+            state_export(model.scene, views, tune.cache_bytes if finetunes else 0, learning)
         try:
             with rich_progress() as progress:
-                baked = bake(model.scene, views, options, progress)
-                if finetunes and baked.atlas is not None:
-                    held_out = datamanager.eval_views if self.compare else ()
-                    background = model.background.cpu()
-                    photographs = corrected(datamanager.train_views, model.resume_state.get("exposure"))
+                held_out = datamanager.eval_views if self.compare else ()
+                background = model.background.cpu()
+                photographs = datamanager.train_views
+                if polishes or finetunes:
+                    photographs = corrected(photographs, model.resume_state.get("exposure"))
+                baked = bake(model.scene, views, options, progress, not polishes)
+                if polishes:
+                    baked = polished(baked, photographs, background, polish, model.train_config, progress, held_out)
+                if finetunes and baked.texels is not None:
                     baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
@@ -150,6 +170,23 @@ class ExportAtlas(BakeOptions):
             bundle.info.statistics.held_out = held_out
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
+
+
+def polished(
+    baked: Baked,
+    photographs: Sequence[View],
+    background: torch.Tensor,
+    options: PolishOptions,
+    train: TrainConfig,
+    progress: Progress,
+    held_out: Sequence[View],
+) -> Baked:
+    """A bake with all of its view colours after the polish, with reduced ones and an encoded atlas. One without an
+    atlas has no texels that could learn: its view colours alone are reduced."""
+    if baked.texels is not None:
+        baked = polish_scene(baked, photographs, background, options, train, progress, held_out)
+    baked = with_reduced_colors(baked, [view.camera.to("cpu") for view in photographs], progress)
+    return baked if baked.texels is None or baked.atlas is not None else baked.with_texels(baked.texels, progress)
 
 
 def default_export() -> ExportAtlas:
@@ -260,113 +297,6 @@ def replace_file(path: Path, data: bytes) -> None:
         write_file(path, data)
     except OSError as error:
         fail(f"{path} could not be written: {reason(error, path)}.", error)
-
-
-def decibels(value: float | None) -> str:
-    """For the table; pictures that are equal have no finite PSNR, nor have those of which no pixel counts."""
-    return "no number" if value is None else f"{value:.2f} dB"
-
-
-def print_summary(folder: Path, info: Manifest) -> None:
-    """What was written, what was left out, and what it cost."""
-    statistics = info.statistics
-    surfels = statistics.surfels
-    table = Table("", "", title=escape(f"Bundle {folder}"), show_header=False)
-    table.add_row("Surfels", f"{surfels.trained:,} -> {info.surfels.count:,}")
-    left_out = {name: count for name, count in surfels.left_out if count}
-    table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
-    if statistics.texels is not None:
-        print_savings(table, info)
-    levels = statistics.field
-    if levels is not None:
-        alone = ", ".join(f"{change:.2f}" for change in levels.change_of_each)
-        table.add_row("Levels of the field", f"{levels.levels} -> {levels.kept[1]}")
-        table.add_row("", f"(each alone changes a surfel by up to {alone} steps; tolerance {levels.tolerance:g})")
-    print_view_color(table, info)
-    atlas = statistics.atlas
-    if atlas is None:
-        why = "the scene has no texture" if statistics.texels is None else "no tile is needed"
-        table.add_row("Atlas", f"none ({why})")
-    else:
-        layers, height, width = atlas.pages
-        size = info.files[info.atlas.file].bytes
-        table.add_row("Atlas", f"{size / 1e6:.2f} MB {info.atlas.format}, {layers} x {width} x {height} texels")
-        table.add_row("Occupancy", f"{100 * atlas.occupancy:.1f} %")
-        if atlas.psnr is not None:
-            table.add_row("Quantisation", f"{atlas.psnr:.2f} dB over the texels")
-    if statistics.finetune is not None:
-        print_tuning(table, statistics.finetune)
-    table.add_row("Files", f"{sum(entry.bytes for entry in info.files.values()) / 1e6:.2f} MB in total")
-    held_out = statistics.held_out
-    if held_out is not None:
-        table.add_row("Held-out views", f"{held_out.views}")
-        table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))
-        for name, form in (("Trained scene", "neural"), ("Bundle", "baked")):
-            plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "cc_psnr"))
-            table.add_row(
-                f"{name} against photographs", f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
-            )
-    CONSOLE.print(table)
-    say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
-
-
-def print_savings(table: Table, info: Manifest) -> None:
-    """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
-    statistics, options = info.statistics, info.statistics.options
-    texels, tuned = statistics.texels, statistics.finetune
-    error = statistics.error or tuned.error_before
-    kept, count = texels.kept, info.surfels.count
-    table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
-    table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
-    voxel = "local voxel" if options.local_voxel else "smallest voxel"
-    table.add_row(f"... by the {voxel}, extent {options.extent:g}", f"{texels.nyquist:,}")
-    table.add_row("... no finer than a view sees", f"{texels.after_cap_by_views:,}")
-    table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
-    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels.paper):.1f} %)")
-    rule = texels.paper * BYTES_PER_TEXEL[options.format]
-    stored = info.files[info.atlas.file].bytes if info.atlas else 0
-    table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
-    tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
-    table.add_row("Error of a tile", percentiles_text(error.rms))
-    when = "before the fine-tuning" if statistics.error is None else "as stored"
-    table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
-
-
-def print_view_color(table: Table, info: Manifest) -> None:
-    """What the surfels keep of their view colours, and what that saves and costs."""
-    lean, stored = info.statistics.view_color, info.files[SURFELS].bytes
-    if lean is None:
-        table.add_row("View colour", "all of it is kept")
-        table.add_row("Surfel bytes", f"{stored:,}")
-        return
-    sites, count = lean.sites, info.surfels.count
-    share = 100 * sites.after / sites.before
-    table.add_row(VIEW_COLORS[lean.kind].kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
-    table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
-    whole = stored + lean.bytes.before - lean.bytes.after
-    table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
-    table.add_row("Error of a view colour", percentiles_text(lean.error))
-    table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
-
-
-def print_tuning(table: Table, tuned: FineTuning) -> None:
-    """What the fine-tuning gained, and why it ended."""
-    if not tuned.steps:
-        table.add_row("Fine-tuning", f"none: {tuned.views} training views are too few to set some aside")
-        return
-    table.add_row("Fine-tuning", f"{tuned.steps} steps, {tuned.seconds:.0f} s")
-    if tuned.steps < tuned.steps_asked:
-        table.add_row("", f"(stopped early at step {tuned.steps} of {tuned.steps_asked}: no gain on the")
-        table.add_row("", f"set-aside training views for {tuned.steps - tuned.best_step} steps)")
-    gains = {"... set-aside training views": tuned.psnr_held_in, "... held-out views": tuned.psnr_held_out}
-    for views, gain in gains.items():
-        if gain is not None:
-            table.add_row(views, f"{gain.before:.2f} -> {gain.after:.2f} dB")
-
-
-def percentiles_text(error: Percentiles) -> str:
-    """Of an error in 8-bit steps."""
-    return f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"
 
 
 def main() -> None:

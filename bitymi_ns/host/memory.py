@@ -67,17 +67,19 @@ def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int) -
     _state("Training", needed, cameras, f"{advice} {max(1, fragments // 4)}")
 
 
-def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float) -> None:
+def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0) -> None:
     """Say what an export will take.
 
     Args:
         scene: a trained one.
         cameras: of the training views, on the CPU.
         finetune_bytes: that the fine-tuning may keep of the views; 0 = there is none.
+        learning: surfels that learn after the bake.
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels + PER_FRAGMENT * most_fragments(scene, cameras)
+    needed += PER_SURFEL * learning
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
 
 

@@ -1,7 +1,8 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image` and its
-gradient run on the CPU only, `field_tiles` on a CUDA device only: elsewhere they raise a RuntimeError that says so.
+Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image`, `texel_colors`
+and their gradients run on the CPU only, `field_tiles` on a CUDA device only: elsewhere they raise a RuntimeError that
+says so.
 `baked.draw` draws a baked scene on both, by `baked_cpu` or `baked_cuda`.
 """
 
@@ -12,7 +13,7 @@ from .field import FieldGeometry, field
 from .project import Projection, project
 from .shade import shade
 from .ssim import ssim
-from .texel import TexelFragments, TexelTiles, add_texel_gradient, texel_image
+from .texel import TexelFragments, TexelTiles, add_texel_gradient, texel_colors, texel_image
 from .trace import Fragments, masked_counts, trace
 from .view_color import view_color
 from .view_kinds import VIEW_COLORS
@@ -40,6 +41,7 @@ __all__ = [
     "shade",
     "soft_overdraw",
     "ssim",
+    "texel_colors",
     "texel_image",
     "trace",
     "view_color",

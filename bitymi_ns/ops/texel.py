@@ -1,4 +1,4 @@
-"""Images from texels: what the baked renderer shows of a view whose fragments are known, differentiable."""
+"""Colours from texels: what the baked renderer shows, differentiable, of a view whose fragments are known or learn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel, require
-from .trace import Fragments
+from .trace import FRAGMENT, Fragments, by_name
 
 
 def _on_the_cpu(operation: str, like: Tensor) -> None:
@@ -122,6 +122,13 @@ class TexelFragments:
         return {"surfel": self.surfel, "pixel": self.pixel, "weight": self.weight, "uv": self.uv}
 
 
+def _check(base: Tensor, texels: Tensor, tiles: TexelTiles) -> None:
+    if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
+        raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
+    if tuple(base.shape) != (len(tiles.first), 3):
+        raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
+
+
 class _TexelImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, base, texels, fragments, tiles, bound):
@@ -166,10 +173,7 @@ def texel_image(
         RuntimeError: the tensors are not on the CPU.
     """
     _on_the_cpu("texel_image", texels)
-    if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
-        raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
-    if tuple(base.shape) != (len(tiles.first), 3):
-        raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
+    _check(base, texels, tiles)
     return _TexelImage.apply(base, texels, fragments, tiles, bound)
 
 
@@ -201,3 +205,64 @@ def add_texel_gradient(
     kernel("texel_image_backward", texels)(
         **fragments.arrays, **tiles.arrays, **runs, **inputs, dtexels=dtexels, dbase=dbase
     )
+
+
+class _TexelColors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, base, texels, uv, fragments, tiles, bound):
+        b, t, arrays = dense(base, texels), dense(texels, texels), fragments.arrays
+        colors = t.new_empty(len(fragments), 3)
+        inputs = {"bound": bound, "base": b, "texels": t, **tiles.arrays}
+        kernel("texel_colors_forward", t)(**by_name(arrays), **inputs, colors=colors)
+        ctx.save_for_backward(b, t, colors, *arrays)
+        ctx.tiles, ctx.bound = tiles, bound
+        return colors
+
+    @staticmethod
+    def backward(ctx, dcolors):
+        base, texels, colors, *rest = ctx.saved_tensors
+        arrays = by_name(rest[: len(FRAGMENT)])
+        wanted = (base, texels, arrays["uv"])
+        dbase, dtexels, duv = (
+            torch.empty_like(x) if needed else None for x, needed in zip(wanted, ctx.needs_input_grad, strict=False)
+        )
+        inputs = {"bound": ctx.bound, "base": base, "texels": texels, **ctx.tiles.arrays}
+        given = {"colors": colors, "dcolors": dense(dcolors, texels)}
+        kernel("texel_colors_backward", texels)(**arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv)
+        return dbase, dtexels, duv, None, None, None
+
+
+def texel_colors(
+    fragments: Fragments,
+    base: Tensor,
+    texels: Tensor,
+    tiles: TexelTiles,
+    bound: float = 0.0,
+    move_surfels: bool = True,
+) -> Tensor:
+    """Colour of every fragment, ReLU(ReLU(f_view(d) + 0.5) + r(u, v)), with the texels' residual r of `texel_image`.
+
+    Differentiable in `base`, `texels` and the fragments' coordinates. Along u and v the slope is that of the bilinear
+    fetch, and 0 beyond the outer texel centres. Sums do not depend on the number of threads.
+
+    Args:
+        fragments: F fragments, of N surfels.
+        base: [N, 3] f_view of every surfel.
+        texels: [T, 3] residual colours, of the fragments' dtype.
+        tiles: where they lie.
+        bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
+        move_surfels: the gradient of r with respect to u and v reaches the fragments.
+
+    Returns:
+        [F, 3].
+
+    Raises:
+        ValueError: the tiles are not those of these texels or surfels, or the fragments those of others.
+        RuntimeError: the tensors are not on the CPU.
+    """
+    _on_the_cpu("texel_colors", texels)
+    _check(base, texels, tiles)
+    if fragments.surfels != len(base):
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
+    uv = fragments.uv if move_surfels else fragments.uv.detach()
+    return _TexelColors.apply(base, texels, uv, fragments, tiles, bound)

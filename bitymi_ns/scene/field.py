@@ -1,14 +1,35 @@
-"""The residual colour field as a module."""
+"""The residual colours of a scene as modules: a field in space, or texels on every surfel."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
+from bitymi_ns.ops import Fragments, TexelTiles, shade, texel_colors
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
+
+
+class ResidualField(Protocol):
+    """What colours the fragments of a scene beside the surfels' view colours."""
+
+    def shade(
+        self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
+    ) -> Tensor:
+        """[F, 3] colours of the fragments, ReLU(ReLU(f_view + 0.5) + residual).
+
+        Args:
+            fragments: F fragments, of N surfels.
+            base: [N, 3] f_view of every surfel.
+            frames: [N, 9] of the projection.
+            bound: fragments of weight below this have no residual.
+            learns: whether the residual gets gradients.
+            moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
+        """
 
 
 class HashField(nn.Module):
@@ -95,6 +116,13 @@ class HashField(nn.Module):
         """Table and MLP weights, in the order the operations take them."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
+    def shade(
+        self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
+    ) -> Tensor:
+        """See `ResidualField`."""
+        weights = self.weights if learns else tuple(w.detach() for w in self.weights)
+        return shade(fragments, base, frames, self.geometry, weights, bound, moves_surfels)
+
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
         return field(x, self.geometry, *self.weights)
@@ -116,3 +144,24 @@ class HashField(nn.Module):
             return torch.full((x.shape[0], 2), 2 * g.half / finest, dtype=x.dtype, device=x.device)
         r = ((x - x.new_tensor(g.mid)) / g.half).norm(dim=-1).clamp_min(1.0)
         return (4 * g.half / finest) * torch.stack([r * r, r / (2 - 1 / r)], dim=-1)
+
+
+class TexelField(nn.Module):
+    """Residual colours of N surfels in texels, as a bundle has them: each surfel carries its own, wherever it moves.
+
+    Args:
+        tiles: where the texels of every surfel lie.
+        texels: [T, 3] residual colours to start from.
+    """
+
+    def __init__(self, tiles: TexelTiles, texels: Tensor) -> None:
+        super().__init__()
+        self.tiles = tiles
+        self.texels = nn.Parameter(texels.detach().clone())
+
+    def shade(
+        self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
+    ) -> Tensor:
+        """See `ResidualField`; on the CPU only."""
+        texels = self.texels if learns else self.texels.detach()
+        return texel_colors(fragments, base, texels, self.tiles, bound, moves_surfels)

@@ -31,7 +31,7 @@ from bitymi_ns.ops.constants import IMAGE_CHANNELS
 
 from .camera import Camera
 from .config import SceneConfig
-from .field import HashField
+from .field import ResidualField
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 """Names of the per-surfel parameters that every scene has."""
@@ -77,7 +77,7 @@ class Scene(nn.Module):
     Args:
         config: the representation.
         surfels: initial per-surfel parameters by name (docs/overview.md), first dimension N each.
-        field: residual colour field, None = surfels alone.
+        field: residual colours: `HashField`, or `TexelField`; None = surfels alone.
         near: nearest drawn depth, camera z, where the configuration does not give it.
 
     Raises:
@@ -85,7 +85,7 @@ class Scene(nn.Module):
     """
 
     def __init__(
-        self, config: SceneConfig, surfels: Mapping[str, Tensor], field: HashField | None, near: float = NEAR
+        self, config: SceneConfig, surfels: Mapping[str, Tensor], field: ResidualField | None, near: float = NEAR
     ) -> None:
         super().__init__()
         names = (*GEOMETRY, *VIEW_COLORS[config.view_color].names)
@@ -142,24 +142,17 @@ class Scene(nn.Module):
         """
         p = self.surfels
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.through_pixel)
-        geometry, weights = None, ()
-        if self.field is not None and field_mode != "off":
-            geometry, weights = self.field.geometry, self.field.weights
-            if field_mode == "frozen":
-                weights = tuple(w.detach() for w in weights)
+        field = None if field_mode == "off" else self.field
+        learns, bound = field_mode == "train", self.config.weight_bound if weight_bound is None else weight_bound
         base = self.base_color(projection)
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
             fragments = trace(part, self.config.rim, most)
-            colors = shade(
-                fragments,
-                base,
-                part.frames,
-                geometry,
-                weights,
-                self.config.weight_bound if weight_bound is None else weight_bound,
-                move_surfels=self.config.texture_moves_surfels and field_mode == "train",
-            )
+            if field is None:
+                colors = shade(fragments, base, part.frames)
+            else:
+                moves = self.config.texture_moves_surfels and learns
+                colors = field.shade(fragments, base, part.frames, bound, learns, moves)
             image = composite_image(fragments, part, colors, maps)
             if beta_alone:
                 image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)

@@ -22,9 +22,14 @@ def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = Adam
         return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps)
 
 
+def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
+    """One optimiser per surfel parameter, under its name."""
+    return {name: adam([p]) for name, p in scene.surfels.items()}
+
+
 def make_optimizers(scene: Scene) -> dict[str, Adam]:
-    """One optimiser per surfel parameter, under its name, and `field_table` and `field_mlp`."""
-    optimizers = {name: adam([p]) for name, p in scene.surfels.items()}
+    """Those of the surfels, and `field_table` and `field_mlp`."""
+    optimizers = surfel_optimizers(scene)
     if scene.field is not None:
         table, *mlp = scene.field.weights
         optimizers["field_table"] = adam([table], AdamConfig.field_betas)

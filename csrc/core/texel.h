@@ -28,11 +28,13 @@ BT_HD S texel_centre(int i, int r, S extent) {
   return extent * (S(2 * i + 1) / S(r) - S(1));
 }
 
-// The texels between which the fetch interpolates, as offsets from the tile's first (rows along v), and their weights.
+// The texels between which the fetch interpolates, as offsets from the tile's first (rows along v), their weights, and
+// the position from the first texel's centre, in texels.
 template <class S>
 struct TexelCorners {
   int64_t at[4];
   S weight[4];
+  S x, y;
 };
 template <class S>
 BT_HD TexelCorners<S> texel_corners(S u, S v, int r_u, int r_v, S extent) {
@@ -41,10 +43,13 @@ BT_HD TexelCorners<S> texel_corners(S u, S v, int r_u, int r_v, S extent) {
   const S fx = x - S(x0), fy = y - S(y0);
   const int64_t corner = int64_t(y0) * r_u + x0, right = x0 + 1 < r_u ? 1 : 0, down = y0 + 1 < r_v ? r_u : 0;
   return {{corner, corner + right, corner + down, corner + down + right},
-          {(S(1) - fx) * (S(1) - fy), fx * (S(1) - fy), (S(1) - fx) * fy, fx * fy}};
+          {(S(1) - fx) * (S(1) - fy), fx * (S(1) - fy), (S(1) - fx) * fy, fx * fy},
+          x,
+          y};
 }
 
-// Residual colour there, and its vector-Jacobian product: the fetch is linear in the texels.
+// Residual colour there, and its vector-Jacobian products: the fetch is linear in the texels, and along u and v between
+// texel centres.
 template <class S>
 BT_HD Vec3<S> texel_fetch(const S* tile, const TexelCorners<S>& c) {
   Vec3<S> sum = c.weight[0] * load3(tile + 3 * c.at[0]);
@@ -54,6 +59,18 @@ BT_HD Vec3<S> texel_fetch(const S* tile, const TexelCorners<S>& c) {
 template <class S>
 BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
   for (int k = 0; k < 4; ++k) store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + c.weight[k] * g);
+}
+// Adds the gradient with respect to u and v. It is 0 beyond the outer texel centres; at a centre, where the slope
+// jumps, it is that of the side of larger coordinates.
+template <class S>
+BT_HD void texel_fetch_uv_vjp(const S* tile, const TexelCorners<S>& c, int r_u, int r_v, S extent, Vec3<S> g, S& du,
+                              S& dv) {
+  S along[4];
+  for (int k = 0; k < 4; ++k) along[k] = dot(g, load3(tile + 3 * c.at[k]));
+  const S fx = c.weight[1] + c.weight[3], fy = c.weight[2] + c.weight[3];
+  // of the last texel the neighbour is itself: the difference is 0
+  if (c.x > S(0)) du += S(r_u) / (S(2) * extent) * ((S(1) - fy) * (along[1] - along[0]) + fy * (along[3] - along[2]));
+  if (c.y > S(0)) dv += S(r_v) / (S(2) * extent) * ((S(1) - fx) * (along[2] - along[0]) + fx * (along[3] - along[1]));
 }
 
 }  // namespace bt

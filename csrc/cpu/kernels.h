@@ -128,6 +128,10 @@ void texel_image_forward(const TexelForward<S>& a);
 template <class S>
 void texel_image_backward(const TexelBackward<S>& a);
 template <class S>
+void texel_colors_forward(const TexelColorsForward<S>& a);
+template <class S>
+void texel_colors_backward(const TexelColorsBackward<S>& a);
+template <class S>
 void ssim(const Ssim<S>& a);
 
 // An atlas as the renderer reads it: every surfel's tile in one run, row by row. In pages the rows of a tile lie far

@@ -1,5 +1,8 @@
-// Colours from texels, summed per pixel, and their backward pass: what the baked renderer shows, differentiable.
+// Colours from texels, of every fragment or summed per pixel, and their backward passes: what the baked renderer shows,
+// differentiable.
 #include "core/texel.h"
+
+#include <numeric>
 
 #include "core/shading.h"
 #include "cpu/kernels.h"
@@ -23,6 +26,49 @@ struct Patch {
         view(view_base(load3(tiles.base + 3 * id))) {}
   bool textured() const { return size[0] > 0; }
   TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
+};
+
+// Fragments of one surfel that follow each other, from `start[r]` to `start[r + 1]`; `order` sorts the runs by surfel.
+struct Runs {
+  const int32_t* surfel;  // of every fragment
+  const int64_t *start, *order;
+  int64_t count;
+
+  int64_t id(int64_t k) const { return surfel[start[order[k]]]; }
+};
+
+// fn(k, last) for the runs order[k] to order[last - 1] of every surfel. A thread takes whole surfels: what is added to
+// their tiles is added by it alone, and in the order of the list.
+template <class F>
+void for_surfels(const Runs& runs, F&& fn) {
+  std::vector<int64_t> cost(runs.count + 1, 0);
+  for (int64_t r = 0; r < runs.count; ++r)
+    cost[r + 1] = cost[r] + runs.start[runs.order[r] + 1] - runs.start[runs.order[r]];
+  parallel_tiles(cost.data(), runs.count, 1 << 20, [&](int, int64_t begin, int64_t end) {
+    while (begin > 0 && begin < runs.count && runs.id(begin) == runs.id(begin - 1)) ++begin;
+    while (end < runs.count && runs.id(end) == runs.id(end - 1)) ++end;
+    for (int64_t k = begin, last; k < end; k = last) {
+      for (last = k + 1; last < end && runs.id(last) == runs.id(k);) ++last;
+      fn(k, last);
+    }
+  });
+}
+
+// The runs of a fragment list of n surfels.
+struct FoundRuns {
+  std::vector<int64_t> start, order;
+
+  FoundRuns(const int32_t* surfel, int64_t fragments, int64_t n) : start{0} {
+    std::vector<int64_t> next(n + 1, 0);  // first the number of runs, then the place of a surfel's next one
+    for (int64_t i = 0; i < fragments; ++i) {
+      if (i + 1 < fragments && surfel[i + 1] == surfel[i]) continue;
+      start.push_back(i + 1);
+      ++next[surfel[i] + 1];
+    }
+    std::partial_sum(next.begin(), next.end(), next.begin());
+    order.resize(start.size() - 1);
+    for (size_t r = 0; r < order.size(); ++r) order[next[surfel[start[r]]]++] = int64_t(r);
+  }
 };
 }  // namespace
 
@@ -55,22 +101,16 @@ template <class S>
 void texel_image_backward(const TexelBackward<S>& a) {
   const TexelFragments<S>& f = a.f;
   const TexelTiles<S>& table = a.table;
-  const int64_t *run_start = a.runs.start, *order = a.order, runs = a.runs.tiles;
+  const Runs runs{f.surfel, a.runs.start, a.order, a.runs.tiles};
   const S *base = table.base, *texels = table.values, *dimage = a.dimage, bound = a.bound;
   S *dtexels = a.dtexels, *dbase = a.dbase;
   if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
-  // `order` sorts the runs by surfel. A thread takes whole surfels: their tiles are its own, nothing is added twice.
-  std::vector<int64_t> cost(runs + 1, 0);
-  for (int64_t r = 0; r < runs; ++r) cost[r + 1] = cost[r] + run_start[order[r] + 1] - run_start[order[r]];
-  parallel_tiles(cost.data(), runs, 1 << 20, [&](int, int64_t begin, int64_t end) {
-    const auto surfel = [&](int64_t r) { return f.surfel[run_start[order[r]]]; };
-    while (begin > 0 && begin < runs && surfel(begin) == surfel(begin - 1)) ++begin;
-    while (end < runs && surfel(end) == surfel(end - 1)) ++end;
-    for (int64_t r = begin; r < end; ++r) {
-      const int64_t id = surfel(r);
-      const Patch<S> patch(table, id);
+  for_surfels(runs, [&](int64_t first, int64_t last) {
+    const int64_t id = runs.id(first);
+    const Patch<S> patch(table, id);
+    for (int64_t r = first; r < last; ++r) {
       Vec3<S> sum = {S(0), S(0), S(0)};
-      for (int64_t i = run_start[order[r]]; i < run_start[order[r] + 1]; ++i) {
+      for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
         Vec3<S> g = f.weight[i] * load3(dimage + 3 * int64_t(f.pixel[i]));
         if (patch.textured() && f.weight[i] >= bound) {
           const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
@@ -85,9 +125,57 @@ void texel_image_backward(const TexelBackward<S>& a) {
   });
 }
 
-#define BT_INSTANTIATE(S)                                    \
-  template void texel_image_forward(const TexelForward<S>&); \
-  template void texel_image_backward(const TexelBackward<S>&);
+template <class S>
+void texel_colors_forward(const TexelColorsForward<S>& a) {
+  const FragmentArrays<S>& f = a.f;
+  parallel_parts(f.total, 1024, [&](int, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end;) {
+      const int32_t id = f.surfel[i];
+      const Patch<S> patch(a.table, id);
+      for (; i < end && f.surfel[i] == id; ++i) {
+        Vec3<S> c = patch.view;
+        if (patch.textured() && f.weight[i] >= a.bound)
+          c = shaded(c, texel_fetch(a.table.values + 3 * patch.first, patch.corners(f.uv[i], f.uv[f.total + i])));
+        store3(a.colors + 3 * i, c);
+      }
+    }
+  });
+}
+
+template <class S>
+void texel_colors_backward(const TexelColorsBackward<S>& a) {
+  const FragmentArrays<S>& f = a.f;
+  const TexelTiles<S>& table = a.table;
+  S *duv = a.duv, *dtexels = a.dtexels, *dbase = a.dbase;
+  if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
+  if (dtexels) std::fill(dtexels, dtexels + 3 * table.texels, S(0));
+  if (duv) std::fill(duv, duv + 2 * f.total, S(0));
+  const FoundRuns found(f.surfel, f.total, table.n);
+  const Runs runs{f.surfel, found.start.data(), found.order.data(), int64_t(found.order.size())};
+  for_surfels(runs, [&](int64_t first, int64_t last) {
+    const int64_t id = runs.id(first);
+    const Patch<S> patch(table, id);
+    const S* tile = table.values + 3 * patch.first;
+    Vec3<S> sum = {S(0), S(0), S(0)};
+    for (int64_t r = first; r < last; ++r)
+      for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
+        const Vec3<S> g = residual_gradient(load3(a.colors + 3 * i), load3(a.dcolors + 3 * i));
+        sum = sum + g;
+        if (!patch.textured() || f.weight[i] < a.bound) continue;
+        const auto corners = patch.corners(f.uv[i], f.uv[f.total + i]);
+        if (dtexels) texel_fetch_vjp(corners, g, dtexels + 3 * patch.first);
+        if (duv)
+          texel_fetch_uv_vjp(tile, corners, patch.size[0], patch.size[1], patch.extent, g, duv[i], duv[f.total + i]);
+      }
+    if (dbase) store3(dbase + 3 * id, base_gradient(load3(table.base + 3 * id), sum));
+  });
+}
+
+#define BT_INSTANTIATE(S)                                           \
+  template void texel_image_forward(const TexelForward<S>&);        \
+  template void texel_image_backward(const TexelBackward<S>&);      \
+  template void texel_colors_forward(const TexelColorsForward<S>&); \
+  template void texel_colors_backward(const TexelColorsBackward<S>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -1,4 +1,4 @@
-// Arguments of the images that texels give, and of their gradient.
+// Arguments of the images and colours that texels give, and of their gradients.
 #pragma once
 
 #include "ops/arguments.h"
@@ -82,6 +82,44 @@ struct TexelBackward {
     r.rows("dimage", dimage, pixels, 3);
     r.maybe("dtexels", dtexels, 3 * table.texels);
     r.maybe("dbase", dbase, 3 * table.n);
+  }
+};
+
+// colors [F, 3] = relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile relu(base + 0.5)
+template <class S>
+struct TexelColorsForward {
+  FragmentArrays<S> f;
+  S bound;
+  TexelTiles<S> table;
+  S* colors;
+
+  template <class R>
+  void fields(R& r) {
+    f.fields(r);
+    r.number("bound", bound);
+    table.fields(r);
+    r.array("colors", colors, 3 * f.total);
+  }
+};
+// Writes dbase [n, 3], dtexels [texels, 3] and duv [2, F]; each may be null.
+template <class S>
+struct TexelColorsBackward {
+  FragmentArrays<S> f;
+  S bound;
+  TexelTiles<S> table;
+  const S *colors, *dcolors;
+  S *dbase, *dtexels, *duv;
+
+  template <class R>
+  void fields(R& r) {
+    f.fields(r);
+    r.number("bound", bound);
+    table.fields(r);
+    r.array("colors", colors, 3 * f.total);
+    r.array("dcolors", dcolors, 3 * f.total);
+    r.maybe("dbase", dbase, 3 * table.n);
+    r.maybe("dtexels", dtexels, 3 * table.texels);
+    r.maybe("duv", duv, 2 * f.total);
   }
 };
 

@@ -88,6 +88,28 @@ def test_the_texels_are_fine_tuned(
     assert "The export will take about" in out and "GB of memory for 10 training photographs of 48 x 36" in out
 
 
+def test_the_scene_is_polished(
+    trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_export(trained, tmp_path / "b", tolerance=TOLERANCE, polish_steps=30, finetune_steps=8)
+    statistics = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]
+    polished, tuned = statistics["polish"], statistics["finetune"]
+    assert polished["steps"] <= 30 and polished["views"] + polished["held_in_views"] == 10
+    assert polished["psnr_held_in"]["after"] == max(psnr for _, psnr in polished["curve"])
+    assert tuned["psnr_held_in"]["before"] == pytest.approx(polished["psnr_held_in"]["after"], abs=0.1)
+    assert polished["error_before"]["rms"] and "error_before" not in tuned and "error" not in statistics
+    stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "polished.json")["psnr"]
+    assert stored == pytest.approx(tuned["psnr_held_out"]["after"], abs=0.1)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "polishing" in out and "Polish" in out and "Fine-tuning" in out
+    bundle, checks = check_files(tmp_path / "b")
+    assert bundle is not None and all(check.ok for check in checks)
+    found = {check.name: check for check in check_run(bundle, trained.get_base_dir() / "config.yml", views=1)}
+    assert all(check.ok for check in found.values())
+    assert "the surfels learned after the bake" in found["error of the view colours"].detail
+    assert "the texels were changed" in found["error against the field"].detail
+
+
 def test_fine_tuning_mends_an_atlas_that_is_too_dark(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

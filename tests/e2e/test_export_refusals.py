@@ -48,6 +48,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
     ("options", "message"),
     [
         ({"finetune_steps": -1}, "--finetune-steps must not be negative"),
+        ({"polish_steps": -1}, "--polish-steps must not be negative"),
         ({"finetune_memory": math.inf}, "--finetune-memory must be from 0 to"),
         ({"finetune_memory": math.nan}, "--finetune-memory must be from 0 to"),
         ({"page_width": 100}, "page width must be a power of two"),

@@ -65,6 +65,16 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     assert needed[0] == needed[1]
 
 
+def test_surfels_that_learn_in_an_export_take_what_they_take_in_training(
+    scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = []
+    for learning in (0, 1_000_000):
+        memory.state_export(scene[0], [scene[1]], 0, learning)
+        needed.append(gigabytes(said(capsys)))
+    assert needed[1] - needed[0] == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
+
+
 def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:
     output = scene[0].render(scene[1])
     assert trace_cpu.count(output.projection) == len(output.fragments)

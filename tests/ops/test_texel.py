@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
@@ -143,3 +147,119 @@ def test_what_does_not_fit_is_refused() -> None:
         ops.texel_image(fragments, case.base, case.texels[1:], case.tiles)
     with pytest.raises(ValueError, match="base must have shape"):
         ops.texel_image(fragments, case.base[1:], case.texels, case.tiles)
+    with pytest.raises(ValueError, match="the tiles hold"):
+        ops.texel_colors(case.fragments, case.base, case.texels[1:], case.tiles)
+    with pytest.raises(ValueError, match="fragments are those of 31 surfels, not of 30"):
+        ops.texel_colors(replace(case.fragments, surfels=31), case.base, case.texels, case.tiles)
+
+
+def colors_by_reference(case: Case, base: Tensor, texels: Tensor, uv: Tensor, bound: float) -> Tensor:
+    """[F, 3]: the reference's image of pictures with one fragment per pixel, all of weight 1."""
+    f, tiles = case.fragments, case.tiles
+    rows = zip(tiles.first.tolist(), tiles.size.tolist(), strict=True)
+    listed = [texels[first : first + r_u * r_v].view(r_v, r_u, 3) for first, (r_u, r_v) in rows]
+    light = f.weight < bound  # drawn without residual
+    listed_none = [tile[:0] for tile in listed]
+    each = torch.arange(len(f))
+    extent = tiles.extent.double()
+    one = torch.ones(len(f), dtype=torch.float64)
+    plain, full = (
+        reference(one, uv, f.surfel, each, base, tiles_of, extent, 0.0, len(f)) for tiles_of in (listed_none, listed)
+    )
+    return torch.where(light[:, None], plain, full)
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.05])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_colors_and_gradients_against_the_reference(dtype: torch.dtype, bound: float) -> None:
+    case = Case(dtype=dtype)
+    f = replace(case.fragments, uv=case.fragments.uv.clone())
+    got = [t.clone().requires_grad_() for t in (case.base, case.texels, f.uv)]
+    want = [t.detach().double().requires_grad_() for t in got]
+    colors = ops.texel_colors(replace(f, uv=got[2]), got[0], got[1], case.tiles, bound)
+    expected = colors_by_reference(case, *want, bound)
+    loss_weights = torch.linspace(-1, 1, colors.numel(), dtype=torch.float64).view_as(colors)
+    (colors * loss_weights.to(dtype)).sum().backward()
+    (expected * loss_weights).sum().backward()
+    tolerance = 1e-12 if dtype == torch.float64 else 2e-5
+    torch.testing.assert_close(colors.double(), expected, rtol=tolerance, atol=tolerance)
+    for mine, theirs in zip(got, want, strict=True):
+        assert theirs.grad.abs().max() > 0.1
+        torch.testing.assert_close(mine.grad.double(), theirs.grad, rtol=100 * tolerance, atol=100 * tolerance)
+    still = [t.detach().clone().requires_grad_() for t in got]
+    fixed = ops.texel_colors(replace(f, uv=still[2]), still[0], still[1], case.tiles, bound, move_surfels=False)
+    (fixed * loss_weights.to(dtype)).sum().backward()
+    assert still[2].grad is None and all(torch.equal(a.grad, b.grad) for a, b in zip(still[:2], got, strict=False))
+
+
+def one_surfel(uv: Tensor, weight: Tensor) -> ops.Fragments:
+    """Fragments of one surfel, given where they are."""
+    count = uv.shape[1]
+    zeros, start = torch.zeros(count, dtype=torch.int32), torch.tensor([0, count])
+    pixel = torch.arange(count, dtype=torch.int32)
+    return ops.Fragments(weight, uv, weight, zeros, pixel, weight, start, count, 1, start, 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from([(1, 1), (4, 1), (1, 4), (2, 2), (4, 8), (64, 4)]),
+    st.sampled_from([1e-6, 1e-3, 0.5, 3.0, 16.0]),
+    st.integers(0, 2**31),
+)
+def test_gradients_of_colors_by_finite_differences(size: tuple[int, int], extent: float, seed: int) -> None:
+    """At places between the texel centres and beyond the outer ones, in tiles of any size."""
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low
+
+    cell = torch.stack([torch.randint(-2, side + 2, (12,), generator=g) for side in size]) + uniform(0.05, 0.95, 2, 12)
+    sides = torch.tensor(size, dtype=torch.float64)[:, None]
+    uv = (cell + 0.5) / sides * 2 * extent - extent  # `cell` texels from the first one's centre
+    tiles = ops.TexelTiles.of_sizes(torch.tensor([size]), torch.tensor([extent], dtype=torch.float64))
+    base, texels = uniform(-0.4, 0.5, 1, 3), uniform(0.1, 0.6, tiles.count, 3)
+    weight = torch.where(torch.arange(12) % 4 == 0, 0.01, 0.02).double()
+    leaves = [t.requires_grad_() for t in (base, texels, uv / extent)]
+
+    def colors(base: Tensor, texels: Tensor, scaled: Tensor) -> Tensor:
+        return ops.texel_colors(one_surfel(scaled * extent, weight), base, texels, tiles, 0.02)
+
+    assert torch.autograd.gradcheck(colors, leaves)
+    colors(*leaves).sum().backward()
+    slope = leaves[2].grad
+    beyond = (cell < 0) | (cell > sides - 1)
+    assert not slope[beyond].any() and not slope[:, ::4].any()
+
+
+def test_colors_at_the_borders() -> None:
+    """At the outer centres the slope is 0, and a weight at the bound has its residual."""
+    tiles = ops.TexelTiles.of_sizes(torch.tensor([[4, 4]]), torch.tensor([2.0]))
+    texels = torch.arange(16.0)[:, None].expand(-1, 3).contiguous()
+    centre = 1.5
+    uv = torch.tensor([[-centre, centre, 0.0, 0.0], [0.5, 0.5, -centre, 3.0]]).requires_grad_()
+    weight = torch.tensor([0.02, 0.02, 0.02, 0.0199])
+    colors = ops.texel_colors(one_surfel(uv, weight), torch.zeros(1, 3), texels, tiles, 0.02)
+    torch.testing.assert_close(colors[:, 0], torch.tensor([8.5, 11.5, 2.0, 0.5]))
+    colors[:, 0].sum().backward()
+    torch.testing.assert_close(uv.grad, torch.tensor([[0.0, 0.0, 1.0, 0.0], [4.0, 4.0, 0.0, 0.0]]))
+
+
+def test_colors_sum_to_the_image_of_the_texels() -> None:
+    case = Case(200, width=150, height=90)
+    colors = ops.texel_colors(case.fragments, case.base, case.texels, case.tiles, 0.03)
+    image = ops.texel_image(ops.TexelFragments.of(case.fragments), case.base, case.texels, case.tiles, 0.03)
+    torch.testing.assert_close(ops.composite(case.fragments, colors), image, rtol=1e-12, atol=1e-12)
+
+
+def test_gradients_of_colors_do_not_depend_on_the_number_of_threads() -> None:
+    case = Case(300, torch.float32, width=150, height=90)
+    results = []
+    for threads in (1, 2, 3, 7):
+        backend.module(torch.device("cpu")).set_num_threads(threads)
+        leaves = [t.clone().requires_grad_() for t in (case.base, case.texels, case.fragments.uv)]
+        colors = ops.texel_colors(replace(case.fragments, uv=leaves[2]), *leaves[:2], case.tiles, 0.02)
+        colors.square().sum().backward()
+        results.append([colors.detach(), *(leaf.grad for leaf in leaves)])
+    backend.module(torch.device("cpu")).set_num_threads(0)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(other, results[0], strict=True))

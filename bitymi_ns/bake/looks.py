@@ -1,0 +1,90 @@
+"""What a descent on the training photographs keeps: the state that shows best the views that it did not learn from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Generic, Protocol, TypeVar
+
+from bitymi_ns.bake.statistics import FineTuning, Gain
+
+S = TypeVar("S")
+
+
+class LookOptions(Protocol):
+    """The part of the options that decides when it is looked."""
+
+    steps: int
+    checks: int
+    patience: int
+
+
+class Looks(Generic[S]):
+    """The looks at the views that were set aside.
+
+    Attributes:
+        best: the state that showed them best, the first one where none was better.
+        curve: (step, dB over these views) of every look.
+    """
+
+    def __init__(self, options: LookOptions, psnr: float, first: S) -> None:
+        """
+        Args:
+            options: see `LookOptions`.
+            psnr: of the views before the first step, dB.
+            first: the state then.
+        """
+        self._steps, self._patience = options.steps, options.patience
+        self._every = -(-options.steps // options.checks)
+        self.best, self.curve = first, [(0, psnr)]
+
+    def due(self, done: int) -> bool:
+        """Whether it is to be looked after so many steps."""
+        return done % self._every == 0 or done == self._steps
+
+    def note(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
+        """A look after so many steps.
+
+        Args:
+            psnr: of the views, dB.
+            state: makes a copy of the state.
+
+        Returns:
+            whether more steps are worth it: some of the last looks were no worse than all before.
+        """
+        self.curve.append((done, psnr))
+        highest = max(p for _, p in self.curve)
+        if psnr == highest:
+            self.best = state()
+            return True
+        return not all(p < highest for _, p in self.curve[-self._patience :])
+
+    def statistics(self, views: int, set_aside: int, seconds: float, cpu_seconds: float) -> FineTuning:
+        """What is told of the descent."""
+        best_step, best = max(self.curve, key=lambda point: point[1])
+        return FineTuning(
+            views=views,
+            held_in_views=set_aside,
+            steps=self.curve[-1][0],
+            steps_asked=self._steps,
+            best_step=best_step,
+            psnr_held_in=gain(self.curve[0][1], best),
+            curve=[(step, round(psnr, 4)) for step, psnr in self.curve],
+            seconds=round(seconds, 2),
+            cpu_seconds=round(cpu_seconds, 2),
+        )
+
+
+def gain(before: float, after: float) -> Gain:
+    """Of two PSNRs, dB."""
+    return Gain(before=round(before, 4), after=round(after, 4))
+
+
+def falling(rate: float, step: int, steps: int) -> float:
+    """A rate that falls to 0 as a cosine."""
+    return rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+
+
+def set_aside(count: int, every: int) -> tuple[list[int], list[int]]:
+    """Numbers of the views that are looked at, every so-many-th one, and of those that are learned from."""
+    return list(range(0, count, every)), [i for i in range(count) if i % every]

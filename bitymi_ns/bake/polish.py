@@ -1,0 +1,205 @@
+"""The polish: after the bake texels, geometry, opacities and view colours learn together, without the network."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.looks import Looks, falling, gain, set_aside
+from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.statistics import FineTuning
+from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage, numbers
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.losses import mean_psnr, photometric, psnr
+from bitymi_ns.train.memory import MemoryBudget, OnDemand
+from bitymi_ns.train.optimizers import forget_gradients, step, surfel_optimizers
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.views import View, training_order
+
+SLOWER = 0.3
+"""Factor of all rates when a step was not finite, as that of the guard of training."""
+ATTEMPTS = 5
+"""How often a polish goes back to its best state before it ends with that."""
+
+
+@dataclass
+class PolishOptions(TuneOptions):
+    """How a baked scene is polished: `rate` and `prior` are of the texels."""
+
+    steps: int = 200
+    share: float = 0.4
+    """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
+    checks: int = 10
+
+    def check(self) -> None:
+        """Refuses values that make no sense."""
+        super().check()
+        if not self.share > 0:
+            raise ValueError(f"share of the polish must be positive, not {self.share}")
+
+
+class _Polish:
+    """One polish, step by step."""
+
+    def __init__(
+        self, baked: Baked, views: Sequence[View], background: Tensor, options: PolishOptions, train: TrainConfig
+    ) -> None:
+        self.texels = TexelScene(baked, background)
+        drawn = baked.scene
+        config = SceneConfig(
+            view_color=drawn.view_color,  # type: ignore[arg-type]
+            weight_bound=drawn.weight_bound,
+            prefilter=drawn.prefilter,  # type: ignore[arg-type]
+            texture_moves_surfels=True,
+        )
+        self.field = TexelField(self.texels.tiles, self.texels.texels)
+        self.scene = Scene(config, drawn.surfels, self.field, near=drawn.near)
+        self.options, self.background = options, background.cpu()
+        centers = torch.stack([view.camera.center.cpu() for view in views])
+        extent = scene_extent(centers, drawn.surfels["means"])
+        self.schedule = Schedule(replace(train, lr=train.lr.times(options.share)), options.steps, extent)
+        self.optimizers = surfel_optimizers(self.scene)
+        self.factor = 1.0
+
+    def shown(self, view: View) -> Tensor:
+        """[H, W, 3] the scene as a view's photograph shows it."""
+        output = self.scene.render(view.camera.to("cpu"), self.background)
+        return view.shown(output.rgb, output.alpha, self.background)
+
+    @torch.no_grad()
+    def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
+        """Mean dB over the views of which any pixel counts."""
+        values = []
+        for view in (views[i] for i in range(len(views))):
+            rgb = self.shown(view).clamp(0.0, 1.0)
+            values.append(psnr(rgb, view.target(self.background, "cpu"), _mask(view)))
+            progress("looking at the set-aside views", len(values), len(views))
+        return mean_psnr(values)
+
+    def step(self, number: int, view: View, inverse: Tensor) -> bool:
+        """A step on one view; False = it is not finite, and was not done."""
+        options = self.options
+        for name, optimizer in self.optimizers.items():
+            rate = self.factor * falling(self.schedule.lr(name, 0), number, options.steps)
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+        forget_gradients(self.optimizers.values())
+        self.field.texels.grad = None
+        mask, rgb = _mask(view), self.shown(view)
+        loss = photometric(rgb, view.target(self.background, "cpu"), options.ssim_weight, mask)
+        if not math.isfinite(float(loss.detach())):
+            return False
+        if not loss.requires_grad:  # nothing of the scene is in the view
+            return True
+        loss.backward()
+        step(self.optimizers.values())
+        gradient = self.field.texels.grad
+        if gradient is not None:
+            rate = self.factor * falling(options.rate, number, options.steps) * numbers(rgb, mask)
+            with torch.no_grad():
+                self.field.texels.addcmul_(gradient, inverse, value=-rate)
+        return True
+
+    def state(self) -> dict[str, Any]:
+        """A copy of what is learned."""
+        return {name: value.detach().clone() for name, value in self.scene.state_dict().items()}
+
+    def go_back(self, state: dict[str, Any]) -> None:
+        """To an earlier state, with slower steps from here on."""
+        self.scene.load_state_dict(copy.deepcopy(state))
+        self.optimizers = surfel_optimizers(self.scene)
+        self.factor *= SLOWER
+
+
+def polish_scene(
+    baked: Baked,
+    views: Sequence[View],
+    background: Tensor,
+    options: PolishOptions | None = None,
+    train: TrainConfig | None = None,
+    progress: Progress = no_progress,
+    eval_views: Sequence[View] = (),
+) -> Baked:
+    """Lets texels and surfels of a bake learn together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
+
+    Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Surfels keep their tiles with their
+    extents and sizes: a fragment beyond its tile reads the edge, while it learns and when it is drawn. Nothing is
+    densified. The state kept is the one that shows the set-aside views best, the bake itself where none is better. A
+    step that is not finite takes the scene back to that state, with smaller rates.
+
+    It runs on the CPU, as `tune_atlas` does.
+
+    Args:
+        baked: a bake with an atlas and all of its view colours (`bake(reduce_colors=False)`).
+        views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
+        background: [3] colour behind the scene.
+        options: see `PolishOptions`.
+        train: options of the training, for the learning rates.
+        progress: called after every step.
+        eval_views: views of which the gain is stated; they decide nothing.
+
+    Returns:
+        a new bake with `statistics.polish`, encoded; `baked` itself without change where there are fewer than 4 views.
+
+    Raises:
+        ValueError: there is no atlas, the view colours are reduced, or an option is out of range.
+    """
+    options = options or PolishOptions()
+    options.check()
+    if "view_terms" in baked.scene.surfels:
+        raise ValueError("the view colours are reduced already: polish a bake that was made with reduce_colors=False")
+    if len(views) < FEWEST_VIEWS:
+        return replace(baked, statistics=baked.statistics.but(polish=FineTuning(steps=0, views=len(views))))
+    started, cpu_started = time.perf_counter(), time.process_time()
+    held_in, learned = (
+        OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
+        for rows in set_aside(len(views), options.held_in_every)
+    )
+    run = _Polish(baked, views, background, options, train or TrainConfig())
+    before = run.psnr(eval_views) if eval_views else math.nan
+    looks = _learn(run, learned, held_in, progress)
+    run.scene.load_state_dict(looks.best)
+    spent = time.perf_counter() - started, time.process_time() - cpu_started
+    statistics = looks.statistics(len(learned), len(held_in), *spent).but(
+        error_before=baked.statistics.error,
+        psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None,
+    )
+    texels = run.field.texels.detach()
+    result = run.texels.baked(texels, progress).with_surfels(dict(run.scene.surfels))
+    return replace(result, statistics=result.statistics.but(polish=statistics))
+
+
+def _mask(view: View) -> Tensor | None:
+    return None if view.mask is None else view.mask.cpu()
+
+
+def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progress: Progress) -> Looks[dict[str, Any]]:
+    """The state that shows the set-aside views best, and the looks at these."""
+    options = run.options
+    looks = Looks(options, run.psnr(held_in, progress), run.state())
+    seen = coverage(run.texels, TexelViews(run.texels, views, MemoryBudget(0)), progress)
+    inverse, attempts = 1.0 / (seen + options.prior), 0  # [T, 1]
+    for number in range(options.steps):
+        view = views[training_order(len(views), options.seed, number)]
+        if not run.step(number, view, inverse):
+            attempts += 1
+            run.go_back(looks.best)
+        more = attempts < ATTEMPTS
+        if not more or looks.due(number + 1):
+            more = looks.note(number + 1, run.psnr(held_in), run.state) and more
+        progress("polishing", number + 1, options.steps if more else number + 1)
+        if not more:
+            break
+    return looks

@@ -20,7 +20,12 @@ ROOTS: dict[str, Any] = {
     "--sfm.": SfmOptions(),
     "ns-export ... --": BakeOptions(),
 }
-ELSEWHERE = {"--max-num-iterations", "ns-export ... --exact", "ns-export ... --finetune-steps"}
+ELSEWHERE = {
+    "--max-num-iterations",
+    "ns-export ... --exact",
+    "ns-export ... --finetune-steps",
+    "ns-export ... --polish-steps",
+}
 """Options that are declared with the commands, which need nerfstudio."""
 
 

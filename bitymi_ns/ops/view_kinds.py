@@ -1,6 +1,6 @@
 """The kinds of view colour: all that the package knows of each, in one entry of `VIEW_COLORS`.
 
-What a kind is worth in a direction is computed by csrc/core/view_color.h, and in float64 by
+What a kind is worth in a direction is computed by csrc/core/view_kinds.h, and in float64 by
 `ops.reference.view_color`. Everything else that depends on the kind asks its entry here.
 """
 

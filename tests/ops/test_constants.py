@@ -24,7 +24,7 @@ SOURCES = [
 STATED = {
     "relu of f_view + 0.5": (r"relu\(.*\+ S?\(?(0\.5|kColorBias|COLOR_BIAS)", ["shading.h", "shade.py"]),
     "smallest alpha": (r"1(\.0)? ?/ ?255\b(?!\))", ["surfel.h"]),
-    "harmonic of degree 0": (r"= 0\.28209", ["view_color.h"]),
+    "harmonic of degree 0": (r"= 0\.28209", ["view_kinds.h"]),
     "side of a tile": (r"(TILE|kTile\w*) = 16", ["bounds.h"]),
     "channels of an image": (r"kImageChannels = ", ["blend.h"]),
     "weight of a fragment": (r"sigma \* (p\.)?transmittance", ["blend.h"]),
@@ -41,7 +41,7 @@ STATED = {
     "gradient of a point of a surfel": (r"dot\(dx, load3\(", ["field.h"]),
     "where a camera stands": (r"-\(double\(\w\[k\]\) \*", ["camera.h"]),
     "reals as sort keys": (r"\? ~bits", ["primitives.h"]),
-    "temperature": (r"min_\(.*kLogTauMax", ["view_color.h"]),
+    "temperature": (r"min_\(.*kLogTauMax", ["view_kinds.h"]),
     "golden angle": (r"3\.0 - (math\.sqrt\(5|5\.0)", ["sphere.py"]),
 }
 

@@ -22,7 +22,7 @@ from bitymi_ns.train.config import LearningRates
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 KNOWING = ("ops/view_kinds.py", "ops/reference/view_color.py")
-"""The entries and the float64 twins; the formulas are in csrc/core/view_color.h."""
+"""The entries and the float64 twins; the formulas are in csrc/core/view_kinds.h."""
 NAMES = frozenset({*VIEW_COLORS, *VIEW_PARAMETERS})
 
 

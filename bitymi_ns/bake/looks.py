@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
+from torch import Tensor
+
 from bitymi_ns.bake.statistics import FineTuning, Gain
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.train.losses import mean_psnr, psnr
 
 S = TypeVar("S")
 
@@ -73,6 +77,24 @@ class Looks(Generic[S]):
             seconds=round(seconds, 2),
             cpu_seconds=round(cpu_seconds, 2),
         )
+
+
+def look(
+    pictures: Iterable[tuple[Tensor, Tensor, Tensor | None]], count: int, progress: Progress = no_progress
+) -> float:
+    """Mean dB over the views of which any pixel counts.
+
+    Args:
+        pictures: of every view what is drawn and what its photograph shows [H, W, 3], and the mask of the pixels that
+            count. They are made one by one.
+        count: of them.
+        progress: called after each.
+    """
+    values = []
+    for rgb, target, mask in pictures:
+        values.append(psnr(rgb.clamp(0.0, 1.0), target, mask))
+        progress("looking at the set-aside views", len(values), count)
+    return mean_psnr(values)
 
 
 def gain(before: float, after: float) -> Gain:

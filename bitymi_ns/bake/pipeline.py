@@ -156,11 +156,9 @@ def bake(
     started, method = time.perf_counter(), bake_method(options)
     rows, left_out = drawable(scene.surfels)
     candidates = _inputs(scene, rows, cameras)
-    inputs = candidates.looked_at(options, progress)
-    if inputs.views is not None and options.drop_unseen:
-        seen = inputs.views.transmittance > 0
-        left_out = left_out.but(unseen=int((~seen).sum()))
-        rows, inputs = rows[seen], inputs.of(seen)
+    inputs, seen = _looked_at(candidates, options, progress)
+    if seen is not None:
+        left_out, rows = left_out.but(unseen=int((~seen).sum())), rows[seen]
     trained = len(scene.surfels["means"])
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
@@ -204,21 +202,17 @@ def with_reduced_colors(baked: Baked, cameras: Sequence[Camera], progress: Progr
     scene, options = baked.scene, baked.options
     surfels = {name: value[rows] for name, value in scene.surfels.items()}
     inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.through_pixel)
-    inputs = inputs.looked_at(options, progress)
-    unseen = 0
-    if inputs.views is not None and options.drop_unseen:
-        seen = inputs.views.transmittance > 0
-        unseen = int((~seen).sum())
+    inputs, seen = _looked_at(inputs, options, progress)
+    if seen is not None:
+        gone = gone.but(unseen=int((~seen).sum()))
         kept[rows] = seen
-        inputs = inputs.of(seen)
     if not bool(kept.any()):
         raise ValueError("no surfel is left to bake after the polish")
     reduced, view_color = bake_method(options).view_color(inputs, progress)
     result = baked.only(kept).with_surfels(reduced)
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None
-    more = gone.but(unseen=unseen)
-    left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in more if n})
+    left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
     statistics = baked.statistics.but(
         surfels=counts.but(
             kept=len(result.rows), left_out=left_out, without_tile=int((result.packing.tiles[:, 3] == 0).sum())
@@ -230,6 +224,15 @@ def with_reduced_colors(baked: Baked, cameras: Sequence[Camera], progress: Progr
     if result.texels is None:
         statistics = statistics.but(atlas=None)
     return replace(result, statistics=statistics)
+
+
+def _looked_at(inputs: BakeInput, options: BakeOptions, progress: Progress) -> tuple[BakeInput, Tensor | None]:
+    """The input with what the views see; and of which surfels [N] bool that is, None = of all, whether seen or not."""
+    inputs = inputs.looked_at(options, progress)
+    if inputs.views is None or not options.drop_unseen:
+        return inputs, None
+    seen = inputs.views.transmittance > 0
+    return inputs.of(seen), seen
 
 
 def _inputs(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> BakeInput:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.looks import Looks, falling, gain, set_aside
+from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
 from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage, numbers
@@ -22,16 +21,11 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import mean_psnr, photometric, psnr
+from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
-from bitymi_ns.train.optimizers import forget_gradients, step, surfel_optimizers
+from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.views import View, training_order
-
-SLOWER = 0.3
-"""Factor of all rates when a step was not finite, as that of the guard of training."""
-ATTEMPTS = 5
-"""How often a polish goes back to its best state before it ends with that."""
 
 
 @dataclass
@@ -71,7 +65,7 @@ class _Polish:
         extent = scene_extent(centers, drawn.surfels["means"])
         self.schedule = Schedule(replace(train, lr=train.lr.times(options.share)), options.steps, extent)
         self.optimizers = surfel_optimizers(self.scene)
-        self.factor = 1.0
+        self.guard, self.factor = train.guard, 1.0
 
     def shown(self, view: View) -> Tensor:
         """[H, W, 3] the scene as a view's photograph shows it."""
@@ -81,20 +75,14 @@ class _Polish:
     @torch.no_grad()
     def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
         """Mean dB over the views of which any pixel counts."""
-        values = []
-        for view in (views[i] for i in range(len(views))):
-            rgb = self.shown(view).clamp(0.0, 1.0)
-            values.append(psnr(rgb, view.target(self.background, "cpu"), _mask(view)))
-            progress("looking at the set-aside views", len(values), len(views))
-        return mean_psnr(values)
+        pictures = ((self.shown(view), view.target(self.background, "cpu"), _mask(view)) for view in views)
+        return look(pictures, len(views), progress)
 
     def step(self, number: int, view: View, inverse: Tensor) -> bool:
         """A step on one view; False = it is not finite, and was not done."""
         options = self.options
         for name, optimizer in self.optimizers.items():
-            rate = self.factor * falling(self.schedule.lr(name, 0), number, options.steps)
-            for group in optimizer.param_groups:
-                group["lr"] = rate
+            set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
         forget_gradients(self.optimizers.values())
         self.field.texels.grad = None
         mask, rgb = _mask(view), self.shown(view)
@@ -118,9 +106,9 @@ class _Polish:
 
     def go_back(self, state: dict[str, Any]) -> None:
         """To an earlier state, with slower steps from here on."""
-        self.scene.load_state_dict(copy.deepcopy(state))
+        self.scene.load_state_dict(state)
         self.optimizers = surfel_optimizers(self.scene)
-        self.factor *= SLOWER
+        self.factor *= self.guard.rates
 
 
 def polish_scene(
@@ -146,7 +134,7 @@ def polish_scene(
         views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
         background: [3] colour behind the scene.
         options: see `PolishOptions`.
-        train: options of the training, for the learning rates.
+        train: options of the training, for the learning rates, and for what is done when a step is not finite.
         progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
 
@@ -196,7 +184,7 @@ def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progres
         if not run.step(number, view, inverse):
             attempts += 1
             run.go_back(looks.best)
-        more = attempts < ATTEMPTS
+        more = attempts < run.guard.rollbacks
         if not more or looks.due(number + 1):
             more = looks.note(number + 1, run.psnr(held_in), run.state) and more
         progress("polishing", number + 1, options.steps if more else number + 1)

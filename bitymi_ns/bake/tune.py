@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.looks import Looks, falling, gain, set_aside
+from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
 from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
@@ -29,7 +29,7 @@ from bitymi_ns.ops import (
 from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.losses import mean_psnr, photometric, psnr
+from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.views import View, shown, training_order
 
@@ -213,12 +213,9 @@ class TexelViews(Sequence[TexelView]):
 
     def psnr(self, texels: Tensor, progress: Progress = no_progress) -> float:
         """Mean dB over the views of which any pixel counts."""
-        values = []
-        for view in self:
-            rgb = self._scene.shown(view, self._scene.render(view, texels))
-            values.append(psnr(rgb.clamp(0.0, 1.0), view.target, view.mask))
-            progress("looking at the set-aside views", len(values), len(self))
-        return mean_psnr(values)
+        scene = self._scene
+        pictures = ((scene.shown(view, scene.render(view, texels)), view.target, view.mask) for view in self)
+        return look(pictures, len(self), progress)
 
 
 def tune_atlas(

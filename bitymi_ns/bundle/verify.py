@@ -109,8 +109,8 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
             return Check(name, False, f"levels {first} to {first + count - 1} stated, the field has {field.levels}")
         field = field.only(first, count)
     options = statistics.options or BakeOptions()
-    subject = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
-    plan = bake_method(options).plan(field, subject.looked_at(options))
+    inputs = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
+    plan = bake_method(options).plan(field, inputs.looked_at(options))
     tiled = bundle.scene.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
     residuals = None if bundle.scene.atlas is None else bundle.scene.residuals().numpy()

@@ -21,6 +21,7 @@ from torch.optim import SparseAdam
 from bitymi_ns.train.agreement import measure_agreement
 from bitymi_ns.train.config import ExposureKind
 from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.views import View
 
 LIMIT = 2.0
@@ -130,7 +131,7 @@ class Exposure:
             return
         self.table.grad = self.table.grad.coalesce()
         self.table.grad.values().nan_to_num_(0.0, 0.0, 0.0)
-        self._optimizer.param_groups[0]["lr"] = rate
+        set_rate(self._optimizer, rate)
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
         with torch.no_grad():

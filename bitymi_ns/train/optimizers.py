@@ -101,6 +101,12 @@ def _ready(optimizer: Optimizer, group: dict[str, Any]) -> list[list[torch.Tenso
     return found
 
 
+def set_rate(optimizer: Optimizer, rate: float) -> None:
+    """Gives an optimiser its learning rate."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
 def forget_gradients(optimizers: Iterable[Optimizer]) -> None:
     """Takes the gradients from all parameters, as `zero_grad` of each optimiser would."""
     for optimizer in optimizers:

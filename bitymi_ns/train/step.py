@@ -19,6 +19,7 @@ from bitymi_ns.train.errors import TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.losses import objective
+from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.resize import ResizeHook
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
@@ -138,9 +139,7 @@ class Training:
 
     def _set_rates(self) -> None:
         for name, optimizer in self.optimizers.items():
-            rate = self.guard.factor * self.schedule.lr(name, self.step)
-            for group in optimizer.param_groups:
-                group["lr"] = rate
+            set_rate(optimizer, self.guard.factor * self.schedule.lr(name, self.step))
 
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput]:
         """`view_losses` of the step's view. Where they are not finite, the guard mends the scene and it is drawn anew.

@@ -127,15 +127,15 @@ void texel_image_backward(const TexelBackward<S>& a) {
 
 template <class S>
 void texel_colors_forward(const TexelColorsForward<S>& a) {
-  const FragmentArrays<S>& f = a.f;
+  const FragmentArrays<S>& f = a.of.f;
   parallel_parts(f.total, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end;) {
       const int32_t id = f.surfel[i];
-      const Patch<S> patch(a.table, id);
+      const Patch<S> patch(a.of.table, id);
       for (; i < end && f.surfel[i] == id; ++i) {
         Vec3<S> c = patch.view;
-        if (patch.textured() && f.weight[i] >= a.bound)
-          c = shaded(c, texel_fetch(a.table.values + 3 * patch.first, patch.corners(f.uv[i], f.uv[f.total + i])));
+        if (patch.textured() && f.weight[i] >= a.of.bound)
+          c = shaded(c, texel_fetch(a.of.table.values + 3 * patch.first, patch.corners(f.uv[i], f.uv[f.total + i])));
         store3(a.colors + 3 * i, c);
       }
     }
@@ -144,8 +144,8 @@ void texel_colors_forward(const TexelColorsForward<S>& a) {
 
 template <class S>
 void texel_colors_backward(const TexelColorsBackward<S>& a) {
-  const FragmentArrays<S>& f = a.f;
-  const TexelTiles<S>& table = a.table;
+  const FragmentArrays<S>& f = a.of.f;
+  const TexelTiles<S>& table = a.of.table;
   S *duv = a.duv, *dtexels = a.dtexels, *dbase = a.dbase;
   if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
   if (dtexels) std::fill(dtexels, dtexels + 3 * table.texels, S(0));
@@ -161,7 +161,7 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
       for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
         const Vec3<S> g = residual_gradient(load3(a.colors + 3 * i), load3(a.dcolors + 3 * i));
         sum = sum + g;
-        if (!patch.textured() || f.weight[i] < a.bound) continue;
+        if (!patch.textured() || f.weight[i] < a.of.bound) continue;
         const auto corners = patch.corners(f.uv[i], f.uv[f.total + i]);
         if (dtexels) texel_fetch_vjp(corners, g, dtexels + 3 * patch.first);
         if (duv)

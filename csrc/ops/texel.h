@@ -85,41 +85,47 @@ struct TexelBackward {
   }
 };
 
-// colors [F, 3] = relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile relu(base + 0.5)
+// What the colours of fragments are made of.
 template <class S>
-struct TexelColorsForward {
+struct TexelColors {
   FragmentArrays<S> f;
   S bound;
   TexelTiles<S> table;
-  S* colors;
 
   template <class R>
   void fields(R& r) {
     f.fields(r);
     r.number("bound", bound);
     table.fields(r);
-    r.array("colors", colors, 3 * f.total);
+  }
+};
+// colors [F, 3] = relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile relu(base + 0.5)
+template <class S>
+struct TexelColorsForward {
+  TexelColors<S> of;
+  S* colors;
+
+  template <class R>
+  void fields(R& r) {
+    of.fields(r);
+    r.array("colors", colors, 3 * of.f.total);
   }
 };
 // Writes dbase [n, 3], dtexels [texels, 3] and duv [2, F]; each may be null.
 template <class S>
 struct TexelColorsBackward {
-  FragmentArrays<S> f;
-  S bound;
-  TexelTiles<S> table;
+  TexelColors<S> of;
   const S *colors, *dcolors;
   S *dbase, *dtexels, *duv;
 
   template <class R>
   void fields(R& r) {
-    f.fields(r);
-    r.number("bound", bound);
-    table.fields(r);
-    r.array("colors", colors, 3 * f.total);
-    r.array("dcolors", dcolors, 3 * f.total);
-    r.maybe("dbase", dbase, 3 * table.n);
-    r.maybe("dtexels", dtexels, 3 * table.texels);
-    r.maybe("duv", duv, 2 * f.total);
+    of.fields(r);
+    r.array("colors", colors, 3 * of.f.total);
+    r.array("dcolors", dcolors, 3 * of.f.total);
+    r.maybe("dbase", dbase, 3 * of.table.n);
+    r.maybe("dtexels", dtexels, 3 * of.table.texels);
+    r.maybe("duv", duv, 2 * of.f.total);
   }
 };
 

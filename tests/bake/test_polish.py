@@ -22,30 +22,23 @@ from bitymi_ns.bake import (
     with_reduced_colors,
 )
 from bitymi_ns.bake import polish as polish_module
+from bitymi_ns.train.config import GuardConfig
 from bitymi_ns.train.views import View
-from tests.bake.test_tune import BACKGROUND, cameras, render
+from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving
 
 OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, held_in_every=4)
 
 
 @pytest.fixture(scope="module")
 def truth(scene) -> Baked:
-    """A scene of large surfels with a waving residual; one has no tile, one is seen by no view."""
-    made = scene(60)
-    made.surfels["log_scales"] += 1.5
-    made.surfels["opacity_logits"] += 1.0
-    made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])
-    baked = bake(made, options=BakeOptions(format="fp16", r_max=8), reduce_colors=False)
-    baked.scene.weight_bound = 0.02
-    baked.packing.tiles[0] = 0
-    baked.mean_residual[0] = 0.3
-    return baked
+    """The scene of the photographs, with all of its view colours."""
+    return waving(scene(60), reduce_colors=False)
 
 
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
     """Photographs of it."""
-    return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
+    return photographs(truth)
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +143,7 @@ def test_steps_that_are_not_finite_are_survived(
     assert told.statistics.polish.psnr_held_in.after > told.statistics.polish.psnr_held_in.before + 1
     monkeypatch.setattr(polish_module, "photometric", lambda *a: real(*a) * math.nan)
     given_up = polish_scene(wrong, views, BACKGROUND, OPTIONS)
-    assert given_up.statistics.polish.steps == polish_module.ATTEMPTS and given_up.statistics.polish.best_step == 0
+    assert given_up.statistics.polish.steps == GuardConfig().rollbacks and given_up.statistics.polish.best_step == 0
     torch.testing.assert_close(given_up.texels, wrong.texels, rtol=0, atol=0)
 
 

@@ -40,24 +40,33 @@ def render(baked: Baked, camera: Camera) -> Tensor:
     return baked.unquantised().render(camera, BACKGROUND).rgb
 
 
-@pytest.fixture(scope="module")
-def truth(scene) -> Baked:
-    """A scene of large surfels with a waving residual; the first surfel's is constant."""
-    made = scene(60)
+def waving(made: Any, reduce_colors: bool = True) -> Baked:
+    """A scene of large surfels with a waving residual; the first surfel's is constant, the last is seen by no view."""
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
-    made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])  # no view sees it
-    baked = bake(made, options=BakeOptions(format="fp16", r_max=8))
+    made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])
+    baked = bake(made, options=BakeOptions(format="fp16", r_max=8), reduce_colors=reduce_colors)
     baked.scene.weight_bound = 0.02
     baked.packing.tiles[0] = 0
     baked.mean_residual[0] = 0.3
     return baked
 
 
+def photographs(truth: Baked) -> list[View]:
+    """What the cameras see of a scene."""
+    return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
+
+
+@pytest.fixture(scope="module")
+def truth(scene) -> Baked:
+    """The scene of the photographs."""
+    return waving(scene(60))
+
+
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
     """Photographs of it."""
-    return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
+    return photographs(truth)
 
 
 @pytest.fixture(scope="module")

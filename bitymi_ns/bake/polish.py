@@ -15,6 +15,7 @@ from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
 from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage, numbers
+from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import TexelField
@@ -78,26 +79,23 @@ class _Polish:
         pictures = ((self.shown(view), view.target(self.background, "cpu"), _mask(view)) for view in views)
         return look(pictures, len(views), progress)
 
-    def step(self, number: int, view: View, inverse: Tensor) -> bool:
+    def step(self, number: int, view: View, share: Tensor) -> bool:
         """A step on one view; False = it is not finite, and was not done."""
         options = self.options
         for name, optimizer in self.optimizers.items():
             set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
         forget_gradients(self.optimizers.values())
-        self.field.texels.grad = None
-        mask, rgb = _mask(view), self.shown(view)
-        loss = photometric(rgb, view.target(self.background, "cpu"), options.ssim_weight, mask)
+        mask, target = _mask(view), view.target(self.background, "cpu")
+        # the loss is a mean, the step wants a sum
+        rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
+        self.field.descent = TexelDescent(share, rate)
+        loss = photometric(self.shown(view), target, options.ssim_weight, mask)
         if not math.isfinite(float(loss.detach())):
             return False
         if not loss.requires_grad:  # nothing of the scene is in the view
             return True
         loss.backward()
         step(self.optimizers.values())
-        gradient = self.field.texels.grad
-        if gradient is not None:
-            rate = self.factor * falling(options.rate, number, options.steps) * numbers(rgb, mask)
-            with torch.no_grad():
-                self.field.texels.addcmul_(gradient, inverse, value=-rate)
         return True
 
     def state(self) -> dict[str, Any]:
@@ -178,10 +176,10 @@ def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progres
     options = run.options
     looks = Looks(options, run.psnr(held_in, progress), run.state())
     seen = coverage(run.texels, TexelViews(run.texels, views, MemoryBudget(0)), progress)
-    inverse, attempts = 1.0 / (seen + options.prior), 0  # [T, 1]
+    share, attempts = (1.0 / (seen + options.prior)).squeeze(1), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]
-        if not run.step(number, view, inverse):
+        if not run.step(number, view, share):
             attempts += 1
             run.go_back(looks.best)
         more = attempts < run.guard.rollbacks

@@ -51,6 +51,19 @@ class TexelTiles:
 
 
 @dataclass(frozen=True)
+class TexelDescent:
+    """How a backward pass moves texels: texel t by -rate share[t] times its gradient.
+
+    Attributes:
+        share: [T] of the texels' dtype.
+        rate: of all texels.
+    """
+
+    share: Tensor
+    rate: float
+
+
+@dataclass(frozen=True)
 class TexelFragments:
     """What the colours of a view depend on while its geometry is fixed. Nothing here has a gradient.
 
@@ -209,13 +222,13 @@ def add_texel_gradient(
 
 class _TexelColors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, base, texels, uv, fragments, tiles, bound):
+    def forward(ctx, base, texels, uv, fragments, tiles, bound, descent):
         b, t, arrays = dense(base, texels), dense(texels, texels), fragments.arrays
         colors = t.new_empty(len(fragments), 3)
         inputs = {"bound": bound, "base": b, "texels": t, **tiles.arrays}
         kernel("texel_colors_forward", t)(**by_name(arrays), **inputs, colors=colors)
         ctx.save_for_backward(b, t, colors, *arrays)
-        ctx.tiles, ctx.bound = tiles, bound
+        ctx.tiles, ctx.bound, ctx.descent = tiles, bound, descent
         return colors
 
     @staticmethod
@@ -227,9 +240,11 @@ class _TexelColors(torch.autograd.Function):
             torch.empty_like(x) if needed else None for x, needed in zip(wanted, ctx.needs_input_grad, strict=False)
         )
         inputs = {"bound": ctx.bound, "base": base, "texels": texels, **ctx.tiles.arrays}
-        given = {"colors": colors, "dcolors": dense(dcolors, texels)}
+        given = {"colors": colors, "dcolors": dense(dcolors, texels), "rate": 0.0}
+        if ctx.descent is not None:
+            given |= {"moved": texels, "share": ctx.descent.share, "rate": ctx.descent.rate}
         kernel("texel_colors_backward", texels)(**arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv)
-        return dbase, dtexels, duv, None, None, None
+        return dbase, dtexels, duv, None, None, None, None
 
 
 def texel_colors(
@@ -239,6 +254,7 @@ def texel_colors(
     tiles: TexelTiles,
     bound: float = 0.0,
     move_surfels: bool = True,
+    descent: TexelDescent | None = None,
 ) -> Tensor:
     """Colour of every fragment, ReLU(ReLU(f_view(d) + 0.5) + r(u, v)), with the texels' residual r of `texel_image`.
 
@@ -252,12 +268,15 @@ def texel_colors(
         tiles: where they lie.
         bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
         move_surfels: the gradient of r with respect to u and v reaches the fragments.
+        descent: the backward pass moves the texels that the view shows, in place, and keeps no gradient of them. So a
+            whole atlas need not be cleared and read for every view.
 
     Returns:
         [F, 3].
 
     Raises:
-        ValueError: the tiles are not those of these texels or surfels, or the fragments those of others.
+        ValueError: the tiles are not those of these texels or surfels, or the fragments those of others; or texels
+            that ask for a gradient are to be moved.
         RuntimeError: the tensors are not on the CPU.
     """
     _on_the_cpu("texel_colors", texels)
@@ -265,4 +284,6 @@ def texel_colors(
     if fragments.surfels != len(base):
         raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
     uv = fragments.uv if move_surfels else fragments.uv.detach()
-    return _TexelColors.apply(base, texels, uv, fragments, tiles, bound)
+    if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
+        raise ValueError("texels that the backward pass moves are dense and ask for no gradient")
+    return _TexelColors.apply(base, texels, uv, fragments, tiles, bound, descent)

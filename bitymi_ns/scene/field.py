@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops import Fragments, TexelTiles, shade, texel_colors
+from bitymi_ns.ops import Fragments, TexelDescent, TexelTiles, shade, texel_colors
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
@@ -158,10 +158,13 @@ class TexelField(nn.Module):
         super().__init__()
         self.tiles = tiles
         self.texels = nn.Parameter(texels.detach().clone())
+        self.descent: TexelDescent | None = None
+        """How a backward pass moves the texels; None = they get a gradient."""
 
     def shade(
         self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
     ) -> Tensor:
         """See `ResidualField`; on the CPU only."""
-        texels = self.texels if learns else self.texels.detach()
-        return texel_colors(fragments, base, texels, self.tiles, bound, moves_surfels)
+        descent = self.descent if learns else None
+        texels = self.texels if learns and descent is None else self.texels.detach()
+        return texel_colors(fragments, base, texels, self.tiles, bound, moves_surfels, descent)

@@ -146,7 +146,7 @@ template <class S>
 void texel_colors_backward(const TexelColorsBackward<S>& a) {
   const FragmentArrays<S>& f = a.of.f;
   const TexelTiles<S>& table = a.of.table;
-  S *duv = a.duv, *dtexels = a.dtexels, *dbase = a.dbase;
+  S *duv = a.duv, *dtexels = a.dtexels, *dbase = a.dbase, *moved = a.moved;
   if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
   if (dtexels) std::fill(dtexels, dtexels + 3 * table.texels, S(0));
   if (duv) std::fill(duv, duv + 2 * f.total, S(0));
@@ -156,6 +156,10 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
     const int64_t id = runs.id(first);
     const Patch<S> patch(table, id);
     const S* tile = table.values + 3 * patch.first;
+    thread_local std::vector<S> own;  // the tile's gradient, where it is not kept
+    const int64_t area = int64_t(patch.size[0]) * patch.size[1];
+    if (moved) own.assign(3 * area, S(0));
+    S* dtile = moved ? own.data() : dtexels ? dtexels + 3 * patch.first : nullptr;
     Vec3<S> sum = {S(0), S(0), S(0)};
     for (int64_t r = first; r < last; ++r)
       for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
@@ -163,11 +167,16 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
         sum = sum + g;
         if (!patch.textured() || f.weight[i] < a.of.bound) continue;
         const auto corners = patch.corners(f.uv[i], f.uv[f.total + i]);
-        if (dtexels) texel_fetch_vjp(corners, g, dtexels + 3 * patch.first);
+        if (dtile) texel_fetch_vjp(corners, g, dtile);
         if (duv)
           texel_fetch_uv_vjp(tile, corners, patch.size[0], patch.size[1], patch.extent, g, duv[i], duv[f.total + i]);
       }
     if (dbase) store3(dbase + 3 * id, base_gradient(load3(table.base + 3 * id), sum));
+    if (!moved) return;
+    for (int64_t t = 0; t < area; ++t) {
+      S* at = moved + 3 * (patch.first + t);
+      store3(at, load3(at) + -a.rate * a.share[patch.first + t] * load3(dtile + 3 * t));
+    }
   });
 }
 

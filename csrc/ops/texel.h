@@ -111,12 +111,15 @@ struct TexelColorsForward {
     r.array("colors", colors, 3 * of.f.total);
   }
 };
-// Writes dbase [n, 3], dtexels [texels, 3] and duv [2, F]; each may be null.
+// Writes dbase [n, 3], dtexels [texels, 3] and duv [2, F]; each may be null. With `moved`, the texels themselves, their
+// gradient g is not kept: every texel moves by -rate `share` [texels] g.
 template <class S>
 struct TexelColorsBackward {
   TexelColors<S> of;
   const S *colors, *dcolors;
-  S *dbase, *dtexels, *duv;
+  const S* share;
+  S rate;
+  S *dbase, *dtexels, *duv, *moved;
 
   template <class R>
   void fields(R& r) {
@@ -126,6 +129,11 @@ struct TexelColorsBackward {
     r.maybe("dbase", dbase, 3 * of.table.n);
     r.maybe("dtexels", dtexels, 3 * of.table.texels);
     r.maybe("duv", duv, 2 * of.f.total);
+    r.maybe("moved", moved, 3 * of.table.texels);
+    r.maybe("share", share, of.table.texels);
+    r.number("rate", rate);
+    if (moved && (moved != of.table.values || !share || dtexels))
+      r.refuse("what moves are the texels, by a share of each, and their gradient is not kept");
   }
 };
 

@@ -263,3 +263,23 @@ def test_gradients_of_colors_do_not_depend_on_the_number_of_threads() -> None:
     backend.module(torch.device("cpu")).set_num_threads(0)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(other, results[0], strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+def test_a_descent_moves_the_texels_by_their_gradient(dtype: torch.dtype) -> None:
+    case = Case(dtype=dtype)
+    share = torch.linspace(0.1, 2.0, len(case.texels), dtype=dtype)
+    texels, uv = case.texels.clone().requires_grad_(), case.fragments.uv.clone().requires_grad_()
+    colors = ops.texel_colors(replace(case.fragments, uv=uv), case.base, texels, case.tiles, 0.02)
+    towards = torch.linspace(-1, 1, colors.numel(), dtype=dtype).view_as(colors)
+    colors.backward(towards)
+    moved, at = case.texels.clone(), case.fragments.uv.clone().requires_grad_()
+    again = ops.texel_colors(
+        replace(case.fragments, uv=at), case.base, moved, case.tiles, 0.02, descent=ops.TexelDescent(share, 0.3)
+    )
+    assert torch.equal(again, colors) and torch.equal(moved, case.texels)
+    again.backward(towards)
+    torch.testing.assert_close(moved, case.texels - 0.3 * share[:, None] * texels.grad)
+    assert texels.grad.abs().max() > 0.1 and torch.equal(at.grad, uv.grad)  # by the texels before they moved
+    with pytest.raises(ValueError, match="ask for no gradient"):
+        ops.texel_colors(case.fragments, case.base, texels, case.tiles, descent=ops.TexelDescent(share, 0.3))

@@ -59,7 +59,7 @@ def measure(run: Path, formats: list[str], bake_options: BakeOptions, tune_optio
     rows = []
     for form in formats:
         options = replace(bake_options, format=form)  # type: ignore[arg-type]
-        both = [replace(each, options=options).with_texels(each.texels) for each in (plain, tuned)]
+        both = [replace(each, options=options).with_texels(each.texels).encoded() for each in (plain, tuned)]
         before, after = (quality(each, evaluation, background) for each in both)
         figures = [number(q[name], 2 if name == "psnr" else 4) for q in (before, after) for name in METRICS]
         texels = int(plain.packing.tiles[:, 3].astype("int64") @ plain.packing.tiles[:, 4].astype("int64"))

@@ -1,7 +1,7 @@
 """Trained field to texture atlas: resolution, plan, evaluation, reduction, packing, quantisation, fine-tuning."""
 
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.pipeline import Baked, bake, with_reduced_colors
+from bitymi_ns.bake.pipeline import Baked, bake, reduced
 from bitymi_ns.bake.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.progress import Progress, rich_progress
@@ -14,7 +14,7 @@ __all__ = [
     "TuneOptions",
     "bake",
     "polish_scene",
+    "reduced",
     "rich_progress",
     "tune_atlas",
-    "with_reduced_colors",
 ]

@@ -57,7 +57,10 @@ class BakeInput:
         """With what the cameras see, where there are any and the options need it."""
         if not self.cameras or not options.looks_at_views:
             return self
-        return replace(self, views=visibility(self.surfels, self.cameras, self.near, self.through_pixel, progress))
+        return replace(
+            self,
+            views=visibility(self.surfels, self.cameras, self.near, self.weight_bound, self.through_pixel, progress),
+        )
 
 
 def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:

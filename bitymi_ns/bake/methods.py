@@ -1,8 +1,9 @@
-"""The two ways to bake: the paper's rule, which keeps everything, and the least that a tolerance allows."""
+"""The ways to bake: the paper's rule, which keeps everything; the least that a tolerance allows; and as fine as the
+views see, which a polish starts from."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -14,8 +15,10 @@ from bitymi_ns.bake.lean_field import lean_field
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import tile_means
-from bitymi_ns.bake.plan import Field, Plan, kernel_parameters, make_plan
-from bitymi_ns.bake.reduce import reduce_tiles
+from bitymi_ns.bake.plan import Field, Plan, Shown, kernel_parameters, make_plan
+from bitymi_ns.bake.reduce import Reduced, reduce_tiles
+from bitymi_ns.bake.reference import held, references
+from bitymi_ns.bake.resolution import coarsened
 from bitymi_ns.bake.statistics import FieldLevels, ViewColorError
 from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
@@ -111,12 +114,8 @@ class ToleranceBake:
     def tiles(self, field: Field, plan: Plan, inputs: BakeInput, progress: Progress) -> Tiles:
         """Of the smallest grid that holds the field, or none."""
         o = self.options
-        reduced = reduce_tiles(field, plan, o.tolerance, o.r_min, o.chunk, progress)
-        packing = pack(reduced.sizes, o.page_width, o.page_rows)
-        texels = reduced.pages(packing)
-        extent = torch.where(plan.extent > 0, plan.extent, o.extent).cpu()
-        means = tile_means(texels, packing, reduced.constant)
-        return Tiles(packing, texels if packing.texels else None, extent, means, reduced.nonfinite)
+        reduced = reduce_tiles(references(field, plan, o.chunk), plan, o.tolerance, o.r_min, progress)
+        return _packed(reduced, plan, o)
 
     def view_color(self, inputs: BakeInput, progress: Progress) -> tuple[dict[str, Tensor], ViewColorError]:
         """As few sites as hold every surfel's colour; see `lean_color.reduce_view_color`."""
@@ -130,9 +129,85 @@ class ToleranceBake:
         return kept | lean.parameters(), describe(kind, surfels, lean, error, tolerance)
 
 
-def bake_method(options: BakeOptions) -> BakeMethod:
+@dataclass(frozen=True)
+class Blank:
+    """A field with no residual anywhere, for scenes that were trained without one."""
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """[M, 3] zeros."""
+        return torch.zeros_like(x)
+
+    def voxel_size(self, x: Tensor) -> Tensor:
+        """[M, 2]: it can hold any detail."""
+        return torch.full((len(x), 2), torch.finfo(torch.float32).tiny, device=x.device)
+
+
+@dataclass(frozen=True)
+class FineBake:
+    """What a polish starts from: as many texels as the views can tell apart, whatever the field has learned, and all of
+    the view colours. A tile has at most a texel for every `pixels_per_texel` pixels of the view that shows most of it.
+    """
+
+    options: BakeOptions
+    pixels_per_texel: float
+
+    def field(self, field: Field, inputs: BakeInput) -> tuple[Field, None]:
+        """The field as it is."""
+        return field, None
+
+    def plan(self, field: Field, inputs: BakeInput) -> Plan:
+        """Tiles of what can be seen, as fine as it is seen."""
+        plan = _plan(field, inputs, self.options, whole=False)
+        if inputs.views is None:
+            return plan
+        limit = coarsened(plan.limit, inputs.views.pixels / self.pixels_per_texel, self.options.r_min)
+        return replace(plan, limit=limit, probes=limit if isinstance(field, Blank) else plan.probes)
+
+    def tiles(self, field: Field, plan: Plan, inputs: BakeInput, progress: Progress) -> Tiles:
+        """One for every surfel of which any view shows a residual."""
+        o = self.options
+        reduced, done = Reduced(torch.zeros(len(plan), 2, dtype=torch.int32), torch.zeros(len(plan), 3)), 0
+        for part in references(field, plan, o.chunk):
+            reduced.sizes[part.rows.cpu()] = torch.tensor(part.size, dtype=torch.int32)
+            reduced.parts.append((part.rows.cpu(), part.values.cpu()))
+            reduced.nonfinite += part.nonfinite
+            done += len(part.rows)
+            progress("evaluating texels", done, len(plan))
+        return _packed(reduced, plan, o)
+
+    def view_color(self, inputs: BakeInput, progress: Progress) -> tuple[dict[str, Tensor], None]:
+        """All of it."""
+        return dict(inputs.surfels), None
+
+
+def bake_method(options: BakeOptions) -> PaperBake | ToleranceBake:
     """The way that the options ask for: nothing after this asks whether there is a tolerance."""
     return ToleranceBake(options) if options.tolerance > 0 else PaperBake(options)
+
+
+def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progress: Progress) -> Tiles:
+    """Tiles of the smallest grids that hold, within the tolerance, what these have learned; none where one colour does.
+
+    Args:
+        tiles: of N surfels, with texels.
+        inputs: the surfels, and what the views see of them.
+    """
+    assert tiles.texels is not None
+    opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
+    shown = Shown(opacity, beta, tiles.extent, inputs.weight_bound)
+    parts = held(tiles.texels, tiles.packing, shown, options.chunk)
+    smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress)
+    bare = torch.from_numpy(tiles.packing.tiles)[:, 3] == 0
+    smaller.constant[bare] = tiles.mean_residual[bare]
+    return _packed(smaller, shown, options)
+
+
+def _packed(reduced: Reduced, shown: Shown, options: BakeOptions) -> Tiles:
+    packing = pack(reduced.sizes, options.page_width, options.page_rows)
+    texels = reduced.pages(packing)
+    extent = torch.where(shown.extent > 0, shown.extent, options.extent).cpu()
+    means = tile_means(texels, packing, reduced.constant)
+    return Tiles(packing, texels if packing.texels else None, extent, means, reduced.nonfinite)
 
 
 def _plan(field: Field, inputs: BakeInput, options: BakeOptions, whole: bool) -> Plan:

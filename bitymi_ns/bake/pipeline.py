@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.inputs import BakeInput, drawable
-from bitymi_ns.bake.methods import BakeMethod, Tiles, bake_method
+from bitymi_ns.bake.methods import BakeMethod, Blank, FineBake, Tiles, bake_method, reduced_tiles
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import moved_texels, tile_means
@@ -73,6 +73,11 @@ class Baked:
         """The same bake with other means [N, 3]."""
         return replace(self, scene=replace(self.scene, mean_residual=mean_residual))
 
+    @property
+    def tiles(self) -> Tiles:
+        """Of every surfel."""
+        return Tiles(self.packing, self.texels, self.extent, self.mean_residual)
+
     def unquantised(self) -> BakedScene:
         """The scene with its texels as 32-bit floats."""
         if self.texels is None:
@@ -94,35 +99,45 @@ class Baked:
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
         return replace(self, scene=replace(self.scene, surfels=given))
 
+    def with_tiles(self, tiles: Tiles) -> Baked:
+        """The same bake with other tiles of its N surfels. The atlas is to be `encoded`."""
+        scene = replace(
+            self.scene,
+            tiles=torch.from_numpy(tiles.packing.tiles),
+            extent=tiles.extent,
+            mean_residual=tiles.mean_residual,
+        )
+        return replace(self, scene=scene, packing=tiles.packing, texels=tiles.texels, atlas=None)
+
     def only(self, kept: Tensor) -> Baked:
         """The bake of some of its surfels, `kept` [N] bool: their tiles, packed anew, with their texels. The atlas is
-        to be encoded by `with_texels`."""
+        to be `encoded`."""
         if bool(kept.all()):
             return self
         surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
         packing = pack(torch.from_numpy(self.packing.tiles)[kept, 3:], self.options.page_width, self.options.page_rows)
-        scene = replace(
-            self.scene,
-            surfels=surfels,
-            tiles=torch.from_numpy(packing.tiles),
-            extent=self.extent[kept],
-            mean_residual=self.mean_residual[kept],
-        )
         texels = None
         if self.texels is not None and packing.texels:
             texels = moved_texels(self.texels, torch.from_numpy(self.packing.tiles)[kept], packing)
-        return replace(self, scene=scene, rows=self.rows[kept], packing=packing, texels=texels, atlas=None)
+        some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept])
+        return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.mean_residual[kept]))
 
-    def with_texels(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
-        """The same bake with other residual colours (fine-tuned ones, say), quantised and encoded anew."""
+    def with_texels(self, texels: Tensor) -> Baked:
+        """The same bake with other residual colours (fine-tuned ones, say), to be `encoded`."""
         if self.texels is None or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         texels = texels.detach().float().cpu().contiguous()
-        atlas = _encode(texels, self.packing, self.options, progress)
         means = tile_means(texels, self.packing, self.mean_residual)
         # no error: the field is no longer what the texels are meant to hold
-        statistics = self.statistics.but(atlas=_cost(self.packing, atlas), error=None)
-        return replace(self.with_mean_residual(means), texels=texels, atlas=atlas, statistics=statistics)
+        statistics = self.statistics.but(atlas=None, error=None)
+        return replace(self.with_mean_residual(means), texels=texels, atlas=None, statistics=statistics)
+
+    def encoded(self, progress: Progress = no_progress) -> Baked:
+        """The same bake with its texels quantised and encoded, where that is not done."""
+        if self.texels is None or self.atlas is not None:
+            return self
+        atlas = _encode(self.texels, self.packing, self.options, progress)
+        return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=_cost(self.packing, atlas)))
 
 
 @torch.no_grad()
@@ -131,7 +146,7 @@ def bake(
     cameras: Sequence[Camera] = (),
     options: BakeOptions | None = None,
     progress: Progress | None = None,
-    reduce_colors: bool = True,
+    pixels_per_texel: float | None = None,
 ) -> Baked:
     """Bakes a scene's residual field into an atlas (paper, section Texture Baking).
 
@@ -145,15 +160,18 @@ def bake(
         cameras: training views, for the cap on tile sizes and for what they see; with none nothing is left out for it.
         options: see `BakeOptions`.
         progress: called after every chunk of work.
-        reduce_colors: reduce the view colours as the options say; False leaves that to `with_reduced_colors`, for a
-            bake of which the surfels are going to learn.
+        pixels_per_texel: for a bake of which texels and surfels are going to learn: tiles get as many texels as the
+            views can tell apart (`methods.FineBake`), zeros where the scene has no field, and are not encoded; view
+            colours stay whole. `reduced` does then what the options say. None = as the options say at once.
 
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
     options, progress = options or BakeOptions(), progress or no_progress
     options.check()
-    started, method = time.perf_counter(), bake_method(options)
+    started = time.perf_counter()
+    learns = pixels_per_texel is not None
+    method = FineBake(options, pixels_per_texel) if pixels_per_texel is not None else bake_method(options)
     rows, left_out = drawable(scene.surfels)
     candidates = _inputs(scene, rows, cameras)
     inputs, seen = _looked_at(candidates, options, progress)
@@ -163,12 +181,13 @@ def bake(
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
     statistics = Statistics(surfels=KeptSurfels(trained=trained, kept=len(rows), left_out=left_out))
-    if scene.field is None:
+    field = Blank() if learns and scene.field is None else scene.field
+    if field is None:
         tiles, atlas = Tiles.none(len(rows), options.extent), None
     else:
-        paper = paper_texels(candidates.surfels, scene.field, options)
-        tiles, atlas, statistics = _textured(method, scene.field, inputs, paper, statistics, options, progress)
-    surfels, view_color = method.view_color(inputs, progress) if reduce_colors else (dict(inputs.surfels), None)
+        paper = None if isinstance(field, Blank) else paper_texels(candidates.surfels, field, options)
+        tiles, atlas, statistics = _textured(method, field, inputs, paper, statistics, options, progress)
+    surfels, view_color = method.view_color(inputs, progress)
     baked = BakedScene(
         {name: value.cpu() for name, value in surfels.items()},
         kind_of(scene.surfels),
@@ -184,13 +203,14 @@ def bake(
 
 
 @torch.no_grad()
-def with_reduced_colors(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_progress) -> Baked:
-    """A bake whose surfels have learned, with its view colours reduced as its options say. Surfels that cannot be drawn
-    any more, that a bundle cannot hold, or that no view blends, are left out and counted. The atlas is to be encoded by
-    `with_texels`.
+def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_progress) -> Baked:
+    """A bake whose texels and surfels have learned, with tiles and view colours reduced as its options say.
+
+    Left out and counted are surfels that cannot be drawn any more, that a bundle cannot hold, or that no view blends.
+    The atlas is to be `encoded`.
 
     Args:
-        baked: made with `reduce_colors=False`.
+        baked: made with `pixels_per_texel`.
         cameras: training views.
 
     Raises:
@@ -208,8 +228,11 @@ def with_reduced_colors(baked: Baked, cameras: Sequence[Camera], progress: Progr
         kept[rows] = seen
     if not bool(kept.any()):
         raise ValueError("no surfel is left to bake after the polish")
-    reduced, view_color = bake_method(options).view_color(inputs, progress)
-    result = baked.only(kept).with_surfels(reduced)
+    lean, view_color = bake_method(options).view_color(inputs, progress)
+    result = baked.only(kept)
+    if options.tolerance > 0 and result.texels is not None:
+        result = result.with_tiles(reduced_tiles(result.tiles, inputs, options, progress))
+    result = result.with_surfels(lean)
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None
     left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
@@ -245,7 +268,7 @@ def _textured(
     method: BakeMethod,
     field: Field,
     inputs: BakeInput,
-    paper: int,
+    paper: int | None,
     statistics: Statistics,
     options: BakeOptions,
     progress: Progress,
@@ -253,16 +276,20 @@ def _textured(
     """The tiles of a scene with a field, their atlas where any surfel needs a tile, and what that saved and cost.
 
     Args:
-        paper: texels that the paper's rule gives.
+        paper: texels that the paper's rule gives; None = it has none.
         statistics: with the numbers of surfels.
     """
     field, levels = method.field(field, inputs)
     plan = method.plan(field, inputs)
     tiles = method.tiles(field, plan, inputs, progress)
     packing = tiles.packing
-    atlas = None if tiles.texels is None else _encode(tiles.texels, packing, options, progress)
-    stored = None if atlas is None else atlas.decoded()
-    errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
+    learns = isinstance(method, FineBake)
+    atlas = None if learns or tiles.texels is None else _encode(tiles.texels, packing, options, progress)
+    error = None
+    if not learns:  # what changes yet has none
+        stored = None if atlas is None else atlas.decoded()
+        errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
+        error = errors.summary(options.tolerance)
     return (
         tiles,
         atlas,
@@ -271,7 +298,7 @@ def _textured(
             texels=plan.texels.but(paper=paper, kept=packing.texels, not_finite=tiles.nonfinite),
             field=levels,
             atlas=None if atlas is None else _cost(packing, atlas),
-            error=errors.summary(options.tolerance),
+            error=error,
         ),
     )
 

@@ -36,30 +36,39 @@ class Field(Protocol):
 
 
 @dataclass
-class Plan:
+class Shown:
+    """How much of a tile can be seen, and how strongly.
+
+    Attributes:
+        opacity: [N] largest blending weight of the surfel's centre.
+        beta: [N] exponent of the kernel.
+        extent: [N] half side of the tile in scale units: beyond it every fragment stays below the weight bound; 0 where
+            all do.
+        weight_bound: fragments of smaller weight get no residual.
+    """
+
+    opacity: Tensor
+    beta: Tensor
+    extent: Tensor
+    weight_bound: float
+
+
+@dataclass
+class Plan(Shown):
     """What is known of every tile before the field is looked at.
 
     Attributes:
         means: [N, 3] world positions.
         edges: [N, 3, 2] tangent directions times scales, world units.
-        opacity: [N] largest blending weight of the surfel's centre.
-        beta: [N] exponent of the kernel.
-        extent: [N] half side of the tile in scale units: beyond it every fragment stays below the weight bound; 0 where
-            all do.
         probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
         limit: [N, 2] int32, the finest tile of use, at most `probes`.
-        weight_bound: fragments of smaller weight get no residual.
         texels: how many texels the rules before the tolerance give.
     """
 
     means: Tensor
     edges: Tensor
-    opacity: Tensor
-    beta: Tensor
-    extent: Tensor
     probes: Tensor
     limit: Tensor
-    weight_bound: float
     texels: KeptTexels
 
     def __len__(self) -> int:
@@ -141,7 +150,7 @@ def make_plan(
         within_visible_part=_texels(limit),
     )
     edges = axes * scales[:, None, :]
-    return Plan(means, edges, opacity, beta, extent, probes, limit, weight_bound, counts)
+    return Plan(opacity, beta, extent, weight_bound, means, edges, probes, limit, counts)
 
 
 def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:

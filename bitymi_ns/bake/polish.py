@@ -37,12 +37,15 @@ class PolishOptions(TuneOptions):
     share: float = 0.4
     """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
     checks: int = 10
+    pixels_per_texel: float = 2.0
+    """A tile starts with at most a texel for so many pixels of the view that shows most of it."""
 
     def check(self) -> None:
         """Refuses values that make no sense."""
         super().check()
-        if not self.share > 0:
-            raise ValueError(f"share of the polish must be positive, not {self.share}")
+        for name in ("share", "pixels_per_texel"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} of the polish must be positive, not {getattr(self, name)}")
 
 
 class _Polish:
@@ -128,7 +131,7 @@ def polish_scene(
     It runs on the CPU, as `tune_atlas` does.
 
     Args:
-        baked: a bake with an atlas and all of its view colours (`bake(reduce_colors=False)`).
+        baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
         background: [3] colour behind the scene.
         options: see `PolishOptions`.
@@ -137,7 +140,8 @@ def polish_scene(
         eval_views: views of which the gain is stated; they decide nothing.
 
     Returns:
-        a new bake with `statistics.polish`, encoded; `baked` itself without change where there are fewer than 4 views.
+        a new bake with `statistics.polish`, to be `reduced`; `baked` itself without change where there are fewer than 4
+        views.
 
     Raises:
         ValueError: there is no atlas, the view colours are reduced, or an option is out of range.
@@ -145,7 +149,7 @@ def polish_scene(
     options = options or PolishOptions()
     options.check()
     if "view_terms" in baked.scene.surfels:
-        raise ValueError("the view colours are reduced already: polish a bake that was made with reduce_colors=False")
+        raise ValueError("the view colours are reduced already: polish a bake that was made with pixels_per_texel")
     if len(views) < FEWEST_VIEWS:
         return replace(baked, statistics=baked.statistics.but(polish=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
@@ -163,7 +167,7 @@ def polish_scene(
         psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None,
     )
     texels = run.field.texels.detach()
-    result = run.texels.baked(texels, progress).with_surfels(dict(run.scene.surfels))
+    result = run.texels.baked(texels).with_surfels(dict(run.scene.surfels))
     return replace(result, statistics=result.statistics.but(polish=statistics))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import torch
@@ -10,8 +11,8 @@ from torch import Tensor
 from bitymi_ns.bake.errors import weighted_rms
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import texel_index
-from bitymi_ns.bake.plan import Field, Plan
-from bitymi_ns.bake.reference import Reference, references
+from bitymi_ns.bake.plan import Shown
+from bitymi_ns.bake.reference import Reference
 from bitymi_ns.bake.resample import fit, fitted, interpolation, read_at
 from bitymi_ns.progress import Progress, no_progress
 
@@ -47,32 +48,31 @@ class Reduced:
 
 @torch.no_grad()
 def reduce_tiles(
-    field: Field,
-    plan: Plan,
+    wanted: Iterable[Reference],
+    shown: Shown,
     tolerance: float,
     r_min: int = 4,
-    chunk: int = 1 << 18,
     progress: Progress = no_progress,
 ) -> Reduced:
     """Chooses every tile's grid.
 
-    The error of a grid is (reconstruction - field) times the largest blending weight that a fragment has there, in
-    8-bit steps: its root mean square over the colour channels and over the part of the support that gets a residual.
+    The error of a grid is (reconstruction - what the tile should hold) times the largest blending weight that a
+    fragment has there, in 8-bit steps: its root mean square over the colour channels and over the part of the support
+    that gets a residual.
     Grids are tried by their number of texels, starting with none (one constant colour). The first within the tolerance
     is taken, the plan's limit at the latest.
 
     Args:
-        field: the residual field.
-        plan: what the tiles have to hold.
+        wanted: what the tiles should hold.
+        shown: how much of the tiles is.
         tolerance: largest error, 8-bit steps.
         r_min: smallest side of a tile, a power of two.
-        chunk: points evaluated at once.
         progress: called with the number of tiles done.
     """
-    n = len(plan)
+    n = len(shown.extent)
     reduced = Reduced(torch.zeros(n, 2, dtype=torch.int32), torch.zeros(n, 3))
-    done = int((plan.extent <= 0).sum())
-    for part in references(field, plan, chunk):
+    done = int((shown.extent <= 0).sum())
+    for part in wanted:
         reduced.nonfinite += part.nonfinite
         constant, flat = _constant(part, tolerance)
         reduced.constant[part.rows.cpu()] = constant.cpu()

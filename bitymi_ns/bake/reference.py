@@ -1,4 +1,5 @@
-"""What tiles should hold: the residual field on the grids of a plan, and how much an error counts there."""
+"""What tiles should hold: the residual field on the grids of a plan, or what they hold already; and how much an error
+counts there."""
 
 from __future__ import annotations
 
@@ -8,7 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.plan import Field, Plan
+from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.bake.plan import Field, Plan, Shown
 from bitymi_ns.bake.resample import fitted
 from bitymi_ns.bake.texels import texel_centres
 from bitymi_ns.ops.constants import SUPPORT
@@ -20,12 +23,12 @@ def grid(count: tuple[int, int], extent: Tensor) -> tuple[Tensor, Tensor]:
     return u[:, None, :].expand(-1, count[1], -1), v[:, :, None].expand(-1, -1, count[0])
 
 
-def weights(plan: Plan, rows: Tensor, count: tuple[int, int]) -> Tensor:
+def weights(shown: Shown, rows: Tensor, count: tuple[int, int]) -> Tensor:
     """Largest blending weight of a fragment at the points of `grid`: [n, count_v, count_u]; 0 without residual."""
-    u, v = grid(count, plan.extent[rows])
+    u, v = grid(count, shown.extent[rows])
     rest = 1.0 - (u.square() + v.square()) / SUPPORT**2
-    weight = plan.opacity[rows, None, None] * rest.clamp(min=1e-12) ** plan.beta[rows, None, None]
-    return torch.where((rest > 0) & (weight >= plan.weight_bound), weight, torch.zeros_like(weight))
+    weight = shown.opacity[rows, None, None] * rest.clamp(min=1e-12) ** shown.beta[rows, None, None]
+    return torch.where((rest > 0) & (weight >= shown.weight_bound), weight, torch.zeros_like(weight))
 
 
 @dataclass
@@ -80,3 +83,21 @@ def references(field: Field, plan: Plan, chunk: int = 1 << 18) -> Iterator[Refer
             if (pu, pv) != (lu, lv):
                 values = fitted(values, (lu, lv))
             yield Reference(rows, (lu, lv), values, weights(plan, rows, (lu, lv)), int(bad.sum()))
+
+
+@torch.no_grad()
+def held(texels: Tensor, packing: Packing, shown: Shown, chunk: int = 1 << 18) -> Iterator[Reference]:
+    """What tiles hold, in chunks of tiles of one size.
+
+    Args:
+        texels: [layers, height, width, 3] in the places of `packing`.
+        packing: N tiles; surfels without one are left out.
+        shown: how much of them is.
+        chunk: texels taken at once (a tile is never split).
+    """
+    tiles, flat = torch.from_numpy(packing.tiles), texels.reshape(-1, 3)
+    for r_u, r_v, members in size_classes(tiles):
+        for rows in members.split(max(1, chunk // (r_u * r_v))):
+            at = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)
+            values = flat[at].permute(0, 3, 1, 2).contiguous()
+            yield Reference(rows, (r_u, r_v), values, weights(shown, rows, (r_u, r_v)), 0)

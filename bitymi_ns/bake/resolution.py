@@ -92,6 +92,27 @@ def nyquist_resolution(
     return resolution.clamp(r_min, r_max).to(torch.int32)
 
 
+def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
+    """Tiles of at most so many texels each: the longer side is halved until it fits, or both are the smallest.
+
+    Args:
+        sides: [N, 2] int32 (r_u, r_v), powers of two of at least `r_min`.
+        texels: [N] how many each may have.
+        r_min: smallest side.
+
+    Returns:
+        [N, 2] int32.
+    """
+    sides = sides.clone()
+    while True:
+        wide = sides[:, 0] >= sides[:, 1]
+        too_many = (sides.long().prod(1) > texels) & (sides.amax(1) > r_min)
+        if not bool(too_many.any()):
+            return sides
+        sides[too_many & wide, 0] //= 2
+        sides[too_many & ~wide, 1] //= 2
+
+
 def max_projected_extent(
     means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = SUPPORT, near: float = 0.2
 ) -> tuple[Tensor, Tensor]:

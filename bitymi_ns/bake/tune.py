@@ -141,15 +141,15 @@ class TexelScene:
             paged = texel_index(rectangles[rows], (r_u, r_v), packing.width, packing.height)
             yield listed.reshape(-1), paged.reshape(-1)
 
-    def baked(self, texels: Tensor, progress: Progress = no_progress) -> Baked:
-        """The bake with these texels [T, 3], quantised and encoded anew."""
+    def baked(self, texels: Tensor) -> Baked:
+        """The bake with these texels [T, 3], to be `encoded`."""
         assert self._baked.texels is not None
         pages = self._baked.texels.clone()
         for rows, texel in self._places():
             pages.view(-1, 3)[texel] = texels[rows]
         bare = torch.from_numpy(self._baked.packing.tiles)[:, 3] == 0
         constants = torch.where(bare[:, None], texels[self.tiles.first], self._baked.mean_residual)
-        return self._baked.with_mean_residual(constants).with_texels(pages, progress)
+        return self._baked.with_mean_residual(constants).with_texels(pages)
 
     @torch.no_grad()
     def view(self, view: View) -> TexelView:
@@ -268,7 +268,7 @@ def tune_atlas(
         error_before=baked.statistics.error,
         psnr_held_out=gain(held_out.psnr(scene.texels), held_out.psnr(looks.best)) if eval_views else None,
     )
-    result = scene.baked(looks.best, progress)
+    result = scene.baked(looks.best).encoded(progress)
     return replace(result, statistics=result.statistics.but(finetune=statistics))
 
 

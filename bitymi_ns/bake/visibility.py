@@ -20,10 +20,12 @@ class Visibility:
     Attributes:
         transmittance: [N] float32 in [0, 1], the largest one in front of a blended fragment of the surfel, over all
             views: a fragment's weight is sigma T; the kernel gives sigma, this gives T. 0 for one that no view blends.
+        pixels: [N] int32, in how many pixels the view that shows most of the surfel gives it a residual.
         seen: [V, N] bool, whether the view blends a fragment of the surfel.
     """
 
     transmittance: Tensor
+    pixels: Tensor
     seen: Tensor
 
     @property
@@ -33,7 +35,7 @@ class Visibility:
 
     def of(self, rows: Tensor) -> Visibility:
         """The same of some of the surfels."""
-        return Visibility(self.transmittance[rows], self.seen[:, rows])
+        return Visibility(self.transmittance[rows], self.pixels[rows], self.seen[:, rows])
 
 
 @torch.no_grad()
@@ -41,6 +43,7 @@ def visibility(
     surfels: Mapping[str, Tensor],
     cameras: Sequence[Camera],
     near: float,
+    weight_bound: float = 0.0,
     through_pixel: bool = False,
     progress: Progress = no_progress,
 ) -> Visibility:
@@ -50,20 +53,25 @@ def visibility(
         surfels: the per-surfel parameters of docs/overview.md, N rows, all of them finite and drawable.
         cameras: the views.
         near: nearest drawn depth.
+        weight_bound: fragments of smaller weight get no residual.
         through_pixel: how the scene is drawn, see `ops.project`.
         progress: called after every view.
     """
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
     largest = means.new_zeros(len(means))
+    pixels = torch.zeros(len(means), dtype=torch.int32, device=means.device)
     seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
+        here = torch.zeros_like(pixels)
         projection = project(means, *geometry, camera.to(means.device), near, through_pixel)
         for fragments in fitting_lists(projection):
             in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
             rows = fragments.surfel.long()
             largest.scatter_reduce_(0, rows, in_front, "amax")
+            here.index_add_(0, rows, (fragments.weight >= weight_bound).to(here.dtype))
             seen[done - 1, rows] = True
             del fragments, in_front, rows  # before the next list is made
+        pixels = torch.maximum(pixels, here)
         progress("looking through the training views", done, len(cameras))
-    return Visibility(largest, seen)
+    return Visibility(largest, pixels, seen)

@@ -148,7 +148,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     means, render = bundle.scene.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
-        views = visibility(trained, cameras, render.near, bundle.scene.through_pixel)
+        views = visibility(trained, cameras, render.near, through_pixel=bundle.scene.through_pixel)
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)

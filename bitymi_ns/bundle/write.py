@@ -90,10 +90,11 @@ def export(
     loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Writes a baked scene as a bundle; see `write_bundle` for the arguments and errors.
+    """Writes a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
 
     `statistics` is added to those of the bake.
     """
+    baked = baked.encoded()
     return write_bundle(
         folder,
         replace(baked.scene, mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),

@@ -28,9 +28,9 @@ from bitymi_ns.bake import (
     TuneOptions,
     bake,
     polish_scene,
+    reduced,
     rich_progress,
     tune_atlas,
-    with_reduced_colors,
 )
 from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import BundleError, export, read_bundle
@@ -125,8 +125,9 @@ class ExportAtlas(BakeOptions):
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        learns = not self.exact and model.scene.field is not None
-        finetunes, polishes = learns and self.finetune_steps != 0, learns and self.polish_steps != 0
+        polishes = not self.exact and self.polish_steps != 0
+        textured = polishes or model.scene.field is not None
+        finetunes = textured and not self.exact and self.finetune_steps != 0
         if finetunes and self.finetune_steps < FEWEST_PASSES * len(views):
             passes = self.finetune_steps / len(views)
             say(
@@ -145,7 +146,7 @@ class ExportAtlas(BakeOptions):
                 photographs = datamanager.train_views
                 if polishes or finetunes:
                     photographs = corrected(photographs, model.resume_state.get("exposure"))
-                baked = bake(model.scene, views, options, progress, not polishes)
+                baked = bake(model.scene, views, options, progress, polish.pixels_per_texel if polishes else None)
                 if polishes:
                     baked = polished(baked, photographs, background, polish, model.train_config, progress, held_out)
                 if finetunes and baked.texels is not None:
@@ -181,12 +182,10 @@ def polished(
     progress: Progress,
     held_out: Sequence[View],
 ) -> Baked:
-    """A bake with all of its view colours after the polish, with reduced ones and an encoded atlas. One without an
-    atlas has no texels that could learn: its view colours alone are reduced."""
+    """A bake with fine tiles and all of its view colours after the polish, with smaller tiles and reduced ones."""
     if baked.texels is not None:
         baked = polish_scene(baked, photographs, background, options, train, progress, held_out)
-    baked = with_reduced_colors(baked, [view.camera.to("cpu") for view in photographs], progress)
-    return baked if baked.texels is None or baked.atlas is not None else baked.with_texels(baked.texels, progress)
+    return reduced(baked, [view.camera.to("cpu") for view in photographs], progress)
 
 
 def default_export() -> ExportAtlas:

@@ -244,7 +244,7 @@ class Knobs:
             exact = self._draw(self.exact_texels(baked))
             settings = [Setting("format", "float32", "baked", exact, 16 * texels[..., 0].numel(), True)]
             for name in FORMATS:
-                other = replace(baked, options=replace(baked.options, format=name)).with_texels(texels)
+                other = replace(baked, options=replace(baked.options, format=name)).with_texels(texels).encoded()
                 assert other.atlas is not None
                 draw = self._draw(self.stored_texels(other))
                 default = name == self.options.format

@@ -131,7 +131,7 @@ def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
 
 def test_fine_tuned_texels_are_encoded_anew(scene):
     baked = bake(scene(30))
-    tuned = baked.with_texels(baked.texels + 1.0)
+    tuned = baked.with_texels(baked.texels + 1.0).encoded()
     tiled = torch.from_numpy(baked.packing.tiles[:, 3:4] > 0)
     assert tiled.any() and not tiled.all()
     torch.testing.assert_close(tuned.mean_residual, baked.mean_residual + tiled.float())

@@ -3,7 +3,13 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake.resolution import max_projected_extent, next_power_of_two, nyquist_resolution, voxel_along_axes
+from bitymi_ns.bake.resolution import (
+    coarsened,
+    max_projected_extent,
+    next_power_of_two,
+    nyquist_resolution,
+    voxel_along_axes,
+)
 from bitymi_ns.bake.texels import texel_centres, tile_points
 from bitymi_ns.train.rotations import tangents
 
@@ -78,3 +84,10 @@ def test_tile_points_run_u_along_rows():
     u, v = (5 + 0.5) / 8 * 6 - 3, (1 + 0.5) / 4 * 6 - 3
     expected = means + u * scales[:, :1] * axes[..., 0] + v * scales[:, 1:] * axes[..., 1]
     torch.testing.assert_close(points[:, 1, 5], expected)
+
+
+def test_coarsened_halves_the_longer_side_until_it_fits():
+    sides = torch.tensor([[64, 16], [8, 8], [4, 64], [4, 4], [32, 32]], dtype=torch.int32)
+    got = coarsened(sides, torch.tensor([256.0, 64.0, 100.0, 1.0, 500.0]))
+    assert got.tolist() == [[16, 16], [8, 8], [4, 16], [4, 4], [16, 16]]
+    assert coarsened(sides, torch.zeros(5)).eq(4).all() and sides[0, 0] == 64

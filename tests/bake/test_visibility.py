@@ -25,3 +25,17 @@ def test_what_stands_in_front_is_counted(surfels, camera):
     assert both.tolist() == pytest.approx([1 - second, 1.0, 1.0, 0.0], abs=2e-3) or both[2] == pytest.approx(1.0)
     assert visibility(params, [camera(6.0)], 0.2).in_front[3] == 1.0  # nothing is known of it
     assert visibility(params, [], 0.2).transmittance.tolist() == [0.0] * 4
+
+
+def test_pixels_of_the_view_that_shows_most(surfels, camera):
+    params = surfels(2)
+    params["means"] = torch.tensor([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0]])
+    params["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4).clone()
+    params["log_scales"] = torch.full((2, 2), -1.5)
+    params["opacity_logits"] = torch.tensor([0.0, 3.0])
+    params["beta_raw"] = torch.full((2,), -9.0)  # hard discs
+    near, far = (int(visibility(params, [camera(d)], 0.2).pixels[0]) for d in (4.0, 8.0))
+    assert near == pytest.approx(4 * far, rel=0.2) and far > 10
+    both = visibility(params, [camera(8.0), camera(4.0)], 0.2, weight_bound=0.4).pixels
+    assert both.tolist() == [near, 0]
+    assert visibility(params, [camera(4.0)], 0.2, weight_bound=0.6).pixels.tolist() == [0, 0]

@@ -290,12 +290,13 @@ def _textured(
         stored = None if atlas is None else atlas.decoded()
         errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
         error = errors.summary(options.tolerance)
+    counts = plan.texels.but(polished=packing.texels) if learns else plan.texels
     return (
         tiles,
         atlas,
         statistics.but(
             surfels=statistics.surfels.but(without_tile=int((packing.tiles[:, 3] == 0).sum())),
-            texels=plan.texels.but(paper=paper, kept=packing.texels, not_finite=tiles.nonfinite),
+            texels=counts.but(paper=paper, kept=packing.texels, not_finite=tiles.nonfinite),
             field=levels,
             atlas=None if atlas is None else _cost(packing, atlas),
             error=error,

@@ -33,7 +33,7 @@ from bitymi_ns.train.views import View, training_order
 class PolishOptions(TuneOptions):
     """How a baked scene is polished: `rate` and `prior` are of the texels."""
 
-    steps: int = 200
+    steps: int = 300
     share: float = 0.4
     """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
     checks: int = 10

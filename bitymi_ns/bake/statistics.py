@@ -95,6 +95,8 @@ class KeptTexels(Part):
     nyquist: Count | None = None
     after_cap_by_views: Count | None = None
     within_visible_part: Count | None = None
+    polished: Count | None = None
+    """Of the tiles that a polish started from."""
     kept: Count | None = None
     not_finite: Count | None = None
     """Points at which the field was not finite."""

@@ -53,7 +53,9 @@ from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
-"""Steps of fine-tuning per photograph; with fewer than this a line says that more may gain."""
+"""Steps of polish or fine-tuning per photograph; with fewer than this a line says that more may gain."""
+STEPS_AFTER_POLISH = 100
+"""Of the fine-tuning: what is left to learn is what the reduction of tiles and view colours changed."""
 
 
 @dataclass(kw_only=True)
@@ -73,12 +75,12 @@ class ExportAtlas(BakeOptions):
     exact: bool = False
     """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
-    polish_steps: int = 0
+    polish_steps: int | None = None
     """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
-    after the bake and without the network, before the view colours are reduced; 0 = surfels stay as they were
-    trained."""
-    finetune_steps: int = TuneOptions.steps
-    """Steps of fine-tuning the texels against the training photographs; 0 = the field as it was learned."""
+    without the network, before tiles and view colours are reduced; 0 = surfels stay as they were trained. Not given:
+    300 on the CPU; 0 on a GPU, for which there are no kernels."""
+    finetune_steps: int | None = None
+    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 100 after a polish, else 400."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
     """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
     not."""
@@ -88,12 +90,12 @@ class ExportAtlas(BakeOptions):
     def main(self) -> None:
         """Run the export."""
         earlier = None
-        bake_options, polish_options, tune_options = self._options()
+        bake_options = self._options()
         try:
             with bundle_place(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 check_room(self.output_dir, self.load_config, self, self.exact)
-                self._run(bake_options, polish_options, tune_options)
+                self._run(bake_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
             state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
@@ -102,54 +104,66 @@ class ExportAtlas(BakeOptions):
         except BundleError as error:
             fail(str(error), error)
 
-    def _options(self) -> tuple[BakeOptions, PolishOptions, TuneOptions]:
-        """Those of bake, polish and fine-tuning; stops where one is out of its range, before anything is loaded."""
+    def _options(self) -> BakeOptions:
+        """Those of the bake; stops where any is out of its range, before anything is loaded."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
-        if self.finetune_steps < 0:
+        if self.finetune_steps is not None and self.finetune_steps < 0:
             fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
-        if self.polish_steps < 0:
+        if self.polish_steps is not None and self.polish_steps < 0:
             fail(f"--polish-steps must not be negative, it is {self.polish_steps}; 0 = no polish")
         if not 0 <= self.finetune_memory <= 1e6:
             fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
-        tune = TuneOptions(steps=self.finetune_steps, cache_bytes=int(self.finetune_memory * 1e9))
         try:
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
-        return options, PolishOptions(steps=self.polish_steps), tune
+        return options
 
-    def _run(self, options: BakeOptions, polish: PolishOptions, tune: TuneOptions) -> None:
+    def _learning(self, model: BitymiModel) -> tuple[PolishOptions | None, TuneOptions | None]:
+        """Options of the polish and of the fine-tuning; None = there is none."""
+        if self.exact:
+            return None, None
+        steps = self.polish_steps
+        if steps is None:
+            steps = PolishOptions.steps if model.device.type == "cpu" else 0
+        polish = PolishOptions(steps=steps) if steps else None
+        textured = polish is not None or model.scene.field is not None
+        steps = self.finetune_steps
+        if steps is None:
+            steps = TuneOptions.steps if polish is None else STEPS_AFTER_POLISH
+        tune = TuneOptions(steps=steps, cache_bytes=int(self.finetune_memory * 1e9)) if textured and steps else None
+        return polish, tune
+
+    def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        polishes = not self.exact and self.polish_steps != 0
-        textured = polishes or model.scene.field is not None
-        finetunes = textured and not self.exact and self.finetune_steps != 0
-        if finetunes and self.finetune_steps < FEWEST_PASSES * len(views):
-            passes = self.finetune_steps / len(views)
-            say(
-                f"Fine-tuning has {self.finetune_steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
-                "for each: more may gain (--finetune-steps)."
-            )
-        if (finetunes or polishes) and model.device.type != "cpu":
+        polish, tune = self._learning(model)
+        for name, options_of in (("polish", polish), ("finetune", None if polish else tune)):
+            if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
+                passes = options_of.steps / len(views)
+                say(
+                    f"The {name} has {options_of.steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
+                    f"for each: more may gain (--{name}-steps)."
+                )
+        if (tune or polish) and model.device.type != "cpu":
             say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
-            learning = len(model.scene) if polishes else 0
-            state_export(model.scene, views, tune.cache_bytes if finetunes else 0, learning)
+            state_export(model.scene, views, tune.cache_bytes if tune else 0, len(model.scene) if polish else 0)
         try:
             with rich_progress() as progress:
                 held_out = datamanager.eval_views if self.compare else ()
                 background = model.background.cpu()
                 photographs = datamanager.train_views
-                if polishes or finetunes:
+                if polish or tune:
                     photographs = corrected(photographs, model.resume_state.get("exposure"))
-                baked = bake(model.scene, views, options, progress, polish.pixels_per_texel if polishes else None)
-                if polishes:
+                baked = bake(model.scene, views, options, progress, polish.pixels_per_texel if polish else None)
+                if polish:
                     baked = polished(baked, photographs, background, polish, model.train_config, progress, held_out)
-                if finetunes and baked.texels is not None:
+                if tune and baked.texels is not None:
                     baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)

@@ -70,18 +70,24 @@ def print_savings(table: Table, info: Manifest) -> None:
     statistics, options = info.statistics, info.statistics.options
     texels = statistics.texels
     learned = [part.error_before for part in (statistics.polish, statistics.finetune) if part is not None]
-    error = statistics.error or next(each for each in learned if each is not None)
+    error = statistics.error or next((each for each in learned if each is not None), None)
     kept, count = texels.kept, info.surfels.count
     table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
-    table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
-    voxel = "local voxel" if options.local_voxel else "smallest voxel"
-    table.add_row(f"... by the {voxel}, extent {options.extent:g}", f"{texels.nyquist:,}")
+    if texels.paper is not None:
+        table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
+        voxel = "local voxel" if options.local_voxel else "smallest voxel"
+        table.add_row(f"... by the {voxel}, extent {options.extent:g}", f"{texels.nyquist:,}")
     table.add_row("... no finer than a view sees", f"{texels.after_cap_by_views:,}")
     table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
-    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, texels.paper):.1f} %)")
-    rule = texels.paper * BYTES_PER_TEXEL[options.format]
+    if texels.polished is not None:
+        table.add_row("... by the pixels that show them: polished", f"{texels.polished:,}")
+    first = texels.paper or texels.within_visible_part
+    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, first):.1f} %)")
+    rule = first * BYTES_PER_TEXEL[options.format]
     stored = info.files[info.atlas.file].bytes if info.atlas else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
+    if error is None:  # the tiles hold what was learned, not the field
+        return
     tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
     table.add_row("Error of a tile", percentiles_text(error.rms))
     when = "before the texels learned" if statistics.error is None else "as stored"

@@ -15,7 +15,8 @@ TOLERANCE = 0.02
 
 
 def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> None:
-    ExportAtlas(load_config=config.get_base_dir() / "config.yml", output_dir=folder, **options).main()
+    given = {"polish_steps": 0, **options}
+    ExportAtlas(load_config=config.get_base_dir() / "config.yml", output_dir=folder, **given).main()
 
 
 def evaluate(config: Path, output: Path) -> dict[str, float]:

@@ -97,7 +97,9 @@ def test_the_scene_is_polished(
     assert polished["steps"] <= 30 and polished["views"] + polished["held_in_views"] == 10
     assert polished["psnr_held_in"]["after"] == max(psnr for _, psnr in polished["curve"])
     assert tuned["psnr_held_in"]["before"] == pytest.approx(polished["psnr_held_in"]["after"], abs=0.1)
-    assert polished["error_before"]["rms"] and "error_before" not in tuned and "error" not in statistics
+    assert "error_before" not in polished and "error_before" not in tuned and "error" not in statistics
+    texels = statistics["texels"]
+    assert 0 < texels["kept"] <= texels["polished"] <= texels["within_visible_part"]
     stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "polished.json")["psnr"]
     assert stored == pytest.approx(tuned["psnr_held_out"]["after"], abs=0.1)
     out = " ".join(capsys.readouterr().out.split())

@@ -116,7 +116,7 @@ def test_a_capture_of_several_cameras_trains_is_exported_and_evaluated(
     assert "training photographs of up to " in " ".join(capsys.readouterr().out.split())
     place = json.loads((config.get_base_dir() / "dataparser_transforms.json").read_text())
     run = config.get_base_dir() / "config.yml"
-    ExportAtlas(load_config=run, output_dir=tmp_path / "bundle", finetune_steps=4).main()
+    ExportAtlas(load_config=run, output_dir=tmp_path / "bundle", polish_steps=4, finetune_steps=4).main()
     world = json.loads((tmp_path / "bundle/bundle.json").read_text())["world"]
     assert np.allclose(world["transform"], place["transform"], atol=1e-6)
     assert world["scale"] == pytest.approx(place["scale"], rel=1e-6)

@@ -114,17 +114,17 @@ def test_the_cap_holds_from_the_start(cloud):
 def test_a_scene_starts_with_room_to_grow(cloud):
     few = DensifyConfig(min_surfels=10)
     surfels, report = start(*cloud, config=TrainConfig(densify=few), image_pixels=60_000)  # densification ends at 200
-    assert len(surfels["means"]) == 80 and report.over_cap == 120
+    assert len(surfels["means"]) == 120 and report.over_cap == 80
 
 
 @pytest.mark.parametrize(
     ("share", "densify", "pixels", "first"),
     [
-        (0.4, DensifyConfig(), 3_000_000, 4_000),
-        (0.4, DensifyConfig(), 0, 0),  # of unknown size
-        (0.4, DensifyConfig(pixels_per_surfel=0), 3_000_000, 0),
-        (0.4, DensifyConfig(), 30_000, 100),  # no fewer than a prune would leave
-        (0.4, DensifyConfig(max_surfels=500), 3_000_000, 200),
+        (0.6, DensifyConfig(), 3_000_000, 6_000),
+        (0.6, DensifyConfig(), 0, 0),  # of unknown size
+        (0.6, DensifyConfig(pixels_per_surfel=0), 3_000_000, 0),
+        (0.6, DensifyConfig(), 30_000, 100),  # no fewer than a prune would leave
+        (0.6, DensifyConfig(max_surfels=500), 3_000_000, 300),
         (0.0, DensifyConfig(), 3_000_000, 0),
         (0.0, DensifyConfig(max_surfels=500), 3_000_000, 500),
     ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.domain import default_table_size, table_size_of
-from bitymi_ns.train.init import PointReport, first_surfels
+from bitymi_ns.train.init import PointReport
 from bitymi_ns.train.schedules import Schedule
 
 
@@ -33,21 +33,20 @@ def short_run(schedule: Schedule, views: int) -> list[str]:
     return found
 
 
-def start(points: PointReport, config: TrainConfig, image_pixels: int, log2_table_size: int | None) -> list[str]:
+def start(points: PointReport, max_surfels: int, image_pixels: int, log2_table_size: int | None) -> list[str]:
     """Bounds that the first scene meets.
 
     Args:
         points: what became of the sparse points.
-        config: training options.
+        max_surfels: `densify.max_surfels`.
         image_pixels: of all training images together.
         log2_table_size: `scene.log2_table_size`; None = by the photographs.
     """
     found = []
     if points.over_cap:
         found.append(
-            f"{points.over_cap:,} of {max(points.given, points.random):,} points are left out: training starts with "
-            f"{first_surfels(config, image_pixels):,} surfels and makes more where they are needed "
-            "(--pipeline.model.train.init-share)."
+            f"{points.over_cap:,} of {points.given:,} points of the capture are left out: densify.max_surfels is "
+            f"{max_surfels:,}."
         )
     size = default_table_size(image_pixels)
     if log2_table_size is None and table_size_of(image_pixels) > size:

@@ -173,9 +173,6 @@ class TrainConfig:
     """How many times the image size is halved at the start."""
     init_opacity: float = 0.1
     """Opacity of the first surfels."""
-    init_share: float = 0.6
-    """First surfels at most, as a share of the number at which densification stops; more points are thinned at random.
-    A scene that starts full cannot put surfels where its errors are. 0 = all points."""
     random_points: int = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
     exposure: ExposureKind = "off"

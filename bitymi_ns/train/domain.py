@@ -37,8 +37,7 @@ def build_scene(
         train_config: training options.
         bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off, as it is for
             scenes with a small `declared` box.
-        image_pixels: of all training images together; decides the number of the first surfels, and the size of the hash
-            table where none is given.
+        image_pixels: of all training images together; decides the size of the hash table where none is given.
         box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
         declared: [2, 3] corners of the box that the capture declares to hold its scene, if it does.
 
@@ -49,9 +48,7 @@ def build_scene(
         ValueError: an option is out of range, or there is nothing to start from.
     """
     check_representation(scene_config)
-    surfels, report = surfels_from_points(
-        points, colours, camera_centers, train_config, scene_config, box, image_pixels
-    )
+    surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
     means = surfels["means"]
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture == "none":

@@ -14,7 +14,6 @@ from bitymi_ns.ops.view_kinds import entry_of
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.rotations import facing
-from bitymi_ns.train.strategy import most_surfels
 
 BETA_RAW = 2.0
 """Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
@@ -32,7 +31,6 @@ class PointReport:
     not_finite: int = 0
     duplicates: int = 0
     over_cap: int = 0
-    """Left out because a scene starts with no more surfels than `first_surfels`."""
     random: int = 0
     """Surfels placed at random because no point was usable."""
 
@@ -61,19 +59,6 @@ def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
     return 1.0
 
 
-def first_surfels(config: TrainConfig, image_pixels: int) -> int:
-    """The number of surfels that training starts with at most; 0 = any.
-
-    Args:
-        config: training options.
-        image_pixels: of all training images at full size; 0 = unknown: `densify.max_surfels` alone counts.
-    """
-    most = most_surfels(config, image_pixels)
-    if most == 0 or config.init_share == 0:
-        return config.densify.max_surfels
-    return max(int(config.init_share * most), min(config.densify.min_surfels, most))
-
-
 def surfels_from_points(
     xyz: Tensor,
     rgb: Tensor,
@@ -81,14 +66,13 @@ def surfels_from_points(
     config: TrainConfig,
     scene_config: SceneConfig,
     box: Tensor | None = None,
-    image_pixels: int = 0,
 ) -> tuple[dict[str, Tensor], PointReport]:
     """Surfel parameters from sparse points.
 
     A point gives one surfel: scale = root mean square distance to its 3 nearest neighbours, the disc faces the nearest
     camera with a random turn in its plane, the colour is the point's from every direction. Points that are not finite
     and repeated positions are dropped and counted. With no usable point, `config.random_points` surfels are placed at
-    random in `box`. More points than `first_surfels` are thinned at random.
+    random in `box`. `config.densify.max_surfels` holds from the start: more points than that are thinned at random.
 
     Args:
         xyz: [M, 3] world positions; M may be 0.
@@ -97,7 +81,6 @@ def surfels_from_points(
         config: training options (opacity, seed, cap).
         scene_config: decides the parameters of the view colour.
         box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
-        image_pixels: of all training images at full size; 0 = unknown.
 
     Returns:
         The parameters by name, float32, on the CPU (table in docs/overview.md), and what became of the points.
@@ -115,7 +98,7 @@ def surfels_from_points(
     if len(xyz) == 0:
         xyz, rgb = _random_points(config.random_points, centers, box, generator)
         report.random = len(xyz)
-    cap = first_surfels(config, image_pixels)
+    cap = config.densify.max_surfels
     if 0 < cap < len(xyz):
         report.over_cap = len(xyz) - cap
         keep = torch.randperm(len(xyz), generator=generator)[:cap].sort().values

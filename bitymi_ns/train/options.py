@@ -51,7 +51,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "resolution_schedule": (0, MOST),
     "num_downscales": (0, 16),
     "init_opacity": (TINY, 1 - TINY),
-    "init_share": (0, 1),
     "random_points": (1, MOST),
 }
 """Option -> smallest and largest value. Learning rates are checked by the schedule that makes them."""

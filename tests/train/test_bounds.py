@@ -30,13 +30,13 @@ def test_a_run_that_does_not_see_every_photograph_says_so() -> None:
 
 @pytest.mark.parametrize(("table", "said"), [(None, True), (19, False)])
 def test_a_table_smaller_than_the_photographs_could_fill_is_announced(table, said) -> None:
-    sentences = bounds.start(PointReport(given=9), TrainConfig(), 10**12, table)
+    sentences = bounds.start(PointReport(given=9), 0, 10**12, table)
     assert [("log2-table-size" in s and "2^35" in s) for s in sentences] == [True] * said
 
 
 def test_points_that_do_not_fit_are_announced() -> None:
-    (sentence,) = bounds.start(PointReport(given=12_000, over_cap=2_000), TrainConfig(), 5_000_000, 17)
-    assert sentence.startswith("2,000 of 12,000 points") and "9,999 surfels" in sentence and "init-share" in sentence
+    (sentence,) = bounds.start(PointReport(given=12_000, over_cap=2_000), 10_000, 0, None)
+    assert sentence.startswith("2,000 of 12,000 points") and "densify.max_surfels is 10,000" in sentence
 
 
 def test_a_bound_that_densification_meets_is_named() -> None:

@@ -11,7 +11,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.init import first_surfels, neighbour_distance, scene_extent, surfels_from_points
+from bitymi_ns.train.init import neighbour_distance, scene_extent, surfels_from_points
 from bitymi_ns.train.rotations import facing, tangents
 
 CENTERS = torch.tensor([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 1.0]])
@@ -109,28 +109,6 @@ def test_point_at_a_camera_and_far_outliers():
 def test_the_cap_holds_from_the_start(cloud):
     surfels, report = start(*cloud, config=TrainConfig(densify=DensifyConfig(max_surfels=37)))
     assert len(surfels["means"]) == 37 and report.over_cap == 163
-
-
-def test_a_scene_starts_with_room_to_grow(cloud):
-    few = DensifyConfig(min_surfels=10)
-    surfels, report = start(*cloud, config=TrainConfig(densify=few), image_pixels=60_000)  # densification ends at 200
-    assert len(surfels["means"]) == 120 and report.over_cap == 80
-
-
-@pytest.mark.parametrize(
-    ("share", "densify", "pixels", "first"),
-    [
-        (0.6, DensifyConfig(), 3_000_000, 6_000),
-        (0.6, DensifyConfig(), 0, 0),  # of unknown size
-        (0.6, DensifyConfig(pixels_per_surfel=0), 3_000_000, 0),
-        (0.6, DensifyConfig(), 30_000, 100),  # no fewer than a prune would leave
-        (0.6, DensifyConfig(max_surfels=500), 3_000_000, 300),
-        (0.0, DensifyConfig(), 3_000_000, 0),
-        (0.0, DensifyConfig(max_surfels=500), 3_000_000, 500),
-    ],
-)
-def test_number_of_first_surfels(share, densify, pixels, first):
-    assert first_surfels(TrainConfig(init_share=share, densify=densify), pixels) == first
 
 
 def test_extent():

@@ -70,6 +70,7 @@ class TrainingRun:
             self.datamanager.train_views,
             scene_extent(metadata["camera_centers"], scene.surfels["means"]),
             metadata["train_pixels"],
+            metadata["first_surfels"],
             stops_of(self.datamanager.train_dataset.image_filenames),
         )
         optimizers = attributes.optimizers.optimizers

@@ -71,6 +71,7 @@ class BitymiModel(SurfelModel):
         self.train_config = train_config_for(self.config.train, self.metadata.get("alpha_color"))
         points = self.kwargs.pop("seed_points", None)
         self.scene = new_scene(points, self.scene_box, self.config.scene, self.train_config, self.metadata)
+        self.metadata["first_surfels"] = len(self.scene)  # a checkpoint that is loaded may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
         self._run: TrainingRun | None = None

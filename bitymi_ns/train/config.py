@@ -83,6 +83,9 @@ class DensifyConfig:
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
     pixels_per_surfel: float = 300.0
     """Densification stops at one surfel for so many pixels of all training photographs together; 0 = no such bound."""
+    growth: float = 2.0
+    """... but not before there are so many times the surfels that training started with, however few the pixels: a
+    scene that cannot grow cannot put surfels where its errors are."""
     max_surfels: int = 0
     """Hard cap on the number of surfels; 0 = none."""
     min_surfels: int = 100

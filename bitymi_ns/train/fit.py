@@ -80,7 +80,9 @@ class Trainer:
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
         pixels = sum(view.camera.width * view.camera.height for view in views)
-        self.training = Training(scene, TrainingData(views, extent, pixels), self.optimizers, config, max_steps)
+        self.training = Training(
+            scene, TrainingData(views, extent, pixels, len(scene)), self.optimizers, config, max_steps
+        )
         self.step = 0
         self._views = len(views)
         self._terms: list[Tensor] = []

@@ -36,6 +36,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "densify.final_prune_score": (0, math.inf),
     "densify.min_interval": (0, MOST),
     "densify.pixels_per_surfel": (0, MOST),
+    "densify.growth": (0, MOST),
     "densify.max_surfels": (0, MOST),
     "densify.min_surfels": (0, MOST),
     "lr.short_run_power": (0, 10),

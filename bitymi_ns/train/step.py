@@ -108,7 +108,7 @@ class Training:
         self.schedule.reset_opacity()
         for name in optimizers:
             self.schedule.lr(name, 0)
-        self.strategy = Strategy(config, self.schedule, data.extent, on_resize, data.image_pixels)
+        self.strategy = Strategy(config, self.schedule, data.extent, on_resize, data.image_pixels, data.first_surfels)
         self.exposure = Exposure(config.exposure, data.exif_stops)
         self.schedule.lr("exposure", 0)
         self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure)

@@ -64,6 +64,7 @@ class Strategy:
         extent: float,
         on_resize: ResizeHook | None = None,
         image_pixels: int = 0,
+        first_surfels: int = 0,
     ) -> None:
         """
         Args:
@@ -72,12 +73,13 @@ class Strategy:
             extent: scene extent in world units.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
+            first_surfels: that training started with, for `densify.growth`.
         """
         self.config = config
         self.schedule = schedule
         self.extent = extent
         self.on_resize = on_resize
-        self.most = most_surfels(config, image_pixels)
+        self.most = most_surfels(config, image_pixels, first_surfels)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._clear(0, torch.device("cpu"))
 
@@ -309,15 +311,18 @@ class Strategy:
                 setattr(self, name, getattr(self, name)[keep.to(self.grad_sum.device)])
 
 
-def most_surfels(config: TrainConfig, image_pixels: int) -> int:
+def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0) -> int:
     """The number of surfels at which densification stops; 0 = never.
 
     Args:
         config: training options.
         image_pixels: of all training images at full size.
+        first_surfels: that training started with.
     """
     densify = config.densify
     by_pixels = int(image_pixels / densify.pixels_per_surfel) if densify.pixels_per_surfel > 0 else 0
+    if by_pixels > 0:
+        by_pixels = max(by_pixels, int(densify.growth * first_surfels))
     return min((bound for bound in (densify.max_surfels, by_pixels) if bound > 0), default=0)
 
 

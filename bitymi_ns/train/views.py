@@ -62,12 +62,14 @@ class TrainingData:
         views: training views at full size.
         extent: scene extent in world units (`init.scene_extent`).
         image_pixels: of all training views together.
+        first_surfels: that training starts, or started, with.
         exif_stops: log2 of the exposure of each photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
     """
 
     views: Sequence[View]
     extent: float
     image_pixels: int
+    first_surfels: int
     exif_stops: Sequence[float] | None = None
 
 

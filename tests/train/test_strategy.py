@@ -263,19 +263,24 @@ def test_the_bound_follows_the_pixels_of_all_photographs(bench, views, surfels):
 
 
 @pytest.mark.parametrize(
-    ("cap", "per_surfel", "pixels", "most"),
+    ("cap", "per_surfel", "pixels", "first", "most"),
     [
-        (0, 300.0, 0, 0),
-        (0, 300.0, 3000, 10),
-        (7, 300.0, 3000, 7),
-        (70, 300.0, 3000, 10),
-        (0, 0.0, 3000, 0),
-        (7, 0.0, 3, 7),
+        (0, 300.0, 0, 0, 0),
+        (0, 300.0, 3000, 0, 10),
+        (7, 300.0, 3000, 0, 7),
+        (70, 300.0, 3000, 0, 10),
+        (0, 0.0, 3000, 0, 0),
+        (7, 0.0, 3, 0, 7),
+        (0, 300.0, 3000, 4, 10),
+        (0, 300.0, 3000, 9, 18),  # there is room to grow, however few the pixels
+        (12, 300.0, 3000, 9, 12),
+        (0, 0.0, 3000, 9, 0),
+        (0, 300.0, 0, 9, 0),  # of unknown size
     ],
 )
-def test_the_tighter_bound_holds(cap, per_surfel, pixels, most):
+def test_the_tighter_bound_holds(cap, per_surfel, pixels, first, most):
     config = TrainConfig(densify=DensifyConfig(max_surfels=cap, pixels_per_surfel=per_surfel))
-    assert most_surfels(config, pixels) == most
+    assert most_surfels(config, pixels, first) == most
 
 
 def test_a_capture_of_the_size_of_tanks_and_temples_densifies_beyond_its_points():

@@ -61,10 +61,8 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
     """Densification wanted `count` more surfels than the `most` there may be."""
     densify = config.densify
     option = "max-surfels" if most == densify.max_surfels else "pixels-per-surfel, growth"
-    rule = (
-        f", one for {densify.pixels_per_surfel:g} pixels of all photographs or {densify.growth:g} times the first ones,"
-    )
-    why = "" if most == densify.max_surfels else rule
+    rule = f"one for {densify.pixels_per_surfel:g} pixels of all photographs or {densify.growth:g} times the first"
+    why = "" if most == densify.max_surfels else f", {rule},"
     return (
         f"Densification stops at {most:,} surfels{why} and would have made {count:,} more now "
         f"(--pipeline.model.train.densify.{option})."

@@ -1,5 +1,6 @@
 """Trained field to texture atlas: resolution, plan, evaluation, reduction, packing, quantisation, fine-tuning."""
 
+from bitymi_ns.bake.learn import Learning, bake_and_learn
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, bake, reduced
 from bitymi_ns.bake.polish import PolishOptions, polish_scene
@@ -9,10 +10,12 @@ from bitymi_ns.progress import Progress, rich_progress
 __all__ = [
     "BakeOptions",
     "Baked",
+    "Learning",
     "PolishOptions",
     "Progress",
     "TuneOptions",
     "bake",
+    "bake_and_learn",
     "polish_scene",
     "reduced",
     "rich_progress",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,16 +21,12 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from bitymi_ns.bake import (
-    Baked,
     BakeOptions,
+    Learning,
     PolishOptions,
-    Progress,
     TuneOptions,
-    bake,
-    polish_scene,
-    reduced,
+    bake_and_learn,
     rich_progress,
-    tune_atlas,
 )
 from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import BundleError, export, read_bundle
@@ -46,10 +42,8 @@ from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import cc_psnr, psnr
-from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
@@ -121,10 +115,9 @@ class ExportAtlas(BakeOptions):
             fail(f"the scene cannot be baked: {error}", error)
         return options
 
-    def _learning(self, model: BitymiModel) -> tuple[PolishOptions | None, TuneOptions | None]:
-        """Options of the polish and of the fine-tuning; None = there is none."""
+    def _learning(self, model: BitymiModel) -> Learning:
         if self.exact:
-            return None, None
+            return Learning()
         steps = self.polish_steps
         if steps is None:
             steps = PolishOptions.steps if model.device.type == "cpu" else 0
@@ -134,14 +127,15 @@ class ExportAtlas(BakeOptions):
         if steps is None:
             steps = TuneOptions.steps if polish is None else STEPS_AFTER_POLISH
         tune = TuneOptions(steps=steps, cache_bytes=int(self.finetune_memory * 1e9)) if textured and steps else None
-        return polish, tune
+        return Learning(polish, tune, model.train_config)
 
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        polish, tune = self._learning(model)
+        learning = self._learning(model)
+        polish, tune = learning.polish, learning.tune
         for name, options_of in (("polish", polish), ("finetune", None if polish else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
                 passes = options_of.steps / len(views)
@@ -160,11 +154,9 @@ class ExportAtlas(BakeOptions):
                 photographs = datamanager.train_views
                 if polish or tune:
                     photographs = corrected(photographs, model.resume_state.get("exposure"))
-                baked = bake(model.scene, views, options, progress, polish.pixels_per_texel if polish else None)
-                if polish:
-                    baked = polished(baked, photographs, background, polish, model.train_config, progress, held_out)
-                if tune and baked.texels is not None:
-                    baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
+                baked = bake_and_learn(
+                    model.scene, views, photographs, background, options, learning, progress, held_out
+                )
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
@@ -185,21 +177,6 @@ class ExportAtlas(BakeOptions):
             bundle.info.statistics.held_out = held_out
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
-
-
-def polished(
-    baked: Baked,
-    photographs: Sequence[View],
-    background: torch.Tensor,
-    options: PolishOptions,
-    train: TrainConfig,
-    progress: Progress,
-    held_out: Sequence[View],
-) -> Baked:
-    """A bake with fine tiles and all of its view colours after the polish, with smaller tiles and reduced ones."""
-    if baked.texels is not None:
-        baked = polish_scene(baked, photographs, background, options, train, progress, held_out)
-    return reduced(baked, [view.camera.to("cpu") for view in photographs], progress)
 
 
 def default_export() -> ExportAtlas:

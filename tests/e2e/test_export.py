@@ -18,6 +18,7 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.bake import BakeOptions, TuneOptions
+from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.host import export as host_export
@@ -115,14 +116,14 @@ def test_the_scene_is_polished(
 def test_fine_tuning_mends_an_atlas_that_is_too_dark(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make = host_export.bake
+    make = bake_learn.bake
 
     def too_dark(*arguments: Any) -> Any:
         baked = make(*arguments)
         dark = baked.with_mean_residual(baked.mean_residual - 0.3).with_texels(baked.texels - 0.3)
         return replace(dark, statistics=dark.statistics.but(error=baked.statistics.error))
 
-    monkeypatch.setattr(host_export, "bake", too_dark)
+    monkeypatch.setattr(bake_learn, "bake", too_dark)
     run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=100)
     tuned = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]
     held_in, held_out = tuned["psnr_held_in"], tuned["psnr_held_out"]

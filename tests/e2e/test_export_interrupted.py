@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bake import tune
 from bitymi_ns.bundle import check_files
 from bitymi_ns.host import export as host_export
@@ -32,7 +33,7 @@ def test_ctrl_c_in_the_export_leaves_nothing(
     def interrupted(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(host_export, "bake", interrupted)
+    monkeypatch.setattr(bake_learn, "bake", interrupted)
     with pytest.raises(SystemExit) as stop:
         run_export(trained, tmp_path / "b")
     assert stop.value.code == 130
@@ -46,7 +47,7 @@ def test_ctrl_c_before_a_bundle_is_replaced_says_which_one_is_there(
     def interrupted(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(host_export, "bake", interrupted)
+    monkeypatch.setattr(bake_learn, "bake", interrupted)
     with pytest.raises(SystemExit):
         run_export(trained, copied, overwrite=True)
     assert "is the earlier one" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,71 @@
+"""The whole way from a trained scene and its photographs to what a bundle holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
+from bitymi_ns.bake.polish import PolishOptions, polish_scene
+from bitymi_ns.bake.tune import TuneOptions, tune_atlas
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.views import View
+
+
+@dataclass(frozen=True)
+class Learning:
+    """What learns from the photographs after the training.
+
+    Attributes:
+        polish: texels and surfels together; None = surfels stay as they were trained.
+        tune: texels alone, after that; None = they stay as they are.
+        train: options of the training, for the rates of the polish.
+    """
+
+    polish: PolishOptions | None = None
+    tune: TuneOptions | None = None
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+def bake_and_learn(
+    scene: BakeableScene,
+    cameras: Sequence[Camera],
+    photographs: Sequence[View],
+    background: Tensor,
+    options: BakeOptions,
+    learning: Learning,
+    progress: Progress = no_progress,
+    held_out: Sequence[View] = (),
+) -> Baked:
+    """Bakes a scene, lets it learn, reduces and encodes it.
+
+    With a polish the order is: fine tiles, polish, reduction of tiles and view colours, fine-tuning. Without: reduced
+    tiles and view colours, fine-tuning.
+
+    Args:
+        scene: a trained scene.
+        cameras: of the training views, on the scene's device.
+        photographs: the training views, with the corrections that training found.
+        background: [3] colour behind the scene, on the CPU.
+        options: what is kept.
+        learning: see `Learning`.
+        progress: called after every piece of work.
+        held_out: views of which the gains are stated; they decide nothing.
+
+    Raises:
+        ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
+    """
+    polish, tune = learning.polish, learning.tune
+    baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+    if polish is not None:
+        if baked.texels is not None:
+            baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
+        baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
+    if tune is not None and baked.texels is not None:
+        baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
+    return baked.encoded(progress)

@@ -72,7 +72,7 @@ class ExportAtlas(BakeOptions):
     polish_steps: int | None = None
     """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
     without the network, before tiles and view colours are reduced; 0 = surfels stay as they were trained. Not given:
-    300 on the CPU; 0 on a GPU, for which there are no kernels."""
+    on the CPU 300, or 4 for each photograph where that is more; 0 on a GPU, for which there are no kernels."""
     finetune_steps: int | None = None
     """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 100 after a polish, else 400."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
@@ -115,12 +115,13 @@ class ExportAtlas(BakeOptions):
             fail(f"the scene cannot be baked: {error}", error)
         return options
 
-    def _learning(self, model: BitymiModel) -> Learning:
+    def _learning(self, model: BitymiModel, views: int) -> Learning:
+        """What learns from so many training photographs."""
         if self.exact:
             return Learning()
         steps = self.polish_steps
         if steps is None:
-            steps = PolishOptions.steps if model.device.type == "cpu" else 0
+            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if model.device.type == "cpu" else 0
         polish = PolishOptions(steps=steps) if steps else None
         textured = polish is not None or model.scene.field is not None
         steps = self.finetune_steps
@@ -134,7 +135,7 @@ class ExportAtlas(BakeOptions):
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        learning = self._learning(model)
+        learning = self._learning(model, len(views))
         polish, tune = learning.polish, learning.tune
         for name, options_of in (("polish", polish), ("finetune", None if polish else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):

@@ -200,6 +200,25 @@ def test_the_estimate_of_a_bundle_is_generous(trained: BitymiTrainerConfig, bund
     assert size < needed[0] < needed[1] < needed[3] and needed[0] < needed[2]
 
 
+def test_a_run_without_a_field_gets_texels_from_the_photographs(
+    start: Callable[..., BitymiTrainerConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = start(method="bitymi-notexture")
+    ns_train.main(config)
+    run_export(config, tmp_path / "b", polish_steps=None, tolerance=0.2)  # as many steps as by default
+    bundle, checks = check_files(tmp_path / "b")
+    assert all(check.ok for check in checks) and bundle.scene.atlas is not None
+    statistics = bundle.info.statistics
+    assert statistics.polish.steps_asked == 300 and statistics.finetune.steps_asked == 100
+    assert statistics.texels.paper is None and 0 < statistics.texels.kept <= statistics.texels.polished
+    against = statistics.held_out
+    assert against.psnr_baked_against_photos > against.psnr_neural_against_photos
+    out = " ".join(capsys.readouterr().out.split())
+    assert "by the pixels that show them: polished" in out and "paper's rule" not in out
+    found = {check.name: check for check in check_run(bundle, config.get_base_dir() / "config.yml", views=1)}
+    assert all(check.ok for check in found.values()) and "error against the field" not in found
+
+
 def test_a_fine_tuning_that_ends_early_says_so(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

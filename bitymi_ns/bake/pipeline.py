@@ -16,6 +16,7 @@ from bitymi_ns.bake.methods import BakeMethod, Blank, FineBake, Tiles, bake_meth
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import moved_texels, tile_means
+from bitymi_ns.bake.photographed import photographed
 from bitymi_ns.bake.plan import Field, paper_texels
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
@@ -197,6 +198,7 @@ def bake(
         near=inputs.near,
         weight_bound=inputs.weight_bound,
         prefilter=getattr(scene.config, "prefilter", "low_pass"),
+        photographed=photographed(inputs),
     )
     statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
     return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics)

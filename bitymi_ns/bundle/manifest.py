@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import math
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
+import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
+from torch import Tensor
 
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.bake.quantise import Format
@@ -19,9 +23,9 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, T
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (2, 2)
+VERSION = (2, 3)
 """The newest version that is read. Lean view colours are version 2, which readers of version 1 refuse."""
-FULL_VERSION = (1, 3)
+FULL_VERSION = (1, 4)
 """Version of a bundle whose surfels have all parameters."""
 _DIGEST_SINCE = {1: 2, 2: 1}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
@@ -60,6 +64,39 @@ def _only(value: float) -> Any:
 
     return Annotated[float, AfterValidator(check)]
 
+
+def points_text(points: Tensor) -> str:
+    """Points with a rate, [P, 4], as bundle.json holds them: base64 of little-endian float32 rows x, y, z, rate."""
+    return base64.b64encode(points.detach().float().cpu().numpy().astype("<f4").tobytes()).decode()
+
+
+def points_of(text: str) -> Tensor:
+    """The points [P, 4] float32 of `points_text`.
+
+    Raises:
+        PydanticCustomError: it is no such text, or a number is out of range.
+    """
+    try:
+        data = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise PydanticCustomError("points", "must be base64 of float32 numbers") from error
+    if len(data) % 16 or len(data) > 16 * _MOST_POINTS:
+        raise PydanticCustomError("points", "must hold rows of four float32 numbers, at most {most}", {"most": _MOST_POINTS})
+    points = torch.frombuffer(bytearray(data), dtype=torch.float32).view(-1, 4) if data else torch.zeros(0, 4)
+    low, high = _RATES
+    good = (points[:, :3].abs() <= LIMITS["means"][0]).all() and ((points[:, 3] >= low) & (points[:, 3] <= high)).all()
+    if not bool(good):  # also for NaN
+        raise PydanticCustomError("points", "must hold places and rates in range")
+    return points
+
+
+def _points(text: str) -> str:
+    points_of(text)
+    return text
+
+
+_MOST_POINTS = 4096
+_RATES = (1e-12, 1e12)  # pixels per unit of length
 
 Positive = Annotated[float, Field(gt=0, le=1e12)]
 Side = Annotated[int, Field(ge=1, le=1 << 20)]
@@ -122,6 +159,9 @@ class Render(Part):
     weight_bound: Share
     low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
     prefilter: Literal["low_pass", "pixel"] = "low_pass"
+    photographed: Annotated[str, AfterValidator(_points)] | None = None
+    """Points of the scene, and with how many pixels per unit of length they were photographed (`points_text`): since
+    versions 1.4 and 2.3."""
     background: tuple[Share, Share, Share]
 
 

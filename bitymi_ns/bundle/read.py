@@ -16,7 +16,7 @@ from torch import Tensor
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.quantise import decode_pages
 from bitymi_ns.bundle import ktx2, ply
-from bitymi_ns.bundle.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileEntry, Manifest, parse
+from bitymi_ns.bundle.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileEntry, Manifest, parse, points_of
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
@@ -140,6 +140,7 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
         near=info.render.near,
         weight_bound=info.render.weight_bound,
         prefilter=info.render.prefilter,
+        photographed=None if info.render.photographed is None else points_of(info.render.photographed),
     )
     if info.atlas is None:
         return Bundle(scene, info)

@@ -30,6 +30,7 @@ from bitymi_ns.bundle.manifest import (
     check_file_name,
     describe,
     dump,
+    points_text,
 )
 from bitymi_ns.bundle.surfel_table import (
     EXTENT_COLUMN,
@@ -192,6 +193,7 @@ def _describe(
             "near": scene.near,
             "weight_bound": scene.weight_bound,
             "prefilter": scene.prefilter,
+            "photographed": None if scene.photographed is None else points_text(scene.photographed),
             "background": list(background),
         },
         "world": world.described(),

@@ -9,15 +9,19 @@ from torch import Tensor
 
 from . import baked_cpu, baked_cuda
 from .backend import cuda_backend
-from .baked_scene import IMAGES, BakedScene, DrawCache
+from .baked_scene import IMAGES, BakedScene, DrawCache, common_size, packed
 from .project import Camera
 
-__all__ = ["IMAGES", "BakedScene", "DrawCache", "draw"]
+__all__ = ["IMAGES", "BakedScene", "DrawCache", "common_size", "draw", "packed"]
 
 
 @torch.no_grad()
 def draw(
-    scene: BakedScene, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
+    scene: BakedScene,
+    cameras: Sequence[Camera],
+    background: Tensor | None,
+    images: Sequence[str],
+    photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
     """Draws views of one size. On a CUDA device all in one go; on the CPU one after the other.
 
@@ -26,6 +30,7 @@ def draw(
         cameras: at least one.
         background: [3] colour behind the scene; None = black.
         images: what to draw, names of `IMAGES`.
+        photo_pixel: side of a photograph's pixel in pixels of the views (csrc/core/resize.h).
 
     Returns:
         name -> [views, height, width, channels].
@@ -36,4 +41,4 @@ def draw(
         RuntimeError: the device has too little memory.
     """
     by = baked_cuda if cuda_backend(scene.tiles.device) else baked_cpu
-    return by.draw(scene, cameras, background, images)
+    return by.draw(scene, cameras, background, images, photo_pixel)

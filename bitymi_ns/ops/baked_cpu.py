@@ -14,6 +14,7 @@ from .baked_scene import BakedScene, check_images, common_size, residual
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
 from .pool import Pool
 from .project import GEOMETRY, Camera, project
+from .tile_levels import tile_levels
 from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
@@ -44,13 +45,21 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
     return module(tiles.device).Patches(**texels, layers=layers, height=height, width=width, tiles=tiles.contiguous())
 
 
-def frame(scene: BakedScene, camera: Camera, maps: bool) -> tuple[Tensor, Tensor | None]:
+def coarser(atlas: Tensor, tiles: Tensor) -> dict[str, Any]:
+    """The levels of an atlas as the kernel reads them, by name."""
+    return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles)}
+
+
+def frame(
+    scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.0
+) -> tuple[Tensor, Tensor | None]:
     """Draws a view.
 
     Args:
         scene: of N surfels, on the CPU.
         camera: of an H x W view.
         maps: also beta, depth, normal and overdraw.
+        photo_pixel: side of a photograph's pixel in pixels of the view.
 
     Returns:
         [H, W, 4] rgb and alpha, with maps [H, W, 9]: also the sums of w beta, w z and w n. And with maps the blended
@@ -64,19 +73,24 @@ def frame(scene: BakedScene, camera: Camera, maps: bool) -> tuple[Tensor, Tensor
     atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
     if atlas is None and scene.blocks is not None:
         raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
-    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, scene.through_pixel)
+    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, scene.through_pixel, photo_pixel)
     geom = projection.geom
     look = residual(scene)
     if atlas is not None and atlas.dtype == torch.uint8:
         look["scale"] /= 255  # the kernel reads bytes as 0 to 255
     image = geom.new_empty(camera.height, camera.width, MAP_CHANNELS if maps else BAKED_CHANNELS)
     overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
+    patches = scene.cache.atlas(lambda: gather(atlas, tiles), atlas, tiles)
+    levels = {}
+    if atlas is not None and photo_pixel < 1.0:
+        levels = scene.cache.coarser(lambda: coarser(atlas, tiles))
     with _bins().borrow() as bins:
         kernel("baked_forward", geom)(
             **projection.view(geom),
             **look,
             base=view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible),
-            patches=scene.cache.atlas(lambda: gather(atlas, tiles), atlas, tiles),
+            patches=patches,
+            **levels,
             bins=bins,
             maps=maps,
             image=image,
@@ -86,7 +100,11 @@ def frame(scene: BakedScene, camera: Camera, maps: bool) -> tuple[Tensor, Tensor
 
 
 def draw(
-    scene: BakedScene, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
+    scene: BakedScene,
+    cameras: Sequence[Camera],
+    background: Tensor | None,
+    images: Sequence[str],
+    photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
     """As `baked.draw`, one view after the other."""
     require("baked_cpu.draw", "cpu", scene.tiles.device, ON_CUDA)
@@ -96,7 +114,8 @@ def draw(
     common_size(cameras)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:
-        image, overdraw = frame(scene, camera, any(name not in ("rgb", "alpha") for name in images))
+        maps = any(name not in ("rgb", "alpha") for name in images)
+        image, overdraw = frame(scene, camera, maps, photo_pixel)
         for name, views in drawn.items():
             found = overdraw if name == "overdraw" else image[..., CHANNELS[name]]
             if name == "rgb" and background is not None:

@@ -15,6 +15,7 @@ from .backend import function, module, on_device, require
 from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual
 from .bc7 import decode_bc7
 from .project import GEOMETRY, Camera
+from .tile_levels import tile_levels
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 
@@ -81,9 +82,22 @@ class AtlasTexture:
         self.pages = torch.tensor([h - (1 << 64) if h >> 63 else h for h in self.texture.handles], device=device)
 
 
-def compiled(scene: BakedScene) -> Any:
+def coarser(scene: BakedScene, device: torch.device) -> dict[str, AtlasTexture]:
+    """The levels of an atlas as textures, by name; those of blocks are bytes."""
+    texels = scene.atlas
+    if texels is None:
+        assert scene.blocks is not None
+        texels = decoded(scene.blocks)
+    return {name: AtlasTexture(pages, False, device) for name, pages, _ in tile_levels(texels, scene.tiles.cpu())}
+
+
+def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
     """The scene as the kernels read it (`BakedScene` of csrc/cuda/baked.h), its atlas as textures on the device of the
     surfels. It keeps all that it points to, so that a recorded CUDA graph never points at memory that is gone.
+
+    Args:
+        scene: on a CUDA device.
+        photo_pixel: as in `frame`; for one below 1 the scene has the levels of its tiles.
 
     Raises:
         TypeError: the surfels are not float32.
@@ -110,6 +124,9 @@ def compiled(scene: BakedScene) -> Any:
         is_blocks = texels is scene.blocks
         kept = scene.cache.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
         atlas = {"texture": kept.texture, "pages": kept.pages}
+        if photo_pixel < 1.0:
+            for name, level in scene.cache.coarser(lambda: coarser(scene, device)).items():
+                atlas |= {name: level.texture, f"{name}_pages": level.pages}
     with on_device(device):
         return module(device).BakedScene(
             **{name: p[name] for name in GEOMETRY},
@@ -205,6 +222,7 @@ def frame(
     images: Mapping[str, Tensor],
     workspace: Workspace,
     stages: Stage = Stage.ALL,
+    photo_pixel: float = 1.0,
 ) -> None:
     """Draws views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
 
@@ -219,6 +237,7 @@ def frame(
         images: what to draw, as `empty_images` makes them.
         workspace: fitted to such a frame.
         stages: the stages to run.
+        photo_pixel: side of a photograph's pixel in pixels of the views.
 
     Raises:
         ValueError: a shape is wrong, or the workspace is too small.
@@ -235,28 +254,33 @@ def frame(
         height=height,
         background=background,
         stages=int(stages),
+        photo_pixel=photo_pixel,
         memory=workspace.memory,
         capacity=workspace.capacity,
     )
 
 
 def draw(
-    scene: BakedScene, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
+    scene: BakedScene,
+    cameras: Sequence[Camera],
+    background: Tensor | None,
+    images: Sequence[str],
+    photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
     """As `baked.draw`, all in one go. Waits for the images, to see whether the working memory was large enough."""
     device, n = scene.tiles.device, len(scene.tiles)
     require("baked_cuda.draw", "cuda", device, ON_CPU)
     viewmats, Ks, width, height = stack_cameras(cameras, device)
-    arrays = compiled(scene)
+    arrays = compiled(scene, photo_pixel)
     if background is not None:
         background = background.to(device, torch.float32).contiguous()
     to = empty_images(images, len(cameras), width, height, device)
     size = (n, len(cameras), width, height, "normal" in to)
     with scene.cache.workspaces(lambda: Workspace(device)).borrow() as workspace:
         workspace.resize(*size)
-        frame(arrays, viewmats, Ks, background, to, workspace)
+        frame(arrays, viewmats, Ks, background, to, workspace, photo_pixel=photo_pixel)
         if n and not workspace.frame_fitted():
             workspace.resize(*size)
-            frame(arrays, viewmats, Ks, background, to, workspace)
+            frame(arrays, viewmats, Ks, background, to, workspace, photo_pixel=photo_pixel)
             workspace.frame_fitted()  # waits: the next frame may use the memory on another stream
     return to

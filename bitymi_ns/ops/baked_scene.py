@@ -30,6 +30,7 @@ class DrawCache:
     def __init__(self) -> None:
         self._sources: list[tuple[Any, int]] = []
         self._atlas: Any = None
+        self._coarser: Any = None
         self._workspaces: Pool[Any] | None = None
 
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
@@ -39,8 +40,15 @@ class DrawCache:
             a is not b and (isinstance(a, Tensor) or a != b) or version != before
             for (a, version), (b, before) in zip(now, self._sources, strict=True)
         ):
-            self._atlas, self._sources = make(), now
+            self._atlas, self._coarser, self._sources = make(), None, now
         return self._atlas
+
+    def coarser(self, make: Callable[[], Any]) -> Any:
+        """The levels of the atlas that `atlas` gave last: made for the first frame that is smaller than the
+        photographs."""
+        if self._coarser is None:
+            self._coarser = make()
+        return self._coarser
 
     def workspaces(self, make: Callable[[], Any]) -> Pool[Any]:
         """Working memory of frames, by what makes it."""
@@ -84,6 +92,12 @@ def check_images(names: Sequence[str]) -> None:
     unknown = [name for name in names if name not in IMAGES]
     if unknown:
         raise ValueError(f"there is no image '{unknown[0]}': choose among {', '.join(IMAGES)}")
+
+
+def packed(rgb: Tensor, alpha: Tensor) -> Tensor:
+    """The image `packed` [..., 1] int32 of colours [..., 3] over the background and coverage [..., 1]."""
+    byte = (torch.cat([rgb, alpha], -1).clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.int32)
+    return byte[..., :1] | byte[..., 1:2] << 8 | byte[..., 2:3] << 16 | byte[..., 3:] << 24
 
 
 def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:

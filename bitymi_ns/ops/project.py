@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, on_same_device
+from .backend import cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
 
 
@@ -46,6 +46,8 @@ class Projection:
         camera: the camera.
         near: nearest depth that is drawn, camera z.
         through_pixel: the kernel is seen through a pixel: all that is done with the rows has to know.
+        photo_pixel: side of a photograph's pixel in pixels of the view; rows of another one than 1 are for the baked
+            renderer alone.
         broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
         mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken per fragment before the sum.
@@ -59,6 +61,7 @@ class Projection:
     near: float
     through_pixel: bool
     broken: Tensor
+    photo_pixel: float = 1.0
     mean2d_grad: Tensor | None = None
     mean2d_absgrad: Tensor | None = None
     whole: Projection | None = None
@@ -80,7 +83,8 @@ class Projection:
             geom: `self.geom` without its graph.
         """
         size = {"width": self.camera.width, "height": self.camera.height}
-        return dict(geom=geom, radii=self.radii, **size, near=self.near, through_pixel=self.through_pixel)
+        drawn = {"near": self.near, "through_pixel": self.through_pixel, "photo_pixel": self.photo_pixel}
+        return dict(geom=geom, radii=self.radii, **size, **drawn)
 
     @property
     def not_finite(self) -> int:
@@ -99,13 +103,14 @@ GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, near, through_pixel, *geometry):
+    def forward(ctx, camera, near, through_pixel, photo_pixel, *geometry):
         means = geometry[0]
         inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
         inputs |= {"viewmat": dense(camera.viewmat, means), "K": dense(camera.K, means)}
         geom, frames, radii = (means.new_empty(len(means), k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
         view = {"width": camera.width, "height": camera.height, "near": near, "through_pixel": through_pixel}
+        view["photo_pixel"] = photo_pixel
         kernel("project_forward", means)(**inputs, **view, geom=geom, frames=frames, radii=radii, broken=broken)
         ctx.names = tuple(inputs)
         ctx.save_for_backward(*inputs.values(), geom)
@@ -126,7 +131,7 @@ class _Project(torch.autograd.Function):
             dframes=dframes,
             **{f"d{name}": gradient for name, gradient in zip(GEOMETRY, out, strict=True)},
         )
-        return None, None, None, *out
+        return None, None, None, None, *out
 
 
 def project(
@@ -138,6 +143,7 @@ def project(
     camera: Camera,
     near: float = 0.2,
     prefilter: bool = False,
+    photo_pixel: float = 1.0,
 ) -> Projection:
     """Projects surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
 
@@ -151,10 +157,16 @@ def project(
         near: surfels with a centre nearer than this (camera z) are not seen.
         prefilter: the kernel is seen through a pixel (csrc/core/prefilter.h) instead of being united with a low pass;
             column 15 of geom then holds n = fx fy s_u s_v / z^2.
+        photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); another one than 1 is for
+            the baked renderer on the CPU, without gradients, and does nothing with `prefilter`. Column 15 of geom then
+            holds the height of the low pass over that of the kernel.
 
     Raises:
-        ValueError: shapes or devices do not agree, or the camera has skew.
+        ValueError: shapes or devices do not agree, the camera has skew, or a gradient or a CUDA device is asked for
+            with another photo_pixel than 1.
     """
+    if photo_pixel != 1.0 and (cuda_backend(means.device) or (torch.is_grad_enabled() and means.requires_grad)):
+        raise ValueError("surfels are resized on the CPU and without gradients alone")
     n = means.shape[0]
     shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
     shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
@@ -165,5 +177,5 @@ def project(
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
     geometry = (means, quats, log_scales, opacity_logits, beta_raw)
-    geom, frames, radii, broken = _Project.apply(camera, near, prefilter, *geometry)
-    return Projection(geom, frames, radii, camera, near, prefilter, broken)
+    geom, frames, radii, broken = _Project.apply(camera, near, prefilter, photo_pixel, *geometry)
+    return Projection(geom, frames, radii, camera, near, prefilter, broken, photo_pixel)

@@ -128,8 +128,11 @@ def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) ->
             its free memory holds together with what shading, blending and their backward pass need.
 
     Raises:
+        ValueError: the rows are not of `project`, or not for a view of the photographs' size.
         TooManyFragments: there are more, or their list does not fit the memory of the CUDA device.
     """
+    if projection.photo_pixel != 1.0:
+        raise ValueError("surfels in a view of another size than the photographs are drawn by the baked renderer alone")
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
     weight, uv, depth, surfel, pixel, sigma, tile_start, layout = _Trace.apply(projection.geom, projection, rim, most)

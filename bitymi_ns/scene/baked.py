@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,10 +10,11 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.baked import DrawCache, draw
+from bitymi_ns.ops.baked import DrawCache, common_size, draw, packed
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 
 from .camera import Camera
+from .sampling import Sampling, averaged, sampling_of, size_of
 
 
 @dataclass
@@ -48,6 +50,9 @@ class BakedScene:
         prefilter: low_pass or pixel, as in `SceneConfig`.
         transmittance_min: a surfel that would leave a pixel less transmittance is not blended and ends the pixel, as in
             training; 0 = every surfel is blended.
+        photographed: [P, 4] float32 on the CPU, points of the scene, and with how many pixels per unit of length they
+            were photographed: by these a view is drawn for its size (`sampling.py`); None = every view is drawn as one
+            of the photographs' size.
     """
 
     surfels: Mapping[str, Tensor]
@@ -63,6 +68,7 @@ class BakedScene:
     prefilter: str = "low_pass"
     transmittance_min: float = TRANSMITTANCE_MIN
     blocks: Tensor | None = None
+    photographed: Tensor | None = None
     cache: DrawCache = field(default_factory=DrawCache, init=False, repr=False, compare=False)
 
     def residuals(self) -> Tensor:
@@ -97,7 +103,9 @@ class BakedScene:
 
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Renders a view: texels are fetched bilinearly, clamped to the tile's outer texel centres.
+        """Renders a view: texels are fetched bilinearly, clamped to the tile's outer texel centres. A view that shows
+        the scene smaller or larger than the photographs do is drawn for its size (`sampling`); overdraw is then that of
+        all samples of a pixel.
 
         On a CUDA device this waits for the image, to see whether its working memory was large enough;
         `baked_renderer.BakedRenderer` does not.
@@ -111,14 +119,14 @@ class BakedScene:
             ValueError: the scene is on the CPU, and its atlas only as BC7 blocks.
         """
         names = ("rgb", "alpha", *(("beta", "depth", "normal", "overdraw") if maps else ()))
-        images = {name: image[0] for name, image in draw(self, [camera], background, names).items()}
+        images = {name: image[0] for name, image in self._draw([camera], background, names).items()}
         return BakedOutput(*(images.get(name) for name in ("rgb", "alpha", "beta", "depth", "normal", "overdraw")))
 
     @torch.no_grad()
     def render_views(
         self, cameras: Sequence[Camera], background: Tensor | None = None, images: Sequence[str] = ("rgb", "alpha")
     ) -> dict[str, Tensor]:
-        """Renders views of one size on a CUDA device, all in one go.
+        """Renders views of one size on a CUDA device, all in one go, with the same samples per pixel.
 
         Args:
             cameras: at least one.
@@ -136,4 +144,28 @@ class BakedScene:
             raise RuntimeError(
                 "views are drawn together on a CUDA device only: move the scene there, or render one by one"
             )
-        return draw(self, cameras, background, images)
+        return self._draw(cameras, background, images)
+
+    def sampling(self, cameras: Sequence[Camera]) -> Sampling:
+        """How views that are drawn together are drawn: by the geometric mean of their sizes."""
+        if self.photographed is None or not len(self.photographed):
+            return Sampling()
+        sizes = [size_of(self.photographed, camera) for camera in cameras]
+        return sampling_of(math.exp(sum(map(math.log, sizes)) / len(sizes)), cameras[0].width * cameras[0].height)
+
+    def _draw(
+        self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
+    ) -> dict[str, Tensor]:
+        """As `ops.baked.draw`, for the size of the views."""
+        common_size(cameras)
+        how = self.sampling(cameras)
+        if how.samples == 1:
+            return draw(self, cameras, background, images, how.photo_pixel)
+        names = [name for name in images if name != "packed"]
+        if "packed" in images:  # bytes cannot be averaged
+            names += [name for name in ("rgb", "alpha") if name not in names]
+        views = [camera.scaled(how.samples) for camera in cameras]
+        drawn = averaged(draw(self, views, background, names, how.photo_pixel), how.samples)
+        if "packed" in images:
+            drawn["packed"] = packed(drawn["rgb"], drawn["alpha"])
+        return {name: drawn[name] for name in images}

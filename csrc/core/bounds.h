@@ -55,18 +55,21 @@ BT_HD Extent filtered_extent(const double* g) {
 }
 
 template <class Kernel, class F>
-BT_HD Extent extent(const F* geom) {
+BT_HD Extent extent(const F* geom, double sharp = 1) {
   using S = double;
   S g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = S(geom[i]);
   if (filtered<Kernel>(g)) return filtered_extent(g);
   Extent e;
-  const S ratio = times_drawn(g[kOpacity]);
-  e.visible = ratio >= S(1);
+  const S ratio = times_drawn(g[kOpacity]), blurred = Kernel::kResized ? ratio * g[kArea] : ratio;
+  e.visible = max_(ratio, blurred) >= S(1);
   if (!e.visible) return e;
-  const S level = log_(ratio);
+  const S level = log_(max_(ratio, S(1)));
   const S rc2 = level_radius2(level, g[kBeta], S(1e-6));
-  e.blur = low_pass_radius(level);
+  if constexpr (Kernel::kResized)
+    e.blur = blurred >= S(1) ? low_pass_radius(log_(blurred)) / sqrt_(sharp) : S(0);
+  else
+    e.blur = low_pass_radius(level);
   const S u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
   e.qa = u1 * u1 + v1 * v1 - rc2 * w1 * w1;
   e.qb = u1 * u2 + v1 * v2 - rc2 * w1 * w2;
@@ -151,8 +154,8 @@ BT_HD TileSpan tile_columns(const Extent& e, const F* geom, int row, int width) 
 }
 // fn(row, first, last) for every row of tiles in which the surfel can touch those from `first` to `last`.
 template <class Kernel, class F, class Visit>
-BT_HD void for_tile_rows(const F* geom, int width, int height, Visit&& fn) {
-  const Extent e = extent<Kernel>(geom);
+BT_HD void for_tile_rows(const F* geom, int width, int height, Visit&& fn, double sharp = 1) {
+  const Extent e = extent<Kernel>(geom, sharp);
   const TileSpan rows = tile_rows(e, geom, height);
   for (int row = rows.first; row <= rows.last; ++row) {
     const TileSpan columns = tile_columns(e, geom, row, width);

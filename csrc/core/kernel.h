@@ -5,12 +5,16 @@
 
 #include "core/blend.h"
 #include "core/prefilter.h"
+#include "core/resize.h"
 
 namespace bt {
 
-template <class T>
-BT_HD MaskOf<T> near_centre(T dx, T dy) {
-  return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
+// `sharp` here and below: 1 / squared radius of the low pass, which ResizedKernel alone looks at.
+template <class Kernel = LowPassKernel, class S = float, class T>
+BT_HD MaskOf<T> near_centre(T dx, T dy, S sharp = S(1)) {
+  const T d2 = dx * dx + dy * dy;
+  if constexpr (Kernel::kResized) return d2 * T(sharp) < T(kLowPassReach * kLowPassReach);
+  return d2 < T(kLowPassReach * kLowPassReach);
 }
 
 // The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the
@@ -76,7 +80,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
 
 // Without kBlur the low pass is left out, for pixels that are not near the centre.
 template <class Kernel, bool kBlur = true, class S, class T>
-BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
+BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));
   if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_hit<S, T>(g, dx, dy));
   const Hit<T> h = hit(g, near, dx, dy);
@@ -86,7 +90,11 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy) {
   f.u = h.u, f.v = h.v, f.depth = T(g[kW0] * g[kZ]) * h.inv, f.low_pass = zero;
   T most = kernel;
   if (kBlur) {
-    const T blur = exp_(-(dx * dx + dy * dy));
+    T blur;
+    if constexpr (Kernel::kResized)
+      blur = T(g[kArea]) * exp_(-(dx * dx + dy * dy) * T(sharp));
+    else
+      blur = exp_(-(dx * dx + dy * dy));
     const auto low = blur > kernel;
     const T r = T(S(kSupport));
     f.u = clamp_(h.u, -r, r), f.v = clamp_(h.v, -r, r);
@@ -111,8 +119,8 @@ BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
 
 // `blur`: whether a pixel of those that are drawn together is near the centre.
 template <class Kernel, class S, class T>
-BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, bool blur) {
-  return blur ? fragment<Kernel, true>(g, near, dx, dy) : fragment<Kernel, false>(g, near, dx, dy);
+BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, bool blur, S sharp = S(1)) {
+  return blur ? fragment<Kernel, true>(g, near, dx, dy, sharp) : fragment<Kernel, false>(g, near, dx, dy, sharp);
 }
 
 // Sigma as a list of fragments holds it: negative in the low-pass branch.

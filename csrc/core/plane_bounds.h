@@ -20,6 +20,24 @@ struct LevelSet {
   S blur2;  // 0: the low pass cannot exceed the kernel anywhere
 };
 
+// The same of a row of ResizedKernel, whose low pass has the squared radius 1 / sharp and the height kArea.
+template <class S>
+BT_HD LevelSet<S> level_set(const S* g, S sharp) {
+  LevelSet<S> l = {false, S(0), S(0)};
+  const S ratio = times_drawn(g[kOpacity]), blurred = ratio * g[kArea], almost = S(1) - S(1e-6);
+  l.visible = max_(ratio, blurred) >= almost;
+  if (!l.visible) return l;
+  l.r2 = level_radius2(log_(max_(ratio, S(1))) + S(1e-5), g[kBeta], S(4e-6));
+  if (!(blurred >= almost)) return l;
+  const S reach = S(kLowPassReach), wide = S(1) / sharp;
+  const S least = g[kW0] - reach * sqrt_(wide) * (abs_(g[kW1]) + abs_(g[kW2]));
+  const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];
+  const bool covered = g[kArea] <= S(1) && least > S(0) &&
+                       S(kSupport2) * least * least >= (g[kBeta] + reach * reach) * wide * S(1.001) * slope;
+  l.blur2 = covered ? S(0) : (log_(max_(blurred, S(1))) + S(1e-5)) * wide;
+  return l;
+}
+
 template <class S>
 BT_HD LevelSet<S> level_set(const S* g) {
   LevelSet<S> l = {false, S(0), S(0)};

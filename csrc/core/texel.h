@@ -22,6 +22,26 @@ BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
+// Levels of a tile: 2 x 2 texels of a level are one of the next, as long as all of that lies on the grid of the page.
+constexpr int kTileLevels = 3;
+BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
+  return ((tile[0] | tile[1] | tile[3] | tile[4]) & ((1 << level) - 1)) == 0;
+}
+// The level of which a texel is about as large as a pixel, by a row of geom of core/surfel.h: the geometric mean along
+// the axes. Not coarser than a pixel of the view is than one of a photograph: nearer to its size the texels were trained
+// as they are. kTileLevels where nothing is left but a constant.
+template <class S>
+BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
+  const S k = S(0.5) / (extent * g[kW0]);  // texels per pixel along the gradient of u and v, squared
+  const S u = g[kU1] * g[kU1] + g[kU2] * g[kU2], v = g[kV1] * g[kV1] + g[kV2] * g[kV2];
+  const S area = sqrt_(u * v) * k * k * S(r_u) * S(r_v);  // texels per pixel, by area
+  const S most = S(1) / (photo_pixel * photo_pixel);
+  int level = 0, side = max_(r_u, r_v);
+  // half way between two levels, 4^l sqrt(4) / 2
+  for (S size = S(2); level < kTileLevels && area > size && most >= size; size *= S(4)) ++level, side /= 2;
+  return level && side <= 2 ? kTileLevels : min_(level, kTileLevels - 1);
+}
+
 // Surfel coordinate of the centre of texel i, eq. (texel centres), rounded as bake/texels.py does.
 template <class S>
 BT_HD S texel_centre(int i, int r, S extent) {

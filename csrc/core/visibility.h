@@ -2,6 +2,7 @@
 #pragma once
 
 #include "core/bounds.h"
+#include "core/resize.h"
 
 namespace bt {
 
@@ -18,12 +19,13 @@ BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
 // does not see it. False when that is because a parameter is not finite.
 template <class Kernel, class S>
 BT_HD bool project_visible(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near,
-                           S* geom, S* frames, S* radii) {
+                           const Resize<S>& to, S* geom, S* frames, S* radii) {
   S g[kGeom], f[kFrame], r[2] = {S(0), S(0)};
-  const bool projected = project<Kernel>(cam, in, i, near, g, f);
+  bool projected = project<Kernel>(cam, in, i, near, g, f);
+  if constexpr (Kernel::kResized) projected = projected && resize(to, g);
   bool seen = projected;
   if (projected) {
-    const Extent e = extent<Kernel>(g);
+    const Extent e = extent<Kernel>(g, double(to.sharp));
     const Interval<double> x = columns_of(e), y = rows_of(e);
     seen = e.visible && g[kCx] + x.x1 >= 0 && g[kCx] + x.x0 <= width && g[kCy] + y.x1 >= 0 && g[kCy] + y.x0 <= height;
     const double most = 1e6;

@@ -90,6 +90,16 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
 }
 
 namespace {
+// The level of a surfel's tile that a view shows; null: its mean alone.
+template <class S>
+const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
+  const int32_t* sides = a.patches->sides.data() + 2 * id;
+  int level = tile_level(a.view.geom + id * kGeom, sides[0], sides[1], extent, a.view.photo_pixel);
+  if (level == kTileLevels) return a.residual.mean_residual ? nullptr : a.patches;
+  while (level && !(a.coarser[level - 1] && a.coarser[level - 1]->sides[2 * id])) --level;
+  return level ? a.coarser[level - 1] : a.patches;
+}
+
 template <class Kernel, class S>
 void baked_forward(const BakedForward<S>& a) {
   using P = Pack<S>;
@@ -103,7 +113,7 @@ void baked_forward(const BakedForward<S>& a) {
   constexpr float kNone[3] = {0, 0, 0};
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   const int channels = maps ? kMapChannels : kBakedChannels;
-  const Patches& patches = *a.patches;
+  const S photo_pixel = a.view.photo_pixel, sharp = Resize<S>(photo_pixel).sharp;
 #pragma omp parallel for num_threads(num_threads()) schedule(dynamic, 2)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
@@ -115,12 +125,15 @@ void baked_forward(const BakedForward<S>& a) {
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
       const S* g = geom + id * kGeom;
+      const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
+      const Patches* level = a.patches;
+      bool tiled = level->sides[2 * id] != 0;
+      if (tiled && a.coarser[0]) level = level_of(a, id, extent), tiled = level != nullptr;
+      const Patches& patches = tiled ? *level : *a.patches;
       const int32_t* sides = patches.sides.data() + 2 * id;
-      const bool tiled = sides[0] != 0;
       const float* flat = atlas.mean_residual ? atlas.mean_residual + 3 * id : kNone;
       const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
       const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
-      const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
       S view[3];
       store3(view, view_base(load3(base + 3 * id)));
       state.template blend<Kernel>(
@@ -150,7 +163,8 @@ void baked_forward(const BakedForward<S>& a) {
               add_textured(patches.bytes.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
             else
               add_textured(patches.floats.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
-          });
+          },
+          sharp);
     }
     for (int pack = 0; pack < kPacks; ++pack)
       for (int lane = 0; lane < kLanes; ++lane) {
@@ -170,7 +184,7 @@ void baked_forward(const BakedForward<S>& a) {
 template <class S>
 void baked_forward(const BakedForward<S>& a) {
   bin(a.view, *a.bins);
-  with_kernel(a.view.through_pixel, [&](auto kernel) { baked_forward<decltype(kernel)>(a); });
+  with_kernel(a.view.through_pixel, float(a.view.photo_pixel), [&](auto kernel) { baked_forward<decltype(kernel)>(a); });
 }
 
 template void baked_forward(const BakedForward<float>&);

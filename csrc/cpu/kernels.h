@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "core/bounds.h"
+#include "core/texel.h"
 #include "cpu/memory.h"
 #include "ops/appearance.h"
 #include "ops/baked.h"
@@ -154,6 +155,7 @@ struct BakedForward {
   const S* base;  // [n, 3] f_view
   BakedResidual residual;
   const Patches* patches;
+  const Patches* coarser[kTileLevels - 1];  // the levels of the tiles; null: none, as in views of the photographs' size
   Bins* bins;
   bool maps;
   S* image;
@@ -165,7 +167,10 @@ struct BakedForward {
     r.array("base", base, 3 * view.n);
     residual.fields(r, view.n);
     r.object("patches", patches);
-    if (int64_t(patches->first.size()) != view.n) r.refuse("the patches belong to other surfels");
+    r.maybe_object("half", coarser[0]);
+    r.maybe_object("quarter", coarser[1]);
+    for (const Patches* level : {patches, coarser[0], coarser[1]})
+      if (level && int64_t(level->first.size()) != view.n) r.refuse("the patches belong to other surfels");
     r.object("bins", bins);
     r.number("maps", maps);
     const int64_t pixels = int64_t(view.width) * view.height;

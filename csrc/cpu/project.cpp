@@ -25,11 +25,13 @@ template <class S>
 void project_forward(const ProjectForward<S>& a) {
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
   std::vector<int64_t> broken(num_threads(), 0);
-  with_kernel(a.through_pixel, [&](auto kernel) {
+  const Resize<S> to{a.photo_pixel};
+  with_kernel(a.through_pixel, float(a.photo_pixel), [&](auto kernel) {
     parallel_parts(a.surfels.n, 1024, [&](int thread, int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i)
         broken[thread] +=
-            !project_visible<decltype(kernel)>(cam, a.width, a.height, a.surfels, i, a.near, a.geom, a.frames, a.radii);
+            !project_visible<decltype(kernel)>(cam, a.width, a.height, a.surfels, i, a.near, to, a.geom, a.frames,
+                                               a.radii);
     });
   });
   *a.broken += int32_t(std::accumulate(broken.begin(), broken.end(), int64_t(0)));
@@ -46,11 +48,22 @@ void project_backward(const ProjectBackward<S>& a) {
 }
 
 namespace {
+// The tile that holds the box of a surfel, as most of small ones: no row of it has to be looked at. -1: there are more.
+template <class S>
+int only_tile(const S* g, const S* radii, const Bins& bins) {
+  const S x = g[kCx] - S(0.5), y = g[kCy] - S(0.5), side = S(kTile);
+  const S column = floor_((x - radii[0]) / side), row = floor_((y - radii[1]) / side);
+  if (!(column >= S(0) && row >= S(0) && column < S(bins.tiles_x) && row < S(bins.tiles_y))) return -1;
+  if (!(x + radii[0] < (column + S(1)) * side - S(1) && y + radii[1] < (row + S(1)) * side - S(1))) return -1;
+  return int(row) * bins.tiles_x + int(column);
+}
+
 template <class Kernel, class S>
 void bin(const View<S>& view, Bins& bins) {
   const S *geom = view.geom, *radii = view.radii;
   const int64_t n = view.n;
   const int width = view.width, height = view.height;
+  const double sharp = double(Resize<S>(view.photo_pixel).sharp);
   bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   // front to back once for all tiles; equal depths keep their order
@@ -71,12 +84,18 @@ void bin(const View<S>& view, Bins& bins) {
     for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
       const size_t head = list.size();
       list.push_back(0);
+      const int only = only_tile(geom + int64_t(order[k].second) * kGeom, radii + 2 * int64_t(order[k].second), bins);
+      if (only >= 0) {
+        list.push_back(only), list[head] = 1;
+        ++at[t][only];
+        continue;
+      }
       for_tile_rows<Kernel>(geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
         for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
           list.push_back(tile);
           ++at[t][tile];
         }
-      });
+      }, sharp);
       list[head] = int32_t(list.size() - head - 1);
     }
   }
@@ -104,7 +123,7 @@ void bin(const View<S>& view, Bins& bins) {
 
 template <class S>
 void bin(const View<S>& view, Bins& bins) {
-  with_kernel(view.through_pixel, [&](auto kernel) { bin<decltype(kernel)>(view, bins); });
+  with_kernel(view.through_pixel, float(view.photo_pixel), [&](auto kernel) { bin<decltype(kernel)>(view, bins); });
 }
 
 #define BT_INSTANTIATE(S)                                    \

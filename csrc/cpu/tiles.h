@@ -41,7 +41,7 @@ struct TileState {
 
   // Blends a surfel: fn(pack, lanes, fragment, weight) for every pack in which some pixel takes it.
   template <class Kernel, class F>
-  void blend(const S* g, const S* radius, S near, F&& fn) {
+  void blend(const S* g, const S* radius, S near, F&& fn, S sharp = S(1)) {
     const S cx = g[kCx] - x0, cy = g[kCy] - y0;
     const int left = first(cx - radius[0]), right = last(cx + radius[0]);
     const int top = first(cy - radius[1]), bottom = last(cy + radius[1]);
@@ -56,9 +56,9 @@ struct TileState {
           continue;
         }
         // a cheap look first: does any lane lie in the support or near the centre?
-        const M inside = in_support(planes(g, dx, dy)), close = near_centre(dx, dy);
+        const M inside = in_support(planes(g, dx, dy)), close = near_centre<Kernel>(dx, dy, sharp);
         if (!bits(open[pack] & (inside | close))) continue;
-        take_fragment(pack, fragment<Kernel>(g, near, dx, dy, bits(close) != 0), fn);
+        take_fragment(pack, fragment<Kernel>(g, near, dx, dy, bits(close) != 0, sharp), fn);
       }
     }
   }

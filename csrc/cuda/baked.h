@@ -15,6 +15,7 @@
 #include <cstdint>
 
 #include "core/surfel.h"
+#include "core/texel.h"
 #include "core/view_color.h"
 #include "cuda/device.h"
 #include "ops/baked.h"
@@ -33,6 +34,9 @@ struct BakedScene : BakedResidual {
   const uint64_t* pages;  // [page_count] a texture per page of the atlas, null: none
   int64_t page_count;
   const AtlasTexture* texture;  // whose pages they are; Python keeps it
+  // likewise the levels of the tiles (core/texel.h), for views smaller than the photographs; null: none
+  const uint64_t* coarser[kTileLevels - 1];
+  const AtlasTexture* coarser_texture[kTileLevels - 1];
   float near;
   bool through_pixel;  // chooses between the kernels of core/surfel.h
 
@@ -47,6 +51,10 @@ struct BakedScene : BakedResidual {
     r.array("tiles", tiles, 5 * n);
     if (r.given("pages")) r.rows("pages", pages, page_count, 1);
     r.maybe_object("texture", texture);
+    r.maybe("half_pages", coarser[0], page_count);
+    r.maybe("quarter_pages", coarser[1], page_count);
+    r.maybe_object("half", coarser_texture[0]);
+    r.maybe_object("quarter", coarser_texture[1]);
     BakedResidual::fields(r, n);
     r.number("near", near);
     r.number("through_pixel", through_pixel);
@@ -93,6 +101,7 @@ struct BakedDraw {
   BakedViews views;
   BakedImages images;
   int stages;
+  float photo_pixel;  // side of a photograph's pixel in pixels of the views
   Workspace memory;
   int64_t capacity;  // pairs that fit
 
@@ -107,6 +116,7 @@ struct BakedDraw {
     r.number("height", views.height);
     images.fields(r, count * views.width * views.height);
     r.number("stages", stages);
+    r.number("photo_pixel", photo_pixel);
     r.memory("memory", memory);
     r.number("capacity", capacity);
   }

@@ -199,7 +199,7 @@ size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, 
 
 void baked_frame(const BakedDraw& a, Stream stream) {
   BakedFrame f = frame_of(a.scene->geometry.n, a.views, a.capacity);
-  f.through_pixel = a.scene->through_pixel;
+  f.through_pixel = a.scene->through_pixel, f.photo_pixel = a.photo_pixel;
   const int64_t needed = lay_out(f, a.memory.at, a.images.normal != nullptr);
   if (a.memory.bytes < needed)
     throw std::invalid_argument("the working memory has " + std::to_string(a.memory.bytes) +

@@ -24,15 +24,21 @@ __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float>
   });
 }
 
-__device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color, float* row) {
+__device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color, float photo_pixel, float* row) {
   const int32_t* tile = s.tiles + 5 * i;
+  int level = 0;
+  if (s.pages && tile[3] != 0 && photo_pixel < 1) {
+    level = tile_level(row, tile[3], tile[4], s.extent ? s.extent[i] : float(kSupport), photo_pixel);
+    if (level == kTileLevels && !s.mean_residual) level = 0;
+    while (level && level < kTileLevels && !(s.coarser[level - 1] && has_level(tile, level))) --level;
+  }
   float scale = 0, place[4] = {0, 0, 0, 0};
   uint64_t page = 0;
-  if (s.pages && tile[3] != 0) {
+  if (s.pages && tile[3] != 0 && level < kTileLevels) {
     scale = 0.5f / (s.extent ? s.extent[i] : float(kSupport));
-    page = s.pages[tile[2]];
-    place[0] = float(tile[0]) + 0.5f, place[1] = float(tile[1]) + 0.5f;
-    place[2] = float(tile[3] - 1), place[3] = float(tile[4] - 1);
+    page = (level ? s.coarser[level - 1] : s.pages)[tile[2]];
+    place[0] = float(tile[0] >> level) + 0.5f, place[1] = float(tile[1] >> level) + 0.5f;
+    place[2] = float((tile[3] >> level) - 1), place[3] = float((tile[4] >> level) - 1);
   } else if (s.mean_residual) {
     const Vec3<float> flat = load3(s.mean_residual + 3 * i);
     if (flat.x != 0 || flat.y != 0 || flat.z != 0) {
@@ -63,9 +69,13 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
     float geom[kGeom], frame[kFrame];
     const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
     seen = project<Kernel>(camera, in, i, s.near, geom, frame);
+    const Resize<float> to(f.photo_pixel);
+    if constexpr (Kernel::kResized) seen = seen && resize(to, geom);
     if (seen) {
       LevelSet<float> level;
-      if (filtered<Kernel>(geom))
+      if constexpr (Kernel::kResized)
+        level = level_set(geom, to.sharp);
+      else if (filtered<Kernel>(geom))
         level = {filtered_bounds(geom).visible, 0, -geom[kArea]};
       else
         level = level_set(geom);
@@ -98,14 +108,14 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
   const Vec3<float> color = view_base(view_color_of(s, j, d));
   float* to = f.memory.rows + (first + j) * kRow;
   store3(to + kRed, color);
-  write_texture(s, j, color, to);
+  write_texture(s, j, color, f.photo_pixel, to);
 }
 }  // namespace
 
 void baked_prepare(const BakedScene& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
   if (!f.rows) return;
   const dim3 grid(unsigned(ceil_div(f.n, kThreads)), unsigned(v.count));
-  with_kernel(f.through_pixel, [&](auto kernel) {
+  with_kernel(f.through_pixel, f.photo_pixel, [&](auto kernel) {
     BT_LAUNCH(prepare_kernel<decltype(kernel)>, grid, dim3(kThreads), 0, stream, s, v, f);
   });
 }

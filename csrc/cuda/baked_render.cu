@@ -9,6 +9,8 @@
 // are examined blend it. So the masks leave little to reject. A hit costs one reciprocal, one logarithm, one
 // exponential and, where the weight is above the bound, one texture fetch. The kernel is bound by issue of arithmetic,
 // then by the texture unit. Memory traffic is 96 bytes per row and warp, mostly from L2.
+#include <type_traits>
+
 #include "core/kernel.h"
 #include "core/shading.h"
 #include "core/texel.h"
@@ -31,6 +33,7 @@ struct DrawArgs {
   const int32_t* ranges;
   int width, height, tiles_x, tiles_of_view;
   float near, offset, scale, weight_bound, transmittance_min;
+  float sharp;  // of the low pass (core/resize.h)
   BakedImages images;
 };
 
@@ -126,7 +129,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
     if (Kernel::kPixel || kBlur)
-      f[j] = fragment<Kernel, true>(s.g, a.near, FastFloat(dx), y[j]);
+      f[j] = fragment<Kernel, true>(s.g, a.near, FastFloat(dx), y[j], a.sharp);
     else
       f[j] = fragment_within(s.g, at[j]);
     const float sigma = f[j].sigma.v;
@@ -165,6 +168,10 @@ __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
     if (to.overdraw) to.overdraw[at] = p.count;
   }
 }
+
+// How a kernel draws the rows that it does not filter.
+template <class Kernel>
+using Unfiltered = std::conditional_t<Kernel::kResized, ResizedKernel, LowPassKernel>;
 
 template <bool kMaps, class Kernel>
 __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) draw_kernel(DrawArgs a) {
@@ -215,7 +222,9 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
       if (!__any_sync(kFullMask, p[0].transmittance > 0 || p[1].transmittance > 0)) break;
       for (int k = look; k < min_(look + kLook, in_hand); ++k, q += kRowQuads) {
         const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
-        const float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
+        float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
+        if (Kernel::kResized && q3.y > 0)
+          area = exp_(FastFloat(q3.y * a.sharp)).v * float(kAlphaMin) / q2.z;  // q2.z: opacity
         const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
                        q3.x,
                        q3.y,
@@ -227,9 +236,9 @@ __global__ void __launch_bounds__(kThreads, kMaps || Kernel::kPixel ? 6 : 8) dra
         if (filtered<Kernel>(s.g))
           blend<kMaps, Kernel, true>(a, s, dx, dy, p);
         else if (s.blur2 > 0)
-          blend<kMaps, LowPassKernel, true>(a, s, dx, dy, p);
+          blend<kMaps, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
         else
-          blend<kMaps, LowPassKernel, false>(a, s, dx, dy, p);
+          blend<kMaps, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
       }
     }
     wanted = 0;
@@ -262,10 +271,11 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
                       s.scale,
                       max_(s.weight_bound, 1e-30f),  // above the weight of a pixel without a fragment
                       s.transmittance_min,
+                      Resize<float>(f.photo_pixel).sharp,
                       images};
   const dim3 grid(static_cast<unsigned>(f.tiles));
   const bool maps = images.beta || images.depth || images.normal || images.overdraw;
-  with_kernel(f.through_pixel, [&](auto kernel) {
+  with_kernel(f.through_pixel, f.photo_pixel, [&](auto kernel) {
     if (maps)
       BT_LAUNCH((draw_kernel<true, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
     else

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "core/plane_bounds.h"
+#include "core/resize.h"
 #include "cuda/baked.h"
 
 namespace bt::cuda {
@@ -12,7 +13,8 @@ constexpr uint32_t kNeverSeen = 0xffffffffu;  // depth key of a surfel that is n
 // A surfel's row: the first twelve columns are those of GeomColumn. 24 floats are three sectors of 32 bytes.
 enum RowColumn {
   kR2 = kBeta + 1,  // level set u^2 + v^2 <= r2
-  kBlur2,           // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel
+  kBlur2,           // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel.
+                    // With ResizedKernel it also says how high the low pass is: 1/255 is left of it there
   kRed,             // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
   kPage,                   // handle of the texture, 64 bits
@@ -42,6 +44,7 @@ struct BakedFrame {
   int width, height, tiles_x, tiles_y;
   int64_t tiles;       // of all views
   bool through_pixel;  // as in BakedScene
+  float photo_pixel;   // as in BakedDraw
   BakedMemory memory;
 };
 

@@ -9,8 +9,9 @@ namespace bt {
 
 // viewmat [4, 4] and K [3, 3] lie where the surfels do. Written: geom [n, kGeom], frames [n, kFrame] and radii [n, 2]
 // (half extents of the level-set box in pixels, 0 where not visible); rows of surfels that are not visible are zero.
-// broken [1] is raised by the number of rows that are not finite. `through_pixel` chooses between the kernels of
-// core/surfel.h, and has to be the same wherever a view's rows go.
+// broken [1] is raised by the number of rows that are not finite. `through_pixel` and `photo_pixel` choose between the
+// kernels of core/surfel.h, and have to be the same wherever a view's rows go; with another photo_pixel than 1 that is
+// the baked renderer alone.
 template <class S>
 struct ProjectForward {
   Surfels<S> surfels;
@@ -18,6 +19,7 @@ struct ProjectForward {
   int width, height;
   S near;
   bool through_pixel;
+  S photo_pixel;  // side of a photograph's pixel in pixels of the view
   S *geom, *frames, *radii;
   int32_t* broken;
 
@@ -30,6 +32,7 @@ struct ProjectForward {
     r.number("height", height);
     r.number("near", near);
     r.number("through_pixel", through_pixel);
+    r.number("photo_pixel", photo_pixel);
     r.array("geom", geom, surfels.n * kGeom);
     r.array("frames", frames, surfels.n * kFrame);
     r.array("radii", radii, surfels.n * 2);
@@ -65,6 +68,7 @@ struct View {
   int width, height;
   S near;
   bool through_pixel;
+  S photo_pixel;
 
   template <class R>
   void fields(R& r) {
@@ -74,6 +78,7 @@ struct View {
     r.number("height", height);
     r.number("near", near);
     r.number("through_pixel", through_pixel);
+    r.number("photo_pixel", photo_pixel);
   }
 };
 

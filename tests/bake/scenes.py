@@ -15,7 +15,7 @@ from bitymi_ns.bundle import write_bundle
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.scene.baked import BakedScene
 
-OF_THE_SCENE = ("extent", "mean_residual", "near", "weight_bound", "prefilter")
+OF_THE_SCENE = ("extent", "mean_residual", "near", "weight_bound", "prefilter", "photographed")
 
 
 def write(

@@ -60,7 +60,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
 def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
     params = make_lean(surfels, tmp_path / "b", kind)
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.scene.view_color == kind and loaded.info.version == "2.2"
+    assert loaded.scene.view_color == kind and loaded.info.version == "2.3"
     assert set(loaded.scene.surfels) == set(params)
     d = torch.nn.functional.normalize(params["means"], dim=1)
     want = reference.lean(kind, params["view_base"], params["view_span"], params["view_terms"], d)
@@ -110,7 +110,7 @@ def test_the_manifest_states_files_world_and_statistics(surfels, tmp_path):
     extra = {"preview.png": b"\x89PNG...", "config.yml": b"method: bitymi\n"}
     params, *_ = make(surfels, tmp_path / "b", world=world, statistics=statistics, extra_files=extra)
     info = verify_bundle(tmp_path / "b").model_dump(mode="json")
-    assert (info["format"], info["version"]) == ("bitymi-bundle", "1.3")
+    assert (info["format"], info["version"]) == ("bitymi-bundle", "1.4")
     assert info["generator"].startswith("bitymi-ns ")
     assert info["world"] == {"transform": [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]], "scale": 0.25}
     assert info["statistics"] == {"psnr": 27.5, "never": None, "views": [1, 2], "path": str(tmp_path)}

@@ -81,8 +81,34 @@ def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tens
     return kernel * omega**2 * area.abs() / det.sqrt(), (a / omega[..., None]).clamp(-SUPPORT, SUPPORT), depth
 
 
+def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor, float, float]:
+    """How surfels are drawn where a photograph's pixel has the side `photo_pixel` (docs/numerics.md).
+
+    With J = d pixel / d (u, v) at the centre, what (u, v) is multiplied by [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and the
+    share of the kernel's height that is left [N]; the low pass's squared radius, and its share.
+    """
+    variance = max(0.0, (1 - photo_pixel**2) / 12)
+    radius2 = photo_pixel**2 + 2 * variance
+    M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
+    J = (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None]  # [N, 2, 2]
+    unit = torch.eye(2, dtype=J.dtype).expand_as(J)
+    seen = projection.valid & (torch.linalg.det(J) != 0)  # not exactly edge-on
+    inverse = torch.linalg.inv(torch.where(seen[:, None, None], J, unit))
+    blur = 2 * variance * (projection.beta + 2) / SUPPORT**2
+    wide = unit + blur[:, None, None] * inverse @ inverse.transpose(-1, -2)
+    values, vectors = torch.linalg.eigh(torch.where(seen[:, None, None], wide, unit))
+    shrink = vectors @ torch.diag_embed(values**-0.5) @ vectors.transpose(-1, -2)
+    return shrink, values.prod(-1) ** -0.5, radius2, photo_pixel**2 / radius2
+
+
 def trace(
-    projection: Projection, width: int, height: int, near: float = 0.2, rim: float = 0.0, prefilter: bool = False
+    projection: Projection,
+    width: int,
+    height: int,
+    near: float = 0.2,
+    rim: float = 0.0,
+    prefilter: bool = False,
+    photo_pixel: float = 1.0,
 ) -> Trace:
     """Intersections, effective opacities and front-to-back weights of all surfels in all pixels.
 
@@ -93,7 +119,8 @@ def trace(
     A fragment is skipped when sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
     centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
     ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative, as the kernels do; values do not change.
-    With `prefilter`, G is the kernel seen through a pixel instead (`_filtered`), without a bound at the rim.
+    With `prefilter`, G is the kernel seen through a pixel instead (`_filtered`), without a bound at the rim. Without it,
+    `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`).
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M
@@ -105,11 +132,16 @@ def trace(
     depth = (uv * M[None, :, 2, :2]).sum(-1) + M[None, :, 2, 2]  # [P, N]
     hit = crosses & (depth > near)
     uv = torch.where(hit[..., None], uv, 0.0)
+    if photo_pixel != 1:
+        shrink, share, radius2, blur_share = _resized(projection, photo_pixel)
+        uv = (shrink @ uv[..., None])[..., 0]
 
     rest = 1 - (uv**2).sum(-1) / SUPPORT**2
     inside = hit & (rest > 0)
     kernel = torch.where(inside, _power(torch.where(inside, rest, 1.0), projection.beta, rim), 0.0)
     blur = torch.exp(-((pixels[:, None] - projection.mean2d[None]) ** 2).sum(-1))
+    if photo_pixel != 1:
+        kernel, blur = share * kernel, blur_share * blur ** (1 / radius2)
     low_pass = blur > kernel
     if prefilter:
         kernel, uv, depth = _filtered(projection, pixels, near)

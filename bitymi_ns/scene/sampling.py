@@ -1,0 +1,99 @@
+"""How a view of another size than the photographs is drawn: what it shows of their pixels, and samples per pixel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from .camera import Camera
+
+AS_TRAINED = (0.75, 1.5)
+"""Views between these sizes are drawn as in training. The sizes of the photographs differ, too: they see a scene from
+near and from far."""
+SMALLEST, LARGEST = 0.5, 2.0
+"""Views beyond these sizes are drawn for what they are; in between it changes over, so that nothing jumps."""
+SAMPLE = 0.375
+"""A photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow."""
+MOST_SAMPLES = 4
+"""Samples per pixel, along each axis."""
+MOST_PIXELS = 1 << 24
+"""Samples of a view: beyond, it has fewer samples per pixel."""
+FARTHEST = (1.0 / 64, 64.0)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a view is drawn.
+
+    Attributes:
+        samples: per pixel, along each axis.
+        photo_pixel: side of a photograph's pixel in samples (csrc/core/resize.h).
+    """
+
+    samples: int = 1
+    photo_pixel: float = 1.0
+
+
+def size_of(photographed: Tensor, camera: Camera) -> float:
+    """How large a view shows what was photographed: 1 = as large as the photographs, 0.5 = at half their size.
+
+    Args:
+        photographed: [P, 4] points of the scene, and the pixels per unit of length with which they were photographed.
+        camera: the view.
+
+    Returns:
+        the median over the points in the picture; 1 where there is none.
+    """
+    viewmat, K = camera.viewmat.detach().cpu().double(), camera.K.detach().cpu().double()
+    x, y, z = (photographed[:, :3].double() @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
+    depth = z.clamp(min=1e-12)
+    column, row = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
+    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    if not bool(inside.any()):
+        return 1.0
+    sizes = torch.sqrt(K[0, 0] * K[1, 1]) / (depth * photographed[:, 3].double())
+    return float(sizes[inside].median().clamp(*FARTHEST))
+
+
+def sampling_of(size: float, pixels: int) -> Sampling:
+    """How a view is drawn.
+
+    Args:
+        size: of `size_of`.
+        pixels: of the view.
+    """
+    low, high = AS_TRAINED
+    if low <= size <= high:
+        return Sampling()
+    wanted = math.ceil(SAMPLE / size)
+    samples = max(1, min(wanted, MOST_SAMPLES, math.isqrt(MOST_PIXELS // max(pixels, 1))))
+    shown = samples * size
+    if SMALLEST < size < low:
+        shown = SMALLEST ** (math.log(low / size) / math.log(low / SMALLEST))
+    elif high < size < LARGEST:
+        shown = LARGEST ** (math.log(size / high) / math.log(LARGEST / high))
+    return Sampling(samples, shown)
+
+
+def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
+    """Images of views from images of their samples.
+
+    Args:
+        images: name -> [views, samples * height, samples * width, channels].
+        samples: per pixel, along each axis.
+
+    Returns:
+        name -> [views, height, width, channels]: means, of integers (counts) sums.
+    """
+    if samples == 1:
+        return images
+    area = samples * samples
+    out = {}
+    for name, image in images.items():
+        mean = avg_pool2d(image.movedim(3, 1).float(), samples).movedim(1, 3)
+        out[name] = mean.contiguous() if image.is_floating_point() else (mean * area).round().to(image.dtype)
+    return out

@@ -1,0 +1,83 @@
+"""How large a view shows what was photographed, and how it is drawn then."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bitymi_ns.ops.baked import draw
+from bitymi_ns.scene import Camera
+from bitymi_ns.scene.sampling import LARGEST, MOST_PIXELS, MOST_SAMPLES, averaged, sampling_of, size_of
+from tests.cuda.baked_scenes import front, textured
+
+POINTS = torch.tensor([[0.0, 0, 0, 15.0], [0.5, 0.1, 0, 15.0], [-0.4, 0.2, 0, 15.0]])
+
+
+def test_size_is_that_of_the_points_in_the_picture() -> None:
+    camera = front()  # focal lengths 60 and 55, distance 4
+    size = math.sqrt(60 * 55) / 4 / 15
+    assert size_of(POINTS, camera) == pytest.approx(size)
+    assert size_of(POINTS, camera.scaled(2.0)) == pytest.approx(2 * size)
+    assert size_of(POINTS, front(distance=8.0)) == pytest.approx(size / 2)
+    assert size_of(POINTS, front(distance=-8.0)) == 1.0  # behind the camera
+    outside = torch.cat([POINTS, torch.tensor([[100.0, 0, 0, 1e-3]] * 5)])
+    assert size_of(outside, camera) == pytest.approx(size)
+
+
+@given(st.floats(1 / 64, 64), st.integers(1, 1 << 26))
+def test_samples_are_close_enough_and_few_enough(size: float, pixels: int) -> None:
+    how = sampling_of(size, pixels)
+    assert 1 <= how.samples <= MOST_SAMPLES and how.photo_pixel > 0
+    assert how.samples == 1 or how.samples**2 * pixels <= MOST_PIXELS
+    if pixels < 1e6 and size >= 0.1:
+        assert how.photo_pixel >= 0.37
+    if how.samples > 1:
+        assert how.photo_pixel < 1
+
+
+def test_nothing_jumps_while_the_samples_stay() -> None:
+    sizes = [2 ** (k / 200) for k in range(-250, 500)]
+    found = [sampling_of(size, 1000) for size in sizes]
+    for a, b in zip(found, found[1:], strict=False):
+        assert a.samples != b.samples or abs(math.log2(b.photo_pixel / a.photo_pixel)) < 0.02
+    assert sampling_of(1.0, 1000) == sampling_of(0.8, 1000) == sampling_of(1.4, 1000)
+    assert sampling_of(2 * LARGEST, 1000).photo_pixel == 2 * LARGEST
+
+
+def test_images_are_means_and_counts_sums() -> None:
+    images = {"rgb": torch.rand(2, 6, 9, 3), "overdraw": torch.randint(0, 9, (2, 6, 9, 1), dtype=torch.int32)}
+    small = averaged(images, 3)
+    torch.testing.assert_close(small["rgb"][1, 1, 2], images["rgb"][1, 3:6, 6:9].mean((0, 1)))
+    assert int(small["overdraw"][0, 0, 1]) == int(images["overdraw"][0, :3, 3:6].sum())
+    assert averaged(images, 1) is images
+
+
+def test_a_view_is_drawn_for_its_size() -> None:
+    scene, camera = textured(60, 0), front(120, 88)
+    plain = scene.render(camera, maps=True)
+    scene.photographed = torch.cat([scene.surfels["means"], torch.full((60, 1), math.sqrt(60 * 55) / 4)], 1)
+    same = scene.render(camera, maps=True)
+    assert all(torch.equal(getattr(same, name), getattr(plain, name)) for name in ("rgb", "alpha", "depth", "overdraw"))
+    small = camera.scaled(0.25)
+    how = scene.sampling([small])
+    assert how.samples == 2 and how.photo_pixel == pytest.approx(0.5, rel=0.25)
+    wanted = averaged(draw(scene, [small.scaled(2)], None, ("rgb", "overdraw"), how.photo_pixel), 2)
+    got = scene.render(small, maps=True)
+    torch.testing.assert_close(got.rgb, wanted["rgb"][0])
+    assert torch.equal(got.overdraw, wanted["overdraw"][0]) and got.depth.shape == (22, 30, 1)
+
+
+def test_small_views_are_close_to_averages_of_large_ones() -> None:
+    scene, camera = textured(200, 3), front(240, 176)
+    full = draw(scene, [camera], None, ("rgb",))
+    scene.photographed = torch.cat([scene.surfels["means"], torch.full((200, 1), math.sqrt(60 * 55) / 4)], 1)
+    for share in (0.5, 0.25, 0.125):
+        small = Camera(camera.viewmat, camera.K, camera.width, camera.height).scaled(share)
+        truth = averaged(full, round(1 / share))["rgb"][0]
+        direct = draw(scene, [small], None, ("rgb",))["rgb"][0]
+        error, before = (float((image - truth).square().mean()) for image in (scene.render(small).rgb, direct))
+        assert error < 0.35 * before, share

@@ -81,7 +81,9 @@ def points_of(text: str) -> Tensor:
     except (binascii.Error, ValueError) as error:
         raise PydanticCustomError("points", "must be base64 of float32 numbers") from error
     if len(data) % 16 or len(data) > 16 * _MOST_POINTS:
-        raise PydanticCustomError("points", "must hold rows of four float32 numbers, at most {most}", {"most": _MOST_POINTS})
+        raise PydanticCustomError(
+            "points", "must hold rows of four float32 numbers, at most {most}", {"most": _MOST_POINTS}
+        )
     points = torch.frombuffer(bytearray(data), dtype=torch.float32).view(-1, 4) if data else torch.zeros(0, 4)
     low, high = _RATES
     good = (points[:, :3].abs() <= LIMITS["means"][0]).all() and ((points[:, 3] >= low) & (points[:, 3] <= high)).all()

@@ -50,9 +50,7 @@ def coarser(atlas: Tensor, tiles: Tensor) -> dict[str, Any]:
     return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles)}
 
 
-def frame(
-    scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.0
-) -> tuple[Tensor, Tensor | None]:
+def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.0) -> tuple[Tensor, Tensor | None]:
     """Draws a view.
 
     Args:

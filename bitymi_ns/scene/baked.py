@@ -153,9 +153,7 @@ class BakedScene:
         sizes = [size_of(self.photographed, camera) for camera in cameras]
         return sampling_of(math.exp(sum(map(math.log, sizes)) / len(sizes)), cameras[0].width * cameras[0].height)
 
-    def _draw(
-        self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]
-    ) -> dict[str, Tensor]:
+    def _draw(self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]) -> dict[str, Tensor]:
         """As `ops.baked.draw`, for the size of the views."""
         common_size(cameras)
         how = self.sampling(cameras)

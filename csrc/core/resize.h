@@ -1,8 +1,8 @@
 // A surfel in a view of another size than the photographs that it was trained on.
 //
-// Let p be the side of a photograph's pixel in pixels of the view. What is to be seen is what the trained picture shows,
-// averaged over the view's pixels. Where p < 1 a pixel averages 1 / p^2 samples of it, which lie evenly in it: of their
-// places the variance along each axis is c = (1 - p^2) / 12 pixels^2. So (docs/numerics.md)
+// Let p be the side of a photograph's pixel in pixels of the view. What is to be seen is what the trained picture
+// shows, averaged over the view's pixels. Where p < 1 a pixel averages 1 / p^2 samples of it, which lie evenly in it:
+// of their places the variance along each axis is c = (1 - p^2) / 12 pixels^2. So (docs/numerics.md)
 //   the scale ellipse Sigma = M^-1 M^-T, with (u, v) = M (dx, dy) at the centre, becomes Sigma + c' with
 //   c' = c 2 (beta + 2) / 9, in the unit in which the kernel has the variance 1; its opacity times sqrt(det Sigma /
 //   det(Sigma + c')), which keeps the total;

@@ -26,8 +26,8 @@ constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their 
 // Columns of a row of `geom` [N, kGeom].
 enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kArea, kGeom = 16 };
 // kArea: 0, or where PixelKernel filters the surfel n = fx fy s_u s_v / z^2, for which n w0 is the area of the
-// projected scale ellipse over pi; with ResizedKernel the height of the low pass (core/resize.h). Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world
-// frame.
+// projected scale ellipse over pi; with ResizedKernel the height of the low pass (core/resize.h). Columns of a row of
+// `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
 // How a launch draws surfels, known when its code is compiled. LowPassKernel: the maximum of the kernel and the low
@@ -50,7 +50,7 @@ void with_kernel(bool through_pixel, F&& launch) {
 // photo_pixel: side of a photograph's pixel in pixels of the view.
 template <class F>
 void with_kernel(bool through_pixel, float photo_pixel, F&& launch) {
-  !through_pixel && photo_pixel != 1 ? launch(ResizedKernel()) : with_kernel(through_pixel, launch);
+  !through_pixel&& photo_pixel != 1 ? launch(ResizedKernel()) : with_kernel(through_pixel, launch);
 }
 template <class Kernel, class S>
 BT_HD bool filtered(const S* g) {

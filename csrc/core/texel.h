@@ -28,8 +28,8 @@ BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
   return ((tile[0] | tile[1] | tile[3] | tile[4]) & ((1 << level) - 1)) == 0;
 }
 // The level of which a texel is about as large as a pixel, by a row of geom of core/surfel.h: the geometric mean along
-// the axes. Not coarser than a pixel of the view is than one of a photograph: nearer to its size the texels were trained
-// as they are. kTileLevels where nothing is left but a constant.
+// the axes. Not coarser than a pixel of the view is than one of a photograph: nearer to its size the texels were
+// trained as they are. kTileLevels where nothing is left but a constant.
 template <class S>
 BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
   const S k = S(0.5) / (extent * g[kW0]);  // texels per pixel along the gradient of u and v, squared

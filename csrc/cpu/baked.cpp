@@ -137,7 +137,8 @@ void baked_forward(const BakedForward<S>& a) {
       S view[3];
       store3(view, view_base(load3(base + 3 * id)));
       state.template blend<Kernel>(
-          g, radii + 2 * id, near, [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
+          g, radii + 2 * id, near,
+          [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
             const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
             const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
             for (int c = 0; c < 3; ++c) sums[c][pack] += plain * P(view[c]);
@@ -184,7 +185,8 @@ void baked_forward(const BakedForward<S>& a) {
 template <class S>
 void baked_forward(const BakedForward<S>& a) {
   bin(a.view, *a.bins);
-  with_kernel(a.view.through_pixel, float(a.view.photo_pixel), [&](auto kernel) { baked_forward<decltype(kernel)>(a); });
+  with_kernel(a.view.through_pixel, float(a.view.photo_pixel),
+              [&](auto kernel) { baked_forward<decltype(kernel)>(a); });
 }
 
 template void baked_forward(const BakedForward<float>&);

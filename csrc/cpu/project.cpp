@@ -29,9 +29,8 @@ void project_forward(const ProjectForward<S>& a) {
   with_kernel(a.through_pixel, float(a.photo_pixel), [&](auto kernel) {
     parallel_parts(a.surfels.n, 1024, [&](int thread, int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i)
-        broken[thread] +=
-            !project_visible<decltype(kernel)>(cam, a.width, a.height, a.surfels, i, a.near, to, a.geom, a.frames,
-                                               a.radii);
+        broken[thread] += !project_visible<decltype(kernel)>(cam, a.width, a.height, a.surfels, i, a.near, to, a.geom,
+                                                             a.frames, a.radii);
     });
   });
   *a.broken += int32_t(std::accumulate(broken.begin(), broken.end(), int64_t(0)));
@@ -90,12 +89,15 @@ void bin(const View<S>& view, Bins& bins) {
         ++at[t][only];
         continue;
       }
-      for_tile_rows<Kernel>(geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
-        for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
-          list.push_back(tile);
-          ++at[t][tile];
-        }
-      }, sharp);
+      for_tile_rows<Kernel>(
+          geom + int64_t(order[k].second) * kGeom, width, height,
+          [&](int row, int first, int last) {
+            for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
+              list.push_back(tile);
+              ++at[t][tile];
+            }
+          },
+          sharp);
       list[head] = int32_t(list.size() - head - 1);
     }
   }

@@ -12,8 +12,8 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) 
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.surfels.n) return;
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
-  const bool fine = project_visible<Kernel>(cam, a.width, a.height, a.surfels, i, a.near, Resize<S>(S(1)),
-                                            a.geom, a.frames, a.radii);
+  const bool fine =
+      project_visible<Kernel>(cam, a.width, a.height, a.surfels, i, a.near, Resize<S>(S(1)), a.geom, a.frames, a.radii);
   if (!fine) atomicAdd(a.broken, 1);
 }
 

@@ -18,6 +18,7 @@ from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module
+from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Stage, draws_blocks
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
@@ -272,3 +273,31 @@ def test_errors(device: torch.device, cpu) -> None:
                 scene.render_views([front(8, 8)])
             with pytest.raises(RuntimeError, match="on the CPU"):
                 BakedRenderer(scene, 8, 8)
+
+
+@pytest.mark.parametrize("photo_pixel", [0.2, 0.45, 0.8, 2.5])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
+def test_views_of_another_size(photo_pixel: float, dtype: torch.dtype, device: torch.device, cpu) -> None:
+    """Widened surfels, and texels of their level; half floats round otherwise."""
+    scene, camera = textured(80, 4, dtype), front()
+    background = torch.tensor([0.2, 0.4, 0.6])
+    names = ("rgb", "alpha", "beta", "depth", "overdraw")
+    got = draw(scene.to(device), [camera], background.to(device), names, photo_pixel)
+    with cpu():
+        want = draw(scene, [camera], background, names, photo_pixel)
+    for name in names:
+        a, b = got[name].cpu().double(), want[name].double()
+        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else 1e-4 * max(1.0, float(b.abs().max()))
+        assert ((a - b).abs() <= step).double().mean() >= 0.998, name
+    assert (got["rgb"].cpu() - want["rgb"]).abs().max() < most(device, 6e-3, 2 * TEXEL + FLIP)
+
+
+def test_a_small_view_has_samples(device: torch.device, cpu) -> None:
+    scene = textured(60, 0)
+    scene.photographed = torch.cat([scene.surfels["means"], torch.full((60, 1), (60 * 55) ** 0.5 / 4)], 1)
+    camera = front(120, 88).scaled(0.25)
+    check(scene, camera, device, cpu)
+    views = scene.to(device).render_views([camera, camera], None, ("packed", "rgb"))
+    assert views["packed"].shape == (2, 22, 30, 1) and torch.equal(views["rgb"][0], views["rgb"][1])
+    red = views["packed"][0, ..., 0] & 255
+    assert (red.float() - views["rgb"][0, ..., 0].clamp(0, 1) * 255).abs().max() <= 0.51

@@ -9,7 +9,7 @@ from torch import Tensor
 from bitymi_ns.bake.inputs import BakeInput
 
 POINTS = 256
-"""A view's size is the median over the points in its picture; each takes 16 bytes of bundle.json, and time per frame."""
+"""A view's size is the median over the points in its picture; each takes 22 bytes of bundle.json, and time."""
 
 
 def photographed(inputs: BakeInput) -> Tensor | None:

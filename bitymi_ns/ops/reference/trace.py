@@ -84,8 +84,8 @@ def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tens
 def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor, float, float]:
     """How surfels are drawn where a photograph's pixel has the side `photo_pixel` (docs/numerics.md).
 
-    With J = d pixel / d (u, v) at the centre, what (u, v) is multiplied by [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and the
-    share of the kernel's height that is left [N]; the low pass's squared radius, and its share.
+    With J = d pixel / d (u, v) at the centre, what (u, v) is multiplied by [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and
+    the share of the kernel's height that is left [N]; the low pass's squared radius, and its share.
     """
     variance = max(0.0, (1 - photo_pixel**2) / 12)
     radius2 = photo_pixel**2 + 2 * variance
@@ -119,8 +119,8 @@ def trace(
     A fragment is skipped when sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
     centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
     ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative, as the kernels do; values do not change.
-    With `prefilter`, G is the kernel seen through a pixel instead (`_filtered`), without a bound at the rim. Without it,
-    `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`).
+    With `prefilter`, G is the kernel seen through a pixel instead (`_filtered`), without a bound at the rim. Without
+    it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`).
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M

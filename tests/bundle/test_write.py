@@ -40,6 +40,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         "weight_bound": 0.02,
         "low_pass": 1.0,
         "prefilter": "low_pass",
+        "photographed": None,
         "background": (1, 0.5, 0),
     }
     if format is None:

@@ -72,6 +72,7 @@ class BakedScene(Protocol):
     near: float
     weight_bound: float
     transmittance_min: float
+    through_webgpu: bool
     cache: DrawCache
 
     @property

@@ -53,6 +53,7 @@ class BakedScene:
         photographed: [P, 4] float32 on the CPU, points of the scene, and with how many pixels per unit of length they
             were photographed: by these a view is drawn for its size (`sampling.py`); None = every view is drawn as one
             of the photographs' size.
+        through_webgpu: draw through WebGPU (`ops.webgpu`), wherever the surfels lie; images then lie on the CPU.
     """
 
     surfels: Mapping[str, Tensor]
@@ -69,6 +70,7 @@ class BakedScene:
     transmittance_min: float = TRANSMITTANCE_MIN
     blocks: Tensor | None = None
     photographed: Tensor | None = None
+    through_webgpu: bool = False
     cache: DrawCache = field(default_factory=DrawCache, init=False, repr=False, compare=False)
 
     def residuals(self) -> Tensor:

@@ -1,0 +1,145 @@
+// Draws a batch of surfels, nearest first, each as a rectangle, into a target that holds the sums of a pixel and, in
+// alpha, the transmittance that is left. The blending unit does the rest of core/blend.h:
+//   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
+//
+// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of the residual, the
+// end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
+// closer; what it costs in the picture is in docs/viewer.md.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
+@group(0) @binding(2) var<storage, read> seen: array<Seen>;
+@group(0) @binding(3) var<storage, read> order: array<u32>;
+@group(0) @binding(4) var<storage, read> visible: u32;
+@group(1) @binding(0) var atlas: texture_2d_array<f32>;
+@group(1) @binding(1) var bilinear: sampler;
+@group(2) @binding(0) var<uniform> layer: vec4u;  // which batch
+@group(2) @binding(1) var before: texture_2d<f32>;  // the target before this batch
+
+struct Corner {
+  @builtin(position) position: vec4f,
+  @location(0) @interpolate(flat) center_u: vec4f,
+  @location(1) @interpolate(flat) v_w: vec4f,
+  @location(2) @interpolate(flat) w0_z_opacity_beta: vec4f,
+  @location(3) @interpolate(flat) color_area: vec4f,
+  @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile the residual
+  @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z
+}
+
+@vertex
+fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance: u32) -> Corner {
+  let i = order[layer_begin(visible, layer.x, frame.layers) + instance];
+  let s = seen[i];
+  let surfel = surfels[i];
+  let side = vec2f(f32(vertex & 1) * 2.0 - 1.0, f32(vertex >> 1) * 2.0 - 1.0);
+  var at = side;
+  if s.half_size.x >= 0.0 {
+    let offset = s.middle + side * s.half_size;
+    let pixel = s.center + s.axis * offset.x + vec2f(-s.axis.y, s.axis.x) * offset.y;
+    at = (pixel / frame.size * 2.0 - 1.0) * vec2f(1.0, -1.0);
+  }
+  var out: Corner;
+  out.position = vec4f(at, 0.0, 1.0);
+  out.center_u = vec4f(s.center, s.u);
+  out.v_w = vec4f(s.v, s.w);
+  out.w0_z_opacity_beta = vec4f(s.w0, s.z, s.opacity, s.beta);
+  out.color_area = vec4f(s.color, s.area);
+  if surfel.sides == 0 {
+    out.tile = vec4f(surfel.residual, 0.0);
+    out.texel = vec4f(-1.0, 0.0, s.normal_z, 0.0);
+  } else {
+    let sides = vec2f(f32(surfel.sides & 0xffff), f32(surfel.sides >> 16));
+    out.tile = vec4f(vec2f(surfel.tile), sides - 1.0);
+    out.texel = vec4f(f32(surfel.layer), 0.5 / surfel.extent, s.normal_z, 0.0);
+  }
+  return out;
+}
+
+struct Fragment {
+  at: vec2f,  // u, v
+  depth: f32,
+  sigma: f32,
+}
+
+// core/kernel.h
+fn beta_fragment(c: Corner, d: vec2f) -> Fragment {
+  let w0 = c.w0_z_opacity_beta.x;
+  let z = c.w0_z_opacity_beta.y;
+  let w = w0 + dot(c.v_w.zw, d);
+  let hit = w > 0.0 && w0 * z > frame.near * w;
+  let inverse = 1.0 / select(1.0, w, hit);
+  let at = select(vec2f(0.0), vec2f(dot(c.center_u.zw, d), dot(c.v_w.xy, d)) * inverse, hit);
+  let rest = 1.0 - dot(at, at) / SUPPORT2;
+  let inside = hit && rest > 0.0;
+  let kernel = select(0.0, exp2(c.w0_z_opacity_beta.w * log2(select(1.0, rest, inside))), inside);
+  let blur = exp(-dot(d, d));
+  var f: Fragment;
+  f.at = clamp(at, vec2f(-SUPPORT), vec2f(SUPPORT));
+  f.depth = select(w0 * z * inverse, z, blur > kernel);
+  f.sigma = min(ALPHA_MAX, c.w0_z_opacity_beta.z * max(kernel, blur));
+  return f;
+}
+
+// core/prefilter.h
+fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
+  let w0 = c.w0_z_opacity_beta.x;
+  let z = c.w0_z_opacity_beta.y;
+  let beta = c.w0_z_opacity_beta.w;
+  let n = c.color_area.w;
+  let variance = PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
+  let a = n * vec4f(c.center_u.zw, c.v_w.xy);
+  let spread = dot(a, a);
+  let tilt = dot(c.v_w.zw, d);
+  let uv = vec2f(dot(c.center_u.zw, d), dot(c.v_w.xy, d));
+  let r = length(uv);
+  let outside = r > SUPPORT * (w0 + tilt);
+  let omega = select(w0 + tilt, r, outside) / select(w0, r - SUPPORT * tilt, outside);
+  let w2 = omega * omega;
+  let covered = w2 * n * w0;
+  let denominator = covered * covered + (variance * spread * w2 + variance * variance);
+  let q = (w2 * dot(n * uv, n * uv) + variance * dot(d, d)) / denominator;
+  let rest = 1.0 - q / SUPPORT2;
+  let inside = rest > 0.0 && z > frame.near * omega;
+  let kernel = select(0.0, exp2(beta * log2(select(1.0, rest, inside))), inside);
+  var f: Fragment;
+  f.at = clamp(uv / (w0 * omega), vec2f(-SUPPORT), vec2f(SUPPORT));
+  f.depth = z / omega;
+  f.sigma = min(ALPHA_MAX, c.w0_z_opacity_beta.z * covered / sqrt(denominator) * kernel);
+  return f;
+}
+
+fn residual(c: Corner, at: vec2f) -> vec3f {
+  if c.texel.x < 0.0 { return c.tile.xyz; }
+  let span = c.tile.zw;
+  let texel = c.tile.xy + clamp(at * (span + 1.0) * c.texel.y + 0.5 * span, vec2f(0.0), span) + 0.5;
+  return frame.offset + frame.scale * textureSampleLevel(atlas, bilinear, texel / frame.atlas, u32(c.texel.x), 0.0).rgb;
+}
+
+@fragment
+fn surfel(c: Corner) -> @location(0) vec4f {
+  let d = c.position.xy - c.center_u.xy;
+  var f: Fragment;
+  if c.color_area.w > 0.0 { f = filtered_fragment(c, d); } else { f = beta_fragment(c, d); }
+  if f.sigma < ALPHA_MIN { discard; }
+  var front = 1.0;
+  if layer.x > 0 { front = textureLoad(before, vec2i(c.position.xy), 0).a; }
+  if front < TRANSMITTANCE_MIN { discard; }
+  let textured = frame.residuals != 0 && f.sigma * front >= frame.weight_bound;
+  switch frame.show {
+    case SHOW_DEPTH: { return vec4f(f.sigma * f.depth, f.sigma * c.w0_z_opacity_beta.w, f.sigma, f.sigma); }
+    case SHOW_NORMAL: {
+      return vec4f(f.sigma * vec3f(-c.v_w.zw * frame.lens.xy, c.texel.z), f.sigma);
+    }
+    case SHOW_OVERDRAW: { return vec4f(1.0, 0.0, 0.0, f.sigma); }
+    case SHOW_RESIDUAL: {
+      var shift = vec3f(0.0);
+      if textured { shift = residual(c, f.at); }
+      return vec4f(f.sigma * max(shift + 0.5, vec3f(0.0)), f.sigma);
+    }
+    default: {
+      var color = c.color_area.xyz;
+      if textured { color = max(color + residual(c, f.at), vec3f(0.0)); }
+      return vec4f(f.sigma * color, f.sigma);
+    }
+  }
+}

@@ -1,0 +1,44 @@
+// Shows what was drawn (draw.wgsl) on the screen: over the background, or as a map in colours.
+
+struct Screen {
+  background: vec4f,
+  size: vec2f,  // of the screen's part, pixels
+  show: u32,  // SHOW_*
+  most: f32,  // of a map: the value of the last colour
+}
+
+@group(0) @binding(0) var<uniform> screen: Screen;
+@group(0) @binding(1) var sums: texture_2d<f32>;
+@group(0) @binding(2) var smooth_sampler: sampler;
+
+@vertex
+fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
+  return vec4f(f32(vertex & 1) * 4.0 - 1.0, f32(vertex >> 1) * 4.0 - 1.0, 0.0, 1.0);
+}
+
+// From dark blue over green and yellow to red.
+fn ramp(x: f32) -> vec3f {
+  let t = clamp(x, 0.0, 1.0);
+  let stops = array<vec3f, 5>(
+    vec3f(0.10, 0.10, 0.25), vec3f(0.13, 0.42, 0.62), vec3f(0.25, 0.68, 0.45), vec3f(0.93, 0.80, 0.30),
+    vec3f(0.83, 0.22, 0.16),
+  );
+  let at = t * 4.0;
+  let k = min(u32(at), 3u);
+  return mix(stops[k], stops[k + 1], at - f32(k));
+}
+
+@fragment
+fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let s = textureSampleLevel(sums, smooth_sampler, position.xy / screen.size, 0.0);
+  let covered = 1.0 - s.a;
+  switch screen.show {
+    case SHOW_DEPTH: {
+      let depth = s.r / max(covered, 1e-4);
+      return vec4f(mix(screen.background.rgb, ramp(1.0 - depth / screen.most), covered), 1.0);
+    }
+    case SHOW_NORMAL: { return vec4f(mix(screen.background.rgb, s.rgb / max(covered, 1e-4) * 0.5 + 0.5, covered), 1.0); }
+    case SHOW_OVERDRAW: { return vec4f(ramp(s.r / screen.most), 1.0); }
+    default: { return vec4f(s.rgb + s.a * screen.background.rgb, 1.0); }
+  }
+}

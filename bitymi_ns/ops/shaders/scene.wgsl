@@ -1,0 +1,83 @@
+// What the shaders of a baked scene share: its numbers, its surfels, and what a frame is drawn with.
+//
+// These files are the renderer for every screen: the browser's viewer and the package's `webgpu` renderer put them
+// together and run them. The formulas are those of csrc/core; its files say why they are as they are.
+
+const SUPPORT: f32 = 3.0;
+const SUPPORT2: f32 = 9.0;
+const ALPHA_MAX: f32 = 0.99;
+const ALPHA_MIN: f32 = 0.00392156862745098;
+const TRANSMITTANCE_MIN: f32 = 1e-4;
+const LOW_PASS_REACH: f32 = 2.36;
+const BETA_MAX: f32 = 4.0;
+const LOG_SCALE_MAX: f32 = 30.0;
+const COLOR_BIAS: f32 = 0.5;
+const PIXEL_VARIANCE: f32 = 0.25;
+
+// A surfel as it is stored, 96 bytes. Means are relative to the scene's origin.
+struct Surfel {
+  mean: vec3f,
+  opacity_logit: f32,
+  quat: vec4f,  // wxyz, unit
+  log_scale: vec2f,
+  beta_raw: f32,
+  extent: f32,  // half side of the tile, scale units
+  residual: vec3f,  // of a surfel without a tile
+  layer: u32,
+  base: vec3f,  // view colour: base, and its terms
+  first_term: u32,
+  tile: vec2u,  // first texel
+  sides: u32,  // texels along u, and along v in the upper half; 0: no tile
+  terms: u32,
+}
+
+// A surfel as a camera sees it, 96 bytes; core/surfel.h has the planes U, V and W.
+struct Seen {
+  center: vec2f,  // pixels
+  u: vec2f,
+  v: vec2f,
+  w: vec2f,  // w1, w2
+  w0: f32,
+  z: f32,
+  opacity: f32,
+  beta: f32,
+  color: vec3f,  // relu(f_view + 0.5)
+  area: f32,  // 0, or where the surfel is seen through a pixel
+  axis: vec2f,  // of the rectangle that holds it on the screen, a unit vector
+  middle: vec2f,  // of the rectangle, along the axis and across, pixels from `center`
+  half_size: vec2f,  // x < 0: the whole screen
+  normal_z: f32,
+  unused: f32,
+}
+
+struct Frame {
+  rotation: array<vec4f, 3>,  // rows, world to camera
+  center: vec4f,  // where the camera stands, relative to the scene's origin
+  color_center: vec4f,  // from where view colours are seen; `center`, unless they are held
+  lens: vec4f,  // fx, fy, cx, cy
+  size: vec2f,  // pixels
+  near: f32,
+  weight_bound: f32,
+  offset: f32,  // residual = offset + scale * texel
+  scale: f32,
+  atlas: vec2f,  // size of a page, texels
+  surfels: u32,
+  kind: u32,  // of the view colours, VIEW_*
+  through_pixel: u32,
+  layers: u32,  // batches of surfels that are drawn one after the other
+  show: u32,  // SHOW_*
+  residuals: u32,  // whether they are added
+  unused: vec2u,
+}
+
+// What is blended: see draw.wgsl.
+const SHOW_COLOR: u32 = 0;
+const SHOW_DEPTH: u32 = 1;
+const SHOW_NORMAL: u32 = 2;
+const SHOW_OVERDRAW: u32 = 3;
+const SHOW_RESIDUAL: u32 = 4;
+
+fn sigmoid(x: f32) -> f32 {
+  let e = exp(-abs(x));
+  return select(1.0, e, x < 0.0) / (1.0 + e);
+}

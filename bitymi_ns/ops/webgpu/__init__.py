@@ -1,0 +1,9 @@
+"""Drawing a baked scene through WebGPU: on graphics of any maker, by the shaders that the browser's viewer runs.
+
+Needs the package `wgpu`, which is optional (`pip install 'bitymi-ns[webgpu]'`).
+"""
+
+from .device import WebGpuUnavailable, adapters
+from .draw import draw
+
+__all__ = ["WebGpuUnavailable", "adapters", "draw"]

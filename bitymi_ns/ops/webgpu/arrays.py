@@ -1,0 +1,122 @@
+"""A baked scene as the arrays that the shaders read (shaders/scene.wgsl)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..baked_scene import BakedScene
+from ..constants import SUPPORT
+from ..view_color import LEAN, check_lean, check_view_color
+from ..view_kinds import VIEW_COLORS
+
+KINDS = {"sv": 0, "sv sites": 1, "sh": 2, "sb": 3, "sg": 4}
+"""Forms of view colours, by their numbers in view_color.wgsl."""
+SURFEL = np.dtype(
+    [
+        *(("mean", "<f4", 3), ("opacity_logit", "<f4"), ("quat", "<f4", 4), ("log_scale", "<f4", 2)),
+        *(("beta_raw", "<f4"), ("extent", "<f4"), ("residual", "<f4", 3), ("layer", "<u4"), ("base", "<f4", 3)),
+        *(("first_term", "<u4"), ("tile", "<u4", 2), ("sides", "<u4"), ("terms", "<u4")),
+    ]
+)
+"""A surfel, as the struct of scene.wgsl."""
+
+
+@dataclass
+class Arrays:
+    """What the shaders read of a scene.
+
+    Attributes:
+        surfels: [N] of `SURFEL`.
+        terms: of the view colours, [.] float32.
+        kind: a number of `KINDS`.
+        origin: [3] float64, which is taken off positions: far from the world's origin float32 would not place them.
+    """
+
+    surfels: npt.NDArray
+    terms: npt.NDArray[np.float32]
+    kind: int
+    origin: npt.NDArray[np.float64]
+
+
+def arrays(scene: BakedScene) -> Arrays:
+    """The arrays of a scene.
+
+    Raises:
+        TypeError: the surfels are not float32.
+        ValueError: a parameter of the view colour has a wrong shape, or a tile does not lie on a page.
+    """
+    p = {name: value.detach().cpu() for name, value in scene.surfels.items()}
+    for name, value in p.items():
+        if value.dtype != torch.float32 and name != "view_span":
+            raise TypeError(f"the WebGPU renderer takes float32 surfels, but {name} is {value.dtype}")
+    n = len(scene.tiles)
+    means = p["means"].double()
+    seen = means[means.isfinite().all(1)]
+    origin = (seen.amin(0) + seen.amax(0)) / 2 if len(seen) else torch.zeros(3, dtype=torch.float64)
+    surfels = np.zeros(n, SURFEL)
+    surfels["mean"] = (means - origin).float().numpy()
+    surfels["opacity_logit"] = p["opacity_logits"].numpy()
+    surfels["quat"] = torch.nn.functional.normalize(p["quats"].double(), dim=1, eps=1e-300).float().numpy()
+    surfels["log_scale"] = p["log_scales"].numpy()
+    surfels["beta_raw"] = p["beta_raw"].numpy()
+    surfels["extent"] = SUPPORT if scene.extent is None else scene.extent.detach().cpu().numpy()
+    if scene.mean_residual is not None:
+        surfels["residual"] = scene.mean_residual.detach().cpu().numpy()
+    _set_tiles(surfels, scene)
+    kind, base, span, terms = _view_colors(scene.view_color, p, n)
+    surfels["base"], surfels["first_term"], surfels["terms"] = base.numpy(), span[:, 0].numpy(), span[:, 1].numpy()
+    _hide_broken(surfels, p)
+    return Arrays(surfels, terms.numpy().ravel(), KINDS[kind], origin.numpy())
+
+
+def _set_tiles(surfels: npt.NDArray, scene: BakedScene) -> None:
+    texels = scene.blocks if scene.atlas is None else scene.atlas
+    if texels is None:
+        return
+    layers, height, width = texels.shape[:3]
+    if scene.atlas is None:
+        height, width = 4 * height, 4 * width
+    tiles = scene.tiles.cpu().long()
+    x, y, layer, columns, rows = tiles.unbind(1)
+    good = (tiles >= 0).all(1) & (x + columns <= width) & (y + rows <= height) & (layer < layers) & (rows > 0)
+    bad = (columns != 0) & ~good
+    if bad.any():
+        raise ValueError(f"the tile of surfel {int(bad.nonzero()[0])} does not lie on a page of the atlas")
+    has = (columns > 0).numpy()
+    surfels["tile"][has] = tiles[:, :2].numpy()[has]
+    surfels["layer"][has] = layer.numpy()[has]
+    surfels["sides"][has] = (columns + (rows << 16)).numpy()[has]
+
+
+def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, Tensor, Tensor]:
+    """Form, base [N, 3], first number and count of terms [N, 2], terms."""
+    if "view_terms" in p:
+        check_lean(kind, p, n)
+        base, span, terms = (p[name] for name in LEAN)
+        first, count = span.long().unbind(1)
+        return kind, base, torch.stack([first * terms.shape[1], count], dim=1), terms
+    check_view_color(kind, p, n)
+    given = VIEW_COLORS[kind].of(p)
+    if kind == "sv":
+        base, terms = torch.zeros(n, 3), torch.cat([given[0], given[1][..., None], given[2]], dim=2)
+    else:
+        base, terms = given
+    count = torch.full((n,), terms.shape[1])
+    first = torch.arange(n) * (terms.shape[1] * terms.shape[2])
+    return {"sv": "sv sites"}.get(kind, kind), base, torch.stack([first, count], dim=1), terms.contiguous()
+
+
+def _hide_broken(surfels: npt.NDArray, p: dict[str, Tensor]) -> None:
+    """Surfels of which a number is not finite, or a rotation 0, are never drawn: shaders need not tell NaN."""
+    geometry = [p[name].flatten(1) for name in ("means", "quats", "log_scales")]
+    rest = torch.stack([p["opacity_logits"], p["beta_raw"]], dim=1)
+    good = torch.cat([*geometry, rest], dim=1).isfinite().all(1) & (p["quats"].abs().amax(1) > 0)
+    broken = ~good.numpy()
+    for name in ("mean", "quat", "log_scale", "beta_raw"):
+        surfels[name][broken] = 0
+    surfels["opacity_logit"][broken] = -100

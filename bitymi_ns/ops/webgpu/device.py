@@ -1,0 +1,65 @@
+"""The graphics device that draws, and what it can do."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from types import ModuleType
+from typing import Any
+
+INSTALL = "pip install 'bitymi-ns[webgpu]'"
+OPTIONAL = ("texture-compression-bc", "float32-blendable", "float32-filterable")
+"""Features that are used where the device has them."""
+_LIMITS = ("max-texture-dimension-2d", "max-storage-buffer-binding-size", "max-buffer-size")
+
+
+class WebGpuUnavailable(RuntimeError):
+    """Nothing here can be drawn through WebGPU; the message says why and what to do."""
+
+
+@functools.cache
+def library() -> ModuleType:
+    """The module wgpu.
+
+    Raises:
+        WebGpuUnavailable: it is not installed, or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("wgpu")
+    except Exception as error:  # its library may be for another system: what it then raises is not written down
+        raise WebGpuUnavailable(f"drawing through WebGPU needs the package wgpu ({INSTALL}): {error}") from error
+
+
+def adapters() -> list[str]:
+    """What could draw here, the first being what `device` takes; empty where there is nothing."""
+    return [f"{a.info['device']} ({a.info['backend_type']})" for a in _usable()]
+
+
+def _usable() -> list[Any]:
+    """Adapters, real cards first; those that draw with the processor only are last."""
+    rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
+    found = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
+    return sorted(found, key=lambda a: rank.get(a.info["adapter_type"], 3))
+
+
+@functools.cache
+def device() -> Any:
+    """The device that draws, one per process, with as much of `OPTIONAL` as it has.
+
+    Raises:
+        WebGpuUnavailable: there is none.
+    """
+    found = _usable()
+    if not found:
+        raise WebGpuUnavailable(
+            "no graphics device for WebGPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Debian and "
+            "Ubuntu: apt install mesa-vulkan-drivers, which also draws without a card)"
+        )
+    adapter = found[0]
+    try:
+        return adapter.request_device_sync(
+            required_features=[name for name in OPTIONAL if name in adapter.features],
+            required_limits={name: adapter.limits[name] for name in _LIMITS},
+        )
+    except RuntimeError as error:
+        raise WebGpuUnavailable(f"the graphics device {adapter.info['device']} cannot be used: {error}") from error

@@ -1,0 +1,277 @@
+"""A scene in the memory of a graphics device, and drawing it there."""
+
+from __future__ import annotations
+
+import functools
+import struct
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from ..baked_cuda import decoded
+from ..baked_scene import BakedScene
+from ..project import Camera
+from .arrays import arrays
+from .device import device, library
+from .programs import Programs
+
+SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}
+"""What is blended, by its number in scene.wgsl."""
+BLOCK, DIGITS, ROUNDS = 1024, 16, 8
+"""Of sort.wgsl: keys per block, digits, rounds of 4 bits."""
+MOST_LAYERS = 64
+_STRIDE = 256  # between the uniforms of batches and of rounds, which devices want so
+
+
+@functools.cache
+def programs() -> Programs:
+    """Compiled for the device of this process."""
+    found = device()
+    return Programs(found, "rgba32float" if "float32-blendable" in found.features else "rgba16float")
+
+
+def check(made: Any, what: str) -> Any:
+    """`made`, unless the device refused it."""
+    if made is None:
+        raise RuntimeError(f"the graphics device has no room for {what}")
+    return made
+
+
+@dataclass
+class _Target:
+    """What is drawn to, for images of one size."""
+
+    size: tuple[int, int]
+    sums: Any
+    before: Any
+    read: Any
+    row_bytes: int
+
+
+class SceneOnDevice:
+    """A scene as textures and buffers of the graphics device.
+
+    Args:
+        scene: what to draw. Its numbers are copied.
+
+    Raises:
+        WebGpuUnavailable: there is no such device, or it has too little room for the scene.
+        TypeError, ValueError: as `arrays`.
+    """
+
+    def __init__(self, scene: BakedScene) -> None:
+        self._programs, self._device = programs(), device()
+        packed = arrays(scene)
+        self._origin, self._kind = packed.origin, packed.kind
+        self.count = len(packed.surfels)
+        self._near, self._bound = scene.near, scene.weight_bound
+        self._through_pixel = scene.through_pixel
+        self._offset, self._scale = scene.offset, scene.scale
+        flags = library().BufferUsage
+        storage, n = flags.STORAGE, max(1, self.count)
+        self._surfels = self._upload(packed.surfels, storage)
+        self._terms = self._upload(packed.terms, storage)
+        self._frame = self._empty(160, flags.UNIFORM | flags.COPY_DST)
+        self._seen = self._empty(96 * n, storage)
+        self._keys = [self._empty(4 * n, storage) for _ in range(2)]
+        self._order = [self._empty(4 * n, storage) for _ in range(2)]
+        self._visible = self._empty(4, storage | flags.COPY_DST)
+        self._draws = self._empty(16 * MOST_LAYERS, storage | flags.INDIRECT)
+        numbers = np.zeros((MOST_LAYERS, _STRIDE // 4), np.uint32)
+        numbers[:, 0] = np.arange(MOST_LAYERS)
+        self._layers = self._upload(numbers, flags.UNIFORM)
+        self._atlas, self._atlas_size = self._texture(scene)
+        self._target: _Target | None = None
+        self._bind()
+
+    def _empty(self, size: int, usage: int) -> Any:
+        return self._device.create_buffer(size=size, usage=usage)
+
+    def _upload(self, data: npt.NDArray, usage: int) -> Any:
+        if not data.size:
+            data = np.zeros(24, np.float32)
+        return self._device.create_buffer_with_data(data=np.ascontiguousarray(data), usage=usage)
+
+    def _texture(self, scene: BakedScene) -> tuple[Any, tuple[int, int]]:
+        features = self._device.features
+        texels, blocks = scene.atlas, scene.blocks
+        if blocks is not None and "texture-compression-bc" in features:
+            return self._pages("bc7-rgba-unorm", blocks.cpu().numpy(), 4)
+        if texels is None and blocks is not None:
+            texels = decoded(blocks)
+            warnings.warn(
+                "the graphics device draws no BC7 textures: the atlas was decoded, at four times the memory",
+                stacklevel=2,
+            )
+        if texels is None:
+            return self._pages("rgba8unorm", np.zeros((1, 1, 1, 4), np.uint8), 1)
+        if texels.dtype == torch.uint8:
+            return self._pages("rgba8unorm", texels.cpu().numpy(), 1)
+        if "float32-filterable" in features:
+            return self._pages("rgba32float", texels.detach().float().cpu().numpy(), 1)
+        return self._pages("rgba16float", texels.detach().half().cpu().numpy(), 1)
+
+    def _pages(self, format: str, pages: npt.NDArray, block: int) -> tuple[Any, tuple[int, int]]:
+        """An array texture of pages [layers, rows of blocks, blocks, ...]."""
+        layers, rows, columns = pages.shape[:3]
+        size = (columns * block, rows * block, layers)
+        flags = library().TextureUsage
+        texture = self._device.create_texture(
+            size=size, format=format, usage=flags.TEXTURE_BINDING | flags.COPY_DST, dimension="2d"
+        )
+        for layer, page in enumerate(pages):
+            data = np.ascontiguousarray(page)
+            self._device.queue.write_texture(
+                {"texture": texture, "origin": (0, 0, layer)},
+                data,
+                {"bytes_per_row": data.nbytes // rows, "rows_per_image": rows},
+                (size[0], size[1], 1),
+            )
+        return texture, size[:2]
+
+    def _group(self, layout: Any, *resources: Any) -> Any:
+        entries = [
+            {"binding": k, "resource": {"buffer": r} if hasattr(r, "usage") and hasattr(r, "map_state") else r}
+            for k, r in enumerate(resources)
+            if r is not None
+        ]
+        return self._device.create_bind_group(layout=layout, entries=entries)
+
+    def _bind(self) -> None:
+        p, blocks = self._programs, -(-max(1, self.count) // BLOCK)
+        flags = library().BufferUsage
+        table = self._empty(4 * DIGITS * blocks, flags.STORAGE)
+        self._prepare = self._group(
+            p.prepare.get_bind_group_layout(0),
+            *(self._frame, self._surfels, self._terms, self._seen, self._keys[0], self._order[0], self._visible),
+        )
+        self._rounds, self._blocks = [], blocks
+        for k in range(ROUNDS):
+            numbers = np.array([self.count, blocks, 4 * k, 0], np.uint32)
+            uniform = self._upload(numbers, flags.UNIFORM)
+            source, to = k % 2, 1 - k % 2
+            given = (uniform, self._keys[source], self._order[source], self._keys[to], self._order[to], table)
+            used = {"count": (0, 1, 5), "scan": (0, 5), "scatter": (0, 1, 2, 3, 4, 5)}
+            self._rounds.append(
+                {
+                    entry: self._group(
+                        p.sort[entry].get_bind_group_layout(0),
+                        *(r if i in used[entry] else None for i, r in enumerate(given)),
+                    )
+                    for entry in used
+                }
+            )
+        self._share = self._group(p.share_out.get_bind_group_layout(0), self._frame, self._visible, self._draws)
+        self._drawn = self._group(p.layout[0], self._frame, self._surfels, self._seen, self._order[0], self._visible)
+        sampler = self._device.create_sampler(mag_filter="linear", min_filter="linear")
+        view = self._atlas.create_view(dimension="2d-array")
+        self._pages_bound = self._group(p.layout[1], view, sampler)
+
+    def _target_of(self, width: int, height: int) -> _Target:
+        if self._target is None or self._target.size != (width, height):
+            flags, buffers, p = library().TextureUsage, library().BufferUsage, self._programs
+            size, texel = (width, height, 1), 16 if p.format == "rgba32float" else 8
+            sums = self._device.create_texture(
+                size=size, format=p.format, usage=flags.RENDER_ATTACHMENT | flags.COPY_SRC
+            )
+            copy = self._device.create_texture(size=size, format=p.format, usage=flags.TEXTURE_BINDING | flags.COPY_DST)
+            row = -(-texel * width // 256) * 256
+            read = self._empty(row * height, buffers.COPY_DST | buffers.MAP_READ)
+            layer = {"buffer": self._layers, "offset": 0, "size": 16}
+            before = self._group(p.layout[2], layer, copy.create_view())
+            self._target = _Target((width, height), (sums, copy), before, read, row)
+        return self._target
+
+    def _set_frame(self, camera: Camera, show: str, layers: int) -> None:
+        viewmat, K = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
+        center = camera.exact_center.cpu().double().numpy() - self._origin
+        rows = [(*viewmat[k, :3], 0.0) for k in range(3)]
+        data = struct.pack(
+            "<32f8I",
+            *(value for row in rows for value in row),
+            *(*center, 0.0, *center, 0.0),
+            *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
+            *(camera.width, camera.height, self._near, self._bound),
+            *(self._offset, self._scale, *self._atlas_size),
+            *(self.count, self._kind, int(self._through_pixel), layers),
+            *(SHOW[show], 1, 0, 0),
+        )
+        self._device.queue.write_buffer(self._frame, 0, data)
+
+    def draw(self, camera: Camera, show: str, layers: int) -> npt.NDArray[np.float32]:
+        """Draws a view.
+
+        Args:
+            camera: the view.
+            show: of `SHOW`.
+            layers: batches, at most `MOST_LAYERS`.
+
+        Returns:
+            [H, W, 4]: the sums, and what is left of the transmittance.
+        """
+        target = self._target_of(camera.width, camera.height)
+        self._set_frame(camera, show, layers)
+        self._device.queue.write_buffer(self._visible, 0, bytes(4))
+        encoder = self._device.create_command_encoder()
+        self._encode_sorting(encoder)
+        self._encode_drawing(encoder, target, show, layers)
+        sums, _ = target.sums
+        encoder.copy_texture_to_buffer(
+            {"texture": sums},
+            {"buffer": target.read, "bytes_per_row": target.row_bytes, "rows_per_image": camera.height},
+            (camera.width, camera.height, 1),
+        )
+        self._device.queue.submit([encoder.finish()])
+        return self._read(target)
+
+    def _encode_sorting(self, encoder: Any) -> None:
+        p, work = self._programs, encoder.begin_compute_pass()
+
+        def run(pipeline: Any, group: Any, groups: int) -> None:
+            work.set_pipeline(pipeline)
+            work.set_bind_group(0, group)
+            work.dispatch_workgroups(groups)
+
+        run(p.prepare, self._prepare, -(-max(1, self.count) // 64))
+        for groups in self._rounds:
+            run(p.sort["count"], groups["count"], self._blocks)
+            run(p.sort["scan"], groups["scan"], 1)
+            run(p.sort["scatter"], groups["scatter"], self._blocks)
+        run(p.share_out, self._share, 1)
+        work.end()
+
+    def _encode_drawing(self, encoder: Any, target: _Target, show: str, layers: int) -> None:
+        p, (sums, copy) = self._programs, target.sums
+        pipeline = p.count_fragments if show == "overdraw" else p.blend
+        view = sums.create_view()
+        for k in range(layers):
+            if k:
+                encoder.copy_texture_to_texture({"texture": sums}, {"texture": copy}, (*target.size, 1))
+            attachment = {
+                "view": view,
+                "load_op": "load" if k else "clear",
+                "store_op": "store",
+                "clear_value": (0, 0, 0, 1),
+            }
+            work = encoder.begin_render_pass(color_attachments=[attachment])
+            work.set_pipeline(pipeline)
+            work.set_bind_group(0, self._drawn)
+            work.set_bind_group(1, self._pages_bound)
+            work.set_bind_group(2, target.before, [k * _STRIDE])
+            work.draw_indirect(self._draws, 16 * k)
+            work.end()
+
+    def _read(self, target: _Target) -> npt.NDArray[np.float32]:
+        width, height = target.size
+        target.read.map_sync(library().MapMode.READ)
+        try:
+            raw = np.frombuffer(target.read.read_mapped(), np.uint8).reshape(height, target.row_bytes)
+            dtype = np.float32 if self._programs.format == "rgba32float" else np.float16
+            used = np.ascontiguousarray(raw[:, : width * 4 * np.dtype(dtype).itemsize])
+            return used.view(dtype).reshape(height, width, 4).astype(np.float32)
+        finally:
+            target.read.unmap()

@@ -1,0 +1,129 @@
+"""The shaders, put together and compiled for a device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from typing import Any
+
+from .device import library
+
+PARTS = {
+    "prepare": ("scene", "view_color", "bounds", "prepare"),
+    "sort": ("sort",),
+    "share_out": ("scene", "batches", "share_out"),
+    "draw": ("scene", "batches", "draw"),
+}
+"""Files of every program, in the order in which they are put together."""
+
+
+def source(program: str) -> str:
+    """The text of a program of `PARTS`."""
+    folder = resources.files("bitymi_ns.ops") / "shaders"
+    return "\n".join((folder / f"{part}.wgsl").read_text("utf8") for part in PARTS[program])
+
+
+@dataclass
+class Programs:
+    """Pipelines of a device.
+
+    Attributes:
+        device: of `device.device`.
+        format: of the target that is drawn to.
+    """
+
+    device: Any
+    format: str
+
+    def _module(self, name: str) -> Any:
+        return self.device.create_shader_module(label=name, code=source(name))
+
+    def _compute(self, module: Any, entry: str) -> Any:
+        return self.device.create_compute_pipeline(
+            label=entry, layout=library().AutoLayoutMode.auto, compute={"module": module, "entry_point": entry}
+        )
+
+    @cached_property
+    def prepare(self) -> Any:
+        return self._compute(self._module("prepare"), "prepare")
+
+    @cached_property
+    def sort(self) -> dict[str, Any]:
+        module = self._module("sort")
+        return {entry: self._compute(module, entry) for entry in ("count", "scan", "scatter")}
+
+    @cached_property
+    def share_out(self) -> Any:
+        return self._compute(self._module("share_out"), "share_out")
+
+    @cached_property
+    def _draw_module(self) -> Any:
+        return self._module("draw")
+
+    @cached_property
+    def layout(self) -> list[Any]:
+        """Bind group layouts of `draw`: the scene and the frame, the atlas, the batch."""
+        wgpu = library()
+        vertex, fragment = wgpu.ShaderStage.VERTEX, wgpu.ShaderStage.FRAGMENT
+        make = self.device.create_bind_group_layout
+        filters = self.filters_floats
+        read = {"type": "read-only-storage"}
+        atlas = {"sample_type": "float", "view_dimension": "2d-array"}
+        return [
+            make(
+                entries=[
+                    {"binding": 0, "visibility": vertex | fragment, "buffer": {"type": "uniform"}},
+                    *({"binding": k, "visibility": vertex, "buffer": read} for k in range(1, 5)),
+                ]
+            ),
+            make(
+                entries=[
+                    {"binding": 0, "visibility": fragment, "texture": atlas},
+                    {"binding": 1, "visibility": fragment, "sampler": {"type": "filtering"}},
+                ]
+            ),
+            make(
+                entries=[
+                    {
+                        "binding": 0,
+                        "visibility": vertex | fragment,
+                        "buffer": {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": 16},
+                    },
+                    {
+                        "binding": 1,
+                        "visibility": fragment,
+                        "texture": {"sample_type": "float" if filters else "unfilterable-float"},
+                    },
+                ]
+            ),
+        ]
+
+    @property
+    def filters_floats(self) -> bool:
+        """Whether the target's format can be filtered, which its binding has to say."""
+        return self.format != "rgba32float" or "float32-filterable" in self.device.features
+
+    def _draw(self, color: dict[str, str]) -> Any:
+        transmittance = {"operation": "add", "src_factor": "zero", "dst_factor": "one-minus-src-alpha"}
+        module = self._draw_module
+        return self.device.create_render_pipeline(
+            layout=self.device.create_pipeline_layout(bind_group_layouts=self.layout),
+            vertex={"module": module, "entry_point": "corner"},
+            primitive={"topology": "triangle-strip"},
+            fragment={
+                "module": module,
+                "entry_point": "surfel",
+                "targets": [{"format": self.format, "blend": {"color": color, "alpha": transmittance}}],
+            },
+        )
+
+    @cached_property
+    def blend(self) -> Any:
+        """Adds a fragment times the transmittance in front of it."""
+        return self._draw({"operation": "add", "src_factor": "dst-alpha", "dst_factor": "one"})
+
+    @cached_property
+    def count_fragments(self) -> Any:
+        """Adds fragments as they are."""
+        return self._draw({"operation": "add", "src_factor": "one", "dst_factor": "one"})

@@ -1,0 +1,19 @@
+"""A graphics device that draws, be it one in software."""
+
+from __future__ import annotations
+
+import pytest
+
+from bitymi_ns.ops import webgpu
+from tests.required import skip_without
+
+
+@pytest.fixture(autouse=True, scope="session")
+def device() -> None:
+    """Skips where nothing can be drawn through WebGPU."""
+    try:
+        found = webgpu.adapters()
+    except webgpu.WebGpuUnavailable as error:
+        skip_without("webgpu", str(error))
+    if not found:
+        skip_without("webgpu", "no graphics device: apt install mesa-vulkan-drivers")

@@ -1,0 +1,154 @@
+"""Scenes drawn through WebGPU against the CPU renderer.
+
+On the golden scenes, whose targets are in single precision, images agreed to 2.5e-5 on llvmpipe; the bounds leave a card
+room for its exponentials. Where a weight bound is set, the weight is judged from above (shaders/draw.wgsl), so that
+residuals are added which are not in the CPU's picture: by at most the bound times the residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.quantise import bc7_encoder
+from bitymi_ns.ops import webgpu
+from bitymi_ns.ops.bc7 import decode_bc7
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.scene import Camera
+from bitymi_ns.scene.baked import BakedScene
+from tests.cuda.baked_scenes import camera_of, front, scene_of, textured
+from tests.ops.golden import GOLDEN_NAMES, SceneCase, atlas_of, extreme_scenes, load_golden
+from tests.ops.test_view_color import lean_parameters
+
+FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
+PICTURE = ("rgb", "alpha", "beta", "depth")
+"""Without the side of a surfel that is seen exactly edge-on, and without fragments behind the end of a pixel, which
+count here as long as their batch goes on."""
+STEP = 1 / 255
+EXTREME = extreme_scenes()
+
+
+def check(
+    scene: BakedScene, camera: Camera, background: Tensor | None = None, fields: Sequence[str] = FIELDS
+) -> Tensor:
+    """Holds a view against the CPU's, colours to a step, but for a pixel in a thousand; the differences of colours."""
+    got = replace(scene, through_webgpu=True).render(camera, background, maps=True)
+    want = scene.render(camera, background, maps=True)
+    for name in fields:
+        a, b = getattr(got, name), getattr(want, name)
+        assert a.shape == b.shape and a.dtype == b.dtype and a.isfinite().all(), name
+        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else 1e-3 * max(1.0, float(b.abs().max()))
+        assert ((a - b).abs() <= step).double().mean() >= 0.999, name
+    return (got.rgb - want.rgb).abs()
+
+
+@pytest.mark.parametrize("name", GOLDEN_NAMES)
+def test_golden_scenes(name: str) -> None:
+    golden = load_golden(name)
+    params = {key: value.float() for key, value in golden.params.items()}
+    scene = BakedScene(params, "sv", *atlas_of(golden)) if golden.tiles else scene_of(golden)
+    camera = camera_of(golden)
+    assert check(scene, camera, golden.background.float()).max() < STEP
+    got = replace(scene, through_webgpu=True).render(camera, golden.background.float())
+    assert (got.rgb.double() - golden.outputs["rgb"]).abs().max() < STEP
+
+
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+@pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
+def test_numbers_that_misbehave(case: SceneCase, prefilter: str) -> None:
+    case = replace(case, width=min(case.width, 300), height=min(case.height, 300))
+    check(scene_of(case, prefilter=prefilter), camera_of(case), case.background.float(), PICTURE)
+
+
+@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("lean", [False, True], ids=["all terms", "lean"])
+def test_view_colours(kind: str, lean: bool) -> None:
+    scene = replace(textured(40, 1, kind=kind), weight_bound=0.0)
+    if lean:
+        scene.surfels = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind].names}
+        scene.surfels |= lean_parameters(kind, 40, torch.float32)
+    assert check(scene, front()).mean() < 0.1 * STEP
+
+
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+def test_texels_are_fetched_within_their_tile(prefilter: str) -> None:
+    for dtype in (torch.uint8, torch.float32):
+        scene = replace(textured(60, 0, dtype), weight_bound=0.0, prefilter=prefilter)
+        # a texture unit's weights have 8 bits of fraction
+        assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
+
+
+def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded() -> None:
+    scene = replace(textured(60, 0), weight_bound=0.0)
+    blocks = [bc7_encoder("ultrafast")(page.numpy()) for page in scene.atlas]
+    height, width = scene.atlas.shape[1:3]
+    decoded = np.stack([decode_bc7(bytes(page), width, height) for page in blocks])
+    scene.atlas = torch.from_numpy(decoded)
+    scene.blocks = torch.from_numpy(
+        np.stack([np.frombuffer(bytes(page), np.uint8) for page in blocks]).reshape(
+            len(blocks), height // 4, width // 4, 16
+        )
+    )
+    assert check(scene, front()).max() < 2 * STEP
+    # nothing but the blocks is needed
+    alone = replace(scene, atlas=None, through_webgpu=True).render(front())
+    assert (alone.rgb - replace(scene, through_webgpu=True).render(front()).rgb).abs().max() == 0
+
+
+def test_more_batches_come_closer_to_the_weight_bound() -> None:
+    scene, camera = replace(textured(200, 3), weight_bound=0.05), front()
+    want = scene.render(camera).rgb
+    off = [float((webgpu.draw(scene, [camera], None, ["rgb"], n)["rgb"][0] - want).abs().mean()) for n in (1, 8, 64)]
+    assert off[0] > off[1] > off[2] and off[2] < 0.5 * STEP
+
+
+def test_surfels_of_equal_depth_are_drawn_in_their_order() -> None:
+    """A few thousand, so that the sort has several blocks."""
+    n = 3000
+    g = torch.Generator().manual_seed(0)
+    scene = replace(textured(n, 4), atlas=None, weight_bound=0.0, tiles=torch.zeros(n, 5, dtype=torch.int32))
+    scene.surfels["means"] = torch.rand(n, 3, generator=g) * 2 - 1
+    scene.surfels["means"][:, 2] = (torch.rand(n, generator=g) * 8).round() / 8
+    scene.surfels["log_scales"] = torch.full((n, 2), -3.0)
+    assert check(scene, front(), fields=PICTURE).max() < STEP
+
+
+def test_a_scene_without_surfels_and_one_far_away() -> None:
+    empty = textured(3, 0)
+    empty = replace(
+        empty,
+        surfels={k: v[:0] for k, v in empty.surfels.items()},
+        tiles=empty.tiles[:0],
+        extent=None,
+        mean_residual=None,
+    )
+    drawn = replace(empty, through_webgpu=True).render(front(), torch.tensor([0.25, 0.5, 1.0]))
+    assert (drawn.rgb == torch.tensor([0.25, 0.5, 1.0])).all() and (drawn.alpha == 0).all()
+    far = replace(textured(20, 0), weight_bound=0.0)
+    far.surfels["means"] = far.surfels["means"] + torch.tensor([4096.0, -8192.0, 2048.0])
+    camera = front()
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] -= torch.tensor([4096.0, -8192.0, 2048.0])
+    check(far, replace(camera, viewmat=viewmat))
+
+
+def test_what_was_changed_is_drawn_anew() -> None:
+    scene = replace(textured(20, 0), weight_bound=0.0, through_webgpu=True)
+    first = scene.render(front(16, 16)).rgb
+    scene.surfels["opacity_logits"] -= 3
+    assert (scene.render(front(16, 16)).rgb - first).abs().max() > 0.01
+
+
+def test_what_cannot_be_drawn_is_refused() -> None:
+    scene = replace(textured(5, 0), through_webgpu=True)
+    with pytest.raises(ValueError, match="packed"):
+        webgpu.draw(scene, [front()], None, ["packed"])
+    scene.tiles = scene.tiles.clone()
+    scene.tiles[1, 0] = 10_000
+    with pytest.raises(ValueError, match="surfel 1"):
+        scene.render(front())

@@ -10,6 +10,9 @@
 # make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
 # make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
 #              with the committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
+# make web     builds the viewer's page from web/ into bitymi_ns/view/page, which is committed: users need no Node.js
+# make web-test  checks and tests of the page's sources, and that the committed page is what they give; says that it is
+#              skipped where there is no Node.js. `make test` begins with it
 # make lint    ruff and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
@@ -37,7 +40,7 @@ CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test gate gate-accept wheel-test sanitize clang-test baseline-test bench lint format clean
+.PHONY: setup demo test gate gate-accept wheel-test sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -85,8 +88,25 @@ $(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(wildcard cmake/*.cmak
 demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash scripts/demo.sh $(if $(DATA),"$(DATA)")
 
-test: setup
+test: setup web-test
 	BITYMI_TESTS_REQUIRE=emulated $(BIN)/python -m pytest -q
+
+# npm records in node_modules what it installed from which lock file.
+web/node_modules/.package-lock.json: web/package-lock.json
+	cd web && npm ci --loglevel=error --no-fund --no-audit
+	@touch $@
+
+web: web/node_modules/.package-lock.json
+	cd web && npm run --silent build
+
+web-test:
+	@if command -v npm >/dev/null; then $(MAKE) --no-print-directory web-test-here; \
+	  else echo "web-test is skipped: no npm found (on Debian and Ubuntu: apt install nodejs npm)"; fi
+
+web-test-here: web/node_modules/.package-lock.json
+	cd web && npm run --silent check && npm run --silent test && npx --no vite build --logLevel error --outDir "$(CURDIR)/build/page"
+	diff -r build/page bitymi_ns/view/page || { \
+	  echo "bitymi_ns/view/page is not what web/ gives: run make web, and commit it" >&2; exit 1; }
 
 gate gate-accept: setup
 	$(BIN)/python benchmarks/gate.py $(if $(DATA),--capture "$(DATA)") $(if $(filter %-accept,$@),--accept)

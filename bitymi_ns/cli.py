@@ -233,6 +233,52 @@ class Verify:
         return 1 if failed else 0
 
 
+@dataclass
+class View:
+    """Show a bundle in the browser; or write it with its page as a folder, which any web server can send."""
+
+    bundle: tyro.conf.Positional[Path]
+    """Folder of the bundle."""
+    export: Path | None = None
+    """Folder to write the page and the bundle to; none = show it now."""
+    overwrite: Flag = False
+    """Replace a page that was exported there before."""
+    host: str = "127.0.0.1"
+    """Address to listen at. Any other than a loopback address shows the bundle to everyone who can reach this
+    machine."""
+    port: int = 0
+    """Port to listen at; 0 = any that is free."""
+    open_browser: bool = True
+    """Open the page in the browser."""
+
+    def run(self) -> int:
+        import webbrowser
+
+        from bitymi_ns import view
+        from bitymi_ns.files import size_text
+
+        site = view.site_of(self.bundle)
+        if self.export is not None:
+            with explained(self.export, ValueError):
+                size = view.write_static(site, self.export, self.overwrite)
+            print(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
+            return 0
+        server = view.serve(site, self.host, self.port)
+        address = view.address_of(server)
+        if not view.is_loopback(self.host):
+            print(f"Everyone who can reach this machine sees {self.bundle} now.", file=sys.stderr)
+        print(f"Showing {self.bundle} at {address} until Ctrl-C", flush=True)
+        if self.open_browser:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            return 0
+        finally:
+            server.server_close()
+        return 0
+
+
 Command = (
     Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Sfm, tyro.conf.subcommand(name="sfm")]
@@ -240,6 +286,7 @@ Command = (
     | Annotated[Stability, tyro.conf.subcommand(name="stability")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Verify, tyro.conf.subcommand(name="verify")]
+    | Annotated[View, tyro.conf.subcommand(name="view")]
 )
 
 

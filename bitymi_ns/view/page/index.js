@@ -1,0 +1,734 @@
+function e(e){let t=document.getElementById(e);if(!t)throw Error(`index.html has no element ${e}`);return t}var t=(e,t)=>e.setAttribute(`aria-pressed`,String(t)),n=e=>e.getAttribute(`aria-pressed`)===`true`,r=class extends Error{title;advice;constructor(e,t,n){super(t),this.title=e,this.advice=n}},i=`Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas.`,a=class extends r{constructor(e){super(`This bundle is damaged`,e,i)}},o=e=>(e/1e6).toFixed(1);function s(t,n){e(`page-progress`).value=n?t/n:0,e(`page-text`).textContent=`${o(t)} of ${o(n)} MB`}function c(t){let n=t instanceof r,i=t instanceof Error?t.message:String(t);e(`page-title`).textContent=n?t.title:`The viewer stopped`,e(`page-text`).textContent=i,e(`page-advice`).textContent=n?t.advice:`Reload the page to try again.`,e(`page-progress`).hidden=!0;for(let t of[`top`,`panel`,`menu`])e(t).hidden=!0;e(`page`).hidden=!1,document.documentElement.dataset.state=`error`}function l(){e(`page`).hidden=!0;for(let t of[`top`,`panel`,`menu`])e(t).hidden=!1;document.documentElement.dataset.state=`ready`}function u(t){let n=e(`notice`);n.textContent=t,n.hidden=!1,setTimeout(()=>n.hidden=!0,8e3)}var d=(e,t)=>[e[0]+t[0],e[1]+t[1],e[2]+t[2]],f=(e,t)=>[e[0]-t[0],e[1]-t[1],e[2]-t[2]],p=(e,t)=>[e*t[0],e*t[1],e*t[2]],m=(e,t)=>e[0]*t[0]+e[1]*t[1]+e[2]*t[2],h=(e,t)=>[e[1]*t[2]-e[2]*t[1],e[2]*t[0]-e[0]*t[2],e[0]*t[1]-e[1]*t[0]],g=e=>Math.hypot(...e),_=e=>p(1/Math.max(g(e),1e-12),e);function v(e,t,n){let[r,i]=[Math.cos(n),Math.sin(n)];return d(d(p(r,e),p(i,h(t,e))),p((1-r)*m(t,e),t))}var y=/^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/,b=1e5,x=e=>typeof e==`number`&&Number.isFinite(e);function ee(e){if(typeof e!=`object`||!e)return null;let t=e,[n,r,i,a,o,s,c]=[t.viewmat,t.fx,t.fy,t.cx,t.cy,t.width,t.height];if(!Array.isArray(n)||n.length!==16||!n.every(x)||![r,i,a,o,s,c].every(x)||typeof t.name!=`string`)return null;let l={fx:r,fy:i,cx:a,cy:o,width:s,height:c};if(!(l.fx>0&&l.fy>0&&l.width>=1&&l.height>=1))return null;let[u,f,m]=[0,4,8].map(e=>n.slice(e,e+3)),h=d(d(p(n[3],u),p(n[7],f)),p(n[11],m)),g=typeof t.photograph==`string`&&y.test(t.photograph)?t.photograph:null;return{name:t.name.slice(0,200),heldOut:t.held_out===!0,pose:{position:p(-1,h),right:u,down:f,forward:m},lens:l,photograph:g}}function te(e){let t;try{t=JSON.parse(e)}catch{return[]}let n=t?.cameras;return Array.isArray(n)?n.slice(0,b).map(ee).filter(e=>e!==null):[]}function ne(e){let t=[0,0,0,0,0,0,0,0,0],n=[0,0,0];for(let{pose:r}of e){let e=r.forward;for(let n=0;n<3;n++)for(let r=0;r<3;r++)t[3*n+r]+=+(n===r)-e[n]*e[r];n=d(n,f(r.position,p(m(e,r.position),e)))}let r=e=>[t[e],t[3+e],t[6+e]],i=(e,t,n)=>e[0]*(t[1]*n[2]-t[2]*n[1])+e[1]*(t[2]*n[0]-t[0]*n[2])+e[2]*(t[0]*n[1]-t[1]*n[0]),a=i(r(0),r(1),r(2));return Math.abs(a)>1e-4*e.length**3?[i(n,r(1),r(2))/a,i(r(0),n,r(2))/a,i(r(0),r(1),n)/a]:null}var S=class e{pose;fx;fy;cx;cy;width;height;constructor(e,t,n,r,i,a,o){this.pose=e,this.fx=t,this.fy=n,this.cx=r,this.cy=i,this.width=a,this.height=o}scaledTo(t,n){let[r,i]=[t/this.width,n/this.height];return new e(this.pose,this.fx*r,this.fy*i,this.cx*r,this.cy*i,t,n)}static contain(t,n,r,i){let a=Math.min(r/n.width,i/n.height),o=r/2+a*(n.cx-n.width/2),s=i/2+a*(n.cy-n.height/2);return new e(t,a*n.fx,a*n.fy,o,s,r,i)}},C={fx:1e3,fy:1e3,cx:500,cy:500,width:1e3,height:1e3};function re(e,t,n){let r=_(f(t,e)),i=h(r,n),a=_(g(i)>1e-6?i:h(r,[n[1],n[2],n[0]]));return{position:e,right:a,down:h(r,a),forward:r}}function w(e,t,n){return{position:e.position,right:v(e.right,t,n),down:v(e.down,t,n),forward:v(e.forward,t,n)}}var ie=.998;function ae(e,t,n){let r=Math.abs(m(e.forward,t));return r<ie||Math.abs(m(v(e.forward,e.right,n),t))<r}function T(e,t,n,r){let i=w(e,t,-n);return ae(i,t,r)?w(i,i.right,r):i}function oe(e,t,n,r,i){let a=f(e.position,t),o=[m(a,e.right),m(a,e.down),m(a,e.forward)],s=T(e,n,r,i),c=d(d(p(o[0],s.right),p(o[1],s.down)),p(o[2],s.forward));return{...s,position:d(t,c)}}function E(e,t,n,r){let i=d(d(p(t,e.right),p(n,e.down)),p(r,e.forward));return{...e,position:d(e.position,i)}}function se(e,t){return w(e,e.forward,t)}var ce=class{surface;pose;target;up;size;changed;mode=`orbit`;pointers=new Map;held=new Set;last=0;constructor(e,t,n,r,i,a){this.surface=e,this.pose=t,this.target=n,this.up=r,this.size=i,this.changed=a,e.addEventListener(`pointerdown`,t=>{e.setPointerCapture(t.pointerId),this.pointers.set(t.pointerId,{x:t.clientX,y:t.clientY})});for(let t of[`pointerup`,`pointercancel`])e.addEventListener(t,e=>this.pointers.delete(e.pointerId));e.addEventListener(`pointermove`,e=>this.drag(e)),e.addEventListener(`contextmenu`,e=>e.preventDefault()),e.addEventListener(`wheel`,e=>{e.preventDefault(),this.approach(Math.exp(-e.deltaY*(e.deltaMode===1?.05:.0015)))},{passive:!1}),e.addEventListener(`keydown`,e=>{e.ctrlKey||e.metaKey||e.altKey||!D[e.code]||(e.preventDefault(),this.held.add(e.code),this.changed())}),e.addEventListener(`keyup`,e=>this.held.delete(e.code)),e.addEventListener(`blur`,()=>this.held.clear())}distance(){return Math.max(g(f(this.target,this.pose.position)),.001*this.size)}drag(e){let t=this.pointers.get(e.pointerId);if(!t)return;let[n,r]=[e.clientX-t.x,e.clientY-t.y],i=[...this.pointers].filter(([t])=>t!==e.pointerId).map(([,e])=>e);this.pointers.set(e.pointerId,{x:e.clientX,y:e.clientY});let a=Math.min(this.surface.clientWidth,this.surface.clientHeight);if(i.length===1){let o=e=>Math.hypot(e.x-i[0].x,e.y-i[0].y);this.slide(n/2/a,r/2/a),this.approach(o({x:e.clientX,y:e.clientY})/Math.max(o(t),1))}else e.buttons&6||e.shiftKey?this.slide(n/a,r/a):this.turn(n/a*3,r/a*3)}turn(e,t){this.mode===`orbit`?this.pose=oe(this.pose,this.target,this.up,-e,-t):this.lookBy(-e/2,-t/2),this.changed()}lookBy(e,t){let n=this.distance();this.pose=T(this.pose,this.up,e,-t),this.target=E(this.pose,0,0,n).position}slide(e,t){let n=this.mode===`orbit`?this.distance():this.size;this.step(-e*n,-t*n,0)}approach(e){let t=this.distance();this.mode===`orbit`?this.pose=E(this.pose,0,0,t-t/e):this.step(0,0,Math.log(e)*.5*this.size),this.changed()}step(e,t,n){let r=this.pose.position;this.pose=E(this.pose,e,t,n),this.target=d(this.target,f(this.pose.position,r)),this.changed()}advance(e){let t=Math.min(.1,(e-this.last)/1e3);if(this.last=e,!this.held.size)return!1;let n=this.held.has(`ShiftLeft`)||this.held.has(`ShiftRight`)?4:1;for(let e of this.held){let[r,i,a,o,s,c]=D[e],l=.35*this.size*t*n;(r||i||a)&&this.step(r*l,i*l,a*l),(o||s)&&this.lookBy(o*t,-s*t),c&&(this.pose=se(this.pose,c*t))}return this.changed(),!0}},D={KeyW:[0,0,1,0,0,0],KeyS:[0,0,-1,0,0,0],KeyA:[-1,0,0,0,0,0],KeyD:[1,0,0,0,0,0],KeyQ:[0,1,0,0,0,0],KeyE:[0,-1,0,0,0,0],ArrowLeft:[0,0,0,-1,0,0],ArrowRight:[0,0,0,1,0,0],ArrowUp:[0,0,0,0,1,0],ArrowDown:[0,0,0,0,-1,0],KeyZ:[0,0,0,0,0,-1],KeyX:[0,0,0,0,0,1],ShiftLeft:[0,0,0,0,0,0],ShiftRight:[0,0,0,0,0,0]},le=1e3/60,ue=.2,de=class{scale=1;milliseconds=0;took(e){this.milliseconds=this.milliseconds?.7*this.milliseconds+.3*e:e;let t=this.scale*Math.sqrt(.85*le/Math.max(this.milliseconds,.5)),n=Math.min(1,Math.max(ue,t));Math.abs(n-this.scale)>.12*this.scale&&(this.scale=Math.round(20*(.5*this.scale+.5*n))/20,this.milliseconds=0)}},O=`// Where batch k of \`layers\` begins in the sorted list of \`count\` visible surfels.
+fn layer_begin(count: u32, k: u32, layers: u32) -> u32 {
+  return count / layers * k + min(k, count % layers);
+}
+`,fe=`// The rectangle on the screen that holds what a surfel can touch: the level set sigma = 1/255 of the kernel and that of
+// the low pass. As core/plane_bounds.h, but along the axes of the surfel's own image, because a rasterizer draws any
+// rectangle: a needle across the screen then costs what it covers.
+
+struct Rectangle {
+  visible: bool,
+  whole: bool,  // the disc comes near the camera plane: anything on the screen
+  axis: vec2f,
+  middle: vec2f,
+  half_size: vec2f,
+}
+
+const BOUND_PAD: f32 = 0.02;  // pixels
+const WIDEST: f32 = 1e5;  // pixels, beyond which the whole screen is drawn
+
+// Squared radius in scale units at which the kernel is exp(-level) of its centre, a little wide.
+fn level_radius2(level: f32, beta: f32) -> f32 {
+  return SUPPORT2 * min(1.0, (1.0 - exp(-level / max(beta, 1e-6))) * 1.0002 + 4e-6);
+}
+
+// The larger principal axis of the ellipse that is the image of the unit circle under [p q].
+fn major_axis(p: vec2f, q: vec2f) -> vec2f {
+  let angle = 0.5 * atan2(2.0 * (p.x * p.y + q.x * q.y), p.x * p.x + q.x * q.x - p.y * p.y - q.y * q.y);
+  return vec2f(cos(angle), sin(angle));
+}
+
+// How far the image of the disc reaches along \`e\`: x = P.q / (1 + C.q) on the unit disc, \`rest\` = 1 - |C|^2.
+fn reach(e: vec2f, p: vec2f, q: vec2f, c: vec2f, rest: f32) -> vec2f {
+  let along = vec2f(dot(e, p), dot(e, q));
+  let pc = dot(along, c);
+  let h = sqrt(pc * pc + rest * dot(along, along));
+  return vec2f(-pc - h, h - pc) / rest;
+}
+
+fn finish(axis: vec2f, along: vec2f, across: vec2f) -> Rectangle {
+  var r: Rectangle;
+  r.visible = true;
+  r.axis = axis;
+  r.middle = 0.5 * vec2f(along.x + along.y, across.x + across.y);
+  r.half_size = 0.5 * vec2f(along.y - along.x, across.y - across.x) * 1.0002 + BOUND_PAD;
+  r.whole = !(max(r.half_size.x, r.half_size.y) < WIDEST);
+  return r;
+}
+
+fn rectangle(s: Seen) -> Rectangle {
+  var r: Rectangle;
+  let ratio = s.opacity / ALPHA_MIN;
+  if ratio < 1.0 - 1e-6 { return r; }
+  let level = max(log(ratio), 0.0) + 1e-5;
+  let r2 = level_radius2(level, s.beta);
+  // where the kernel is larger than the low pass everywhere, the low pass needs no room
+  let least = s.w0 - LOW_PASS_REACH * (abs(s.w.x) + abs(s.w.y));
+  let slope = dot(s.u, s.u) + dot(s.v, s.v);
+  let covered = least > 0.0
+    && SUPPORT2 * least * least >= (s.beta + LOW_PASS_REACH * LOW_PASS_REACH) * 1.001 * slope;
+  var blur = 0.0;
+  if !covered { blur = sqrt(level) + 0.01; }
+  if !(s.w0 > 0.0) {  // seen exactly edge-on: no ray hits it
+    return finish(vec2f(1.0, 0.0), vec2f(-blur, blur), vec2f(-blur, blur));
+  }
+  let mu = 1.0 / max(abs(s.u.x), abs(s.u.y));
+  let mv = 1.0 / max(abs(s.v.x), abs(s.v.y));
+  let u = s.u * mu;
+  let v = s.v * mv;
+  let det = u.x * v.y - u.y * v.x;
+  r.visible = true;
+  r.whole = true;
+  if !(abs(det) > 1e-6) { return r; }
+  let wide = sqrt(r2) * (1.0001 + 1e-6 / abs(det)) / det;
+  let p = s.w0 * mu * wide * vec2f(v.y, -v.x);
+  let q = s.w0 * mv * wide * vec2f(-u.y, u.x);
+  let c = vec2f(s.w.y * v.x - s.w.x * v.y, s.w.x * u.y - s.w.y * u.x) * vec2f(mu, mv) * wide;
+  let rest = 1.0 - dot(c, c);
+  if !(rest > 1e-3 && dot(p, p) + dot(q, q) < 1e12) { return r; }
+  let axis = major_axis(p, q);
+  let along = reach(axis, p, q, c, rest);
+  let across = reach(vec2f(-axis.y, axis.x), p, q, c, rest);
+  return finish(
+    axis,
+    vec2f(min(along.x, -blur), max(along.y, blur)),
+    vec2f(min(across.x, -blur), max(across.y, blur)),
+  );
+}
+
+fn filter_variance(beta: f32) -> f32 {
+  return PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
+}
+
+// Seen through a pixel: the ellipse of the largest blur and magnification that any pixel can have (core/bounds.h).
+fn filtered_rectangle(s: Seen) -> Rectangle {
+  var r: Rectangle;
+  let ratio = s.opacity / ALPHA_MIN;
+  if !(s.w0 > 0.0) || !(ratio > 1.0) { return r; }
+  let c = filter_variance(s.beta);
+  let e = vec2f(s.w.x * s.v.y - s.w.y * s.v.x, s.u.x * s.w.y - s.u.y * s.w.x);
+  let eta = SUPPORT * length(e) * s.area / s.w0 * 1.001;
+  r.visible = true;
+  r.whole = true;
+  if !(eta < 0.9) { return r; }
+  let w = 1.0 / (1.0 - eta);
+  let p = w * s.area * vec2f(s.u.y, -s.u.x);
+  let q = w * s.area * vec2f(s.v.y, -s.v.x);
+  let area = w * w * s.area * s.w0;
+  let det = area * area + c * (dot(p, p) + dot(q, q) + c);
+  let level = log(ratio * area / sqrt(det)) + 1e-4;
+  r.visible = level >= 0.0;
+  if !r.visible { return r; }
+  let r2 = level_radius2(level, s.beta);
+  let axis = major_axis(p, q);
+  let other = vec2f(-axis.y, axis.x);
+  let along = sqrt(r2 * (dot(axis, p) * dot(axis, p) + dot(axis, q) * dot(axis, q) + c)) * 1.001;
+  let across = sqrt(r2 * (dot(other, p) * dot(other, p) + dot(other, q) * dot(other, q) + c)) * 1.001;
+  return finish(axis, vec2f(-along, along), vec2f(-across, across));
+}
+
+// Whether the rectangle meets the image.
+fn on_screen(s: Seen, r: Rectangle, size: vec2f) -> bool {
+  if !r.visible { return false; }
+  if r.whole { return true; }
+  let box = abs(r.axis) * r.half_size.x + abs(r.axis.yx) * r.half_size.y;
+  let at = s.center + r.axis * r.middle.x + vec2f(-r.axis.y, r.axis.x) * r.middle.y;
+  return all(at + box >= vec2f(0.0)) && all(at - box <= size);
+}
+`,pe=`// Draws a batch of surfels, nearest first, each as a rectangle, into a target that holds the sums of a pixel and, in
+// alpha, the transmittance that is left. The blending unit does the rest of core/blend.h:
+//   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
+//
+// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of the residual, the
+// end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
+// closer; what it costs in the picture is in docs/viewer.md.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
+@group(0) @binding(2) var<storage, read> seen: array<Seen>;
+@group(0) @binding(3) var<storage, read> order: array<u32>;
+@group(0) @binding(4) var<storage, read> visible: u32;
+@group(1) @binding(0) var atlas: texture_2d_array<f32>;
+@group(1) @binding(1) var bilinear: sampler;
+@group(2) @binding(0) var<uniform> layer: vec4u;  // which batch
+@group(2) @binding(1) var before: texture_2d<f32>;  // the target before this batch
+
+struct Corner {
+  @builtin(position) position: vec4f,
+  @location(0) @interpolate(flat) center_u: vec4f,
+  @location(1) @interpolate(flat) v_w: vec4f,
+  @location(2) @interpolate(flat) w0_z_opacity_beta: vec4f,
+  @location(3) @interpolate(flat) color_area: vec4f,
+  @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile the residual
+  @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z
+}
+
+@vertex
+fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance: u32) -> Corner {
+  let i = order[layer_begin(visible, layer.x, frame.layers) + instance];
+  let s = seen[i];
+  let surfel = surfels[i];
+  let side = vec2f(f32(vertex & 1) * 2.0 - 1.0, f32(vertex >> 1) * 2.0 - 1.0);
+  var at = side;
+  if s.half_size.x >= 0.0 {
+    let offset = s.middle + side * s.half_size;
+    let pixel = s.center + s.axis * offset.x + vec2f(-s.axis.y, s.axis.x) * offset.y;
+    at = (pixel / frame.size * 2.0 - 1.0) * vec2f(1.0, -1.0);
+  }
+  var out: Corner;
+  out.position = vec4f(at, 0.0, 1.0);
+  out.center_u = vec4f(s.center, s.u);
+  out.v_w = vec4f(s.v, s.w);
+  out.w0_z_opacity_beta = vec4f(s.w0, s.z, s.opacity, s.beta);
+  out.color_area = vec4f(s.color, s.area);
+  if surfel.sides == 0 {
+    out.tile = vec4f(surfel.residual, 0.0);
+    out.texel = vec4f(-1.0, 0.0, s.normal_z, 0.0);
+  } else {
+    let sides = vec2f(f32(surfel.sides & 0xffff), f32(surfel.sides >> 16));
+    out.tile = vec4f(vec2f(surfel.tile), sides - 1.0);
+    out.texel = vec4f(f32(surfel.layer), 0.5 / surfel.extent, s.normal_z, 0.0);
+  }
+  return out;
+}
+
+struct Fragment {
+  at: vec2f,  // u, v
+  depth: f32,
+  sigma: f32,
+}
+
+// core/kernel.h
+fn beta_fragment(c: Corner, d: vec2f) -> Fragment {
+  let w0 = c.w0_z_opacity_beta.x;
+  let z = c.w0_z_opacity_beta.y;
+  let w = w0 + dot(c.v_w.zw, d);
+  let hit = w > 0.0 && w0 * z > frame.near * w;
+  let inverse = 1.0 / select(1.0, w, hit);
+  let at = select(vec2f(0.0), vec2f(dot(c.center_u.zw, d), dot(c.v_w.xy, d)) * inverse, hit);
+  let rest = 1.0 - dot(at, at) / SUPPORT2;
+  let inside = hit && rest > 0.0;
+  let kernel = select(0.0, exp2(c.w0_z_opacity_beta.w * log2(select(1.0, rest, inside))), inside);
+  let blur = exp(-dot(d, d));
+  var f: Fragment;
+  f.at = clamp(at, vec2f(-SUPPORT), vec2f(SUPPORT));
+  f.depth = select(w0 * z * inverse, z, blur > kernel);
+  f.sigma = min(ALPHA_MAX, c.w0_z_opacity_beta.z * max(kernel, blur));
+  return f;
+}
+
+// core/prefilter.h
+fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
+  let w0 = c.w0_z_opacity_beta.x;
+  let z = c.w0_z_opacity_beta.y;
+  let beta = c.w0_z_opacity_beta.w;
+  let n = c.color_area.w;
+  let variance = PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
+  let a = n * vec4f(c.center_u.zw, c.v_w.xy);
+  let spread = dot(a, a);
+  let tilt = dot(c.v_w.zw, d);
+  let uv = vec2f(dot(c.center_u.zw, d), dot(c.v_w.xy, d));
+  let r = length(uv);
+  let outside = r > SUPPORT * (w0 + tilt);
+  let omega = select(w0 + tilt, r, outside) / select(w0, r - SUPPORT * tilt, outside);
+  let w2 = omega * omega;
+  let covered = w2 * n * w0;
+  let denominator = covered * covered + (variance * spread * w2 + variance * variance);
+  let q = (w2 * dot(n * uv, n * uv) + variance * dot(d, d)) / denominator;
+  let rest = 1.0 - q / SUPPORT2;
+  let inside = rest > 0.0 && z > frame.near * omega;
+  let kernel = select(0.0, exp2(beta * log2(select(1.0, rest, inside))), inside);
+  var f: Fragment;
+  f.at = clamp(uv / (w0 * omega), vec2f(-SUPPORT), vec2f(SUPPORT));
+  f.depth = z / omega;
+  f.sigma = min(ALPHA_MAX, c.w0_z_opacity_beta.z * covered / sqrt(denominator) * kernel);
+  return f;
+}
+
+fn residual(c: Corner, at: vec2f) -> vec3f {
+  if c.texel.x < 0.0 { return c.tile.xyz; }
+  let span = c.tile.zw;
+  let texel = c.tile.xy + clamp(at * (span + 1.0) * c.texel.y + 0.5 * span, vec2f(0.0), span) + 0.5;
+  return frame.offset + frame.scale * textureSampleLevel(atlas, bilinear, texel / frame.atlas, u32(c.texel.x), 0.0).rgb;
+}
+
+@fragment
+fn surfel(c: Corner) -> @location(0) vec4f {
+  let d = c.position.xy - c.center_u.xy;
+  var f: Fragment;
+  if c.color_area.w > 0.0 { f = filtered_fragment(c, d); } else { f = beta_fragment(c, d); }
+  if f.sigma < ALPHA_MIN { discard; }
+  var front = 1.0;
+  if layer.x > 0 { front = textureLoad(before, vec2i(c.position.xy), 0).a; }
+  if front < TRANSMITTANCE_MIN { discard; }
+  let textured = frame.residuals != 0 && f.sigma * front >= frame.weight_bound;
+  switch frame.show {
+    case SHOW_DEPTH: { return vec4f(f.sigma * f.depth, f.sigma * c.w0_z_opacity_beta.w, f.sigma, f.sigma); }
+    case SHOW_NORMAL: {
+      return vec4f(f.sigma * vec3f(-c.v_w.zw * frame.lens.xy, c.texel.z), f.sigma);
+    }
+    case SHOW_OVERDRAW: { return vec4f(1.0, 0.0, 0.0, f.sigma); }
+    case SHOW_RESIDUAL: {
+      var shift = vec3f(0.0);
+      if textured { shift = residual(c, f.at); }
+      return vec4f(f.sigma * max(shift + 0.5, vec3f(0.0)), f.sigma);
+    }
+    default: {
+      var color = c.color_area.xyz;
+      if textured { color = max(color + residual(c, f.at), vec3f(0.0)); }
+      return vec4f(f.sigma * color, f.sigma);
+    }
+  }
+}
+`,me=`// One thread per surfel: its projection, view colour, rectangle, and the key by which it is sorted.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
+@group(0) @binding(3) var<storage, read_write> seen: array<Seen>;
+@group(0) @binding(4) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(5) var<storage, read_write> order: array<u32>;
+@group(0) @binding(6) var<storage, read_write> visible: atomic<u32>;
+
+const HIDDEN: u32 = 0xffffffff;
+
+fn to_camera(a: vec3f) -> vec3f {
+  return vec3f(dot(frame.rotation[0].xyz, a), dot(frame.rotation[1].xyz, a), dot(frame.rotation[2].xyz, a));
+}
+
+fn finite(x: vec4f) -> bool {
+  return all(abs(x) < vec4f(3e38));
+}
+
+@compute @workgroup_size(64)
+fn prepare(@builtin(global_invocation_id) id: vec3u) {
+  let i = id.x;
+  if i >= frame.surfels { return; }
+  order[i] = i;
+  keys[i] = HIDDEN;
+  let surfel = surfels[i];
+  let p = to_camera(surfel.mean - frame.center.xyz);
+  if !(p.z > frame.near) { return; }
+
+  let h = surfel.quat;  // w, x, y, z of unit length
+  let t_u = vec3f(1.0 - 2.0 * (h.z * h.z + h.w * h.w), 2.0 * (h.y * h.z + h.x * h.w), 2.0 * (h.y * h.w - h.x * h.z));
+  let t_v = vec3f(2.0 * (h.y * h.z - h.x * h.w), 1.0 - 2.0 * (h.y * h.y + h.w * h.w), 2.0 * (h.z * h.w + h.x * h.y));
+  let t_n = vec3f(2.0 * (h.y * h.w + h.x * h.z), 2.0 * (h.z * h.w - h.x * h.y), 1.0 - 2.0 * (h.y * h.y + h.z * h.z));
+  let a = to_camera(t_u);
+  let b = to_camera(t_v);
+  let n = to_camera(t_n);
+  let np = dot(n, p);
+  let turn = select(1.0, -1.0, np < 0.0);
+  let iz = 1.0 / p.z;
+  let inverse_focal = 1.0 / frame.lens.xy;
+  let scales = exp(clamp(surfel.log_scale, vec2f(-LOG_SCALE_MAX), vec2f(LOG_SCALE_MAX)));
+
+  var s: Seen;
+  s.center = frame.lens.xy * p.xy * iz + frame.lens.zw;
+  s.u = -turn * cross(p, b).xy * inverse_focal / scales.x;
+  s.v = turn * cross(p, a).xy * inverse_focal / scales.y;
+  s.w0 = turn * np * iz;
+  s.w = turn * n.xy * inverse_focal;
+  s.z = p.z;
+  s.opacity = sigmoid(surfel.opacity_logit);
+  s.beta = BETA_MAX * sigmoid(surfel.beta_raw);
+  s.normal_z = -turn * n.z;
+  let area = frame.lens.x * frame.lens.y * scales.x * scales.y * iz * iz;
+  s.area = select(0.0, area, frame.through_pixel != 0 && area < 1e12);
+  if !finite(vec4f(s.center, s.w0, s.area)) || !finite(vec4f(s.u, s.v)) { return; }
+
+  var r: Rectangle;
+  if s.area > 0.0 { r = filtered_rectangle(s); } else { r = rectangle(s); }
+  if !on_screen(s, r, frame.size) { return; }
+  s.axis = r.axis;
+  s.middle = r.middle;
+  s.half_size = select(r.half_size, vec2f(-1.0), r.whole);
+  let direction = unit(surfel.mean - frame.color_center.xyz);
+  s.color = max(view_color(frame.kind, surfel, direction) + COLOR_BIAS, vec3f(0.0));
+  seen[i] = s;
+  keys[i] = bitcast<u32>(p.z);  // positive floats are ordered as their bits are
+  atomicAdd(&visible, 1u);
+}
+`,he=`// Shows what was drawn (draw.wgsl) on the screen: over the background, or as a map in colours.
+
+struct Screen {
+  background: vec4f,
+  size: vec2f,  // of the screen's part, pixels
+  show: u32,  // SHOW_*
+  most: f32,  // of a map: the value of the last colour
+}
+
+@group(0) @binding(0) var<uniform> screen: Screen;
+@group(0) @binding(1) var sums: texture_2d<f32>;
+@group(0) @binding(2) var smooth_sampler: sampler;
+
+@vertex
+fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
+  return vec4f(f32(vertex & 1) * 4.0 - 1.0, f32(vertex >> 1) * 4.0 - 1.0, 0.0, 1.0);
+}
+
+// From dark blue over green and yellow to red.
+fn ramp(x: f32) -> vec3f {
+  let t = clamp(x, 0.0, 1.0);
+  let stops = array<vec3f, 5>(
+    vec3f(0.10, 0.10, 0.25), vec3f(0.13, 0.42, 0.62), vec3f(0.25, 0.68, 0.45), vec3f(0.93, 0.80, 0.30),
+    vec3f(0.83, 0.22, 0.16),
+  );
+  let at = t * 4.0;
+  let k = min(u32(at), 3u);
+  return mix(stops[k], stops[k + 1], at - f32(k));
+}
+
+@fragment
+fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let s = textureSampleLevel(sums, smooth_sampler, position.xy / screen.size, 0.0);
+  let covered = 1.0 - s.a;
+  switch screen.show {
+    case SHOW_DEPTH: {
+      let depth = s.r / max(covered, 1e-4);
+      return vec4f(mix(screen.background.rgb, ramp(1.0 - depth / screen.most), covered), 1.0);
+    }
+    case SHOW_NORMAL: { return vec4f(mix(screen.background.rgb, s.rgb / max(covered, 1e-4) * 0.5 + 0.5, covered), 1.0); }
+    case SHOW_OVERDRAW: { return vec4f(ramp(s.r / screen.most), 1.0); }
+    default: { return vec4f(s.rgb + s.a * screen.background.rgb, 1.0); }
+  }
+}
+`,k=`// What the shaders of a baked scene share: its numbers, its surfels, and what a frame is drawn with.
+//
+// These files are the renderer for every screen: the browser's viewer and the package's \`webgpu\` renderer put them
+// together and run them. The formulas are those of csrc/core; its files say why they are as they are.
+
+const SUPPORT: f32 = 3.0;
+const SUPPORT2: f32 = 9.0;
+const ALPHA_MAX: f32 = 0.99;
+const ALPHA_MIN: f32 = 0.00392156862745098;
+const TRANSMITTANCE_MIN: f32 = 1e-4;
+const LOW_PASS_REACH: f32 = 2.36;
+const BETA_MAX: f32 = 4.0;
+const LOG_SCALE_MAX: f32 = 30.0;
+const COLOR_BIAS: f32 = 0.5;
+const PIXEL_VARIANCE: f32 = 0.25;
+
+// A surfel as it is stored, 96 bytes. Means are relative to the scene's origin.
+struct Surfel {
+  mean: vec3f,
+  opacity_logit: f32,
+  quat: vec4f,  // wxyz, unit
+  log_scale: vec2f,
+  beta_raw: f32,
+  extent: f32,  // half side of the tile, scale units
+  residual: vec3f,  // of a surfel without a tile
+  layer: u32,
+  base: vec3f,  // view colour: base, and its terms
+  first_term: u32,
+  tile: vec2u,  // first texel
+  sides: u32,  // texels along u, and along v in the upper half; 0: no tile
+  terms: u32,
+}
+
+// A surfel as a camera sees it, 96 bytes; core/surfel.h has the planes U, V and W.
+struct Seen {
+  center: vec2f,  // pixels
+  u: vec2f,
+  v: vec2f,
+  w: vec2f,  // w1, w2
+  w0: f32,
+  z: f32,
+  opacity: f32,
+  beta: f32,
+  color: vec3f,  // relu(f_view + 0.5)
+  area: f32,  // 0, or where the surfel is seen through a pixel
+  axis: vec2f,  // of the rectangle that holds it on the screen, a unit vector
+  middle: vec2f,  // of the rectangle, along the axis and across, pixels from \`center\`
+  half_size: vec2f,  // x < 0: the whole screen
+  normal_z: f32,
+  unused: f32,
+}
+
+struct Frame {
+  rotation: array<vec4f, 3>,  // rows, world to camera
+  center: vec4f,  // where the camera stands, relative to the scene's origin
+  color_center: vec4f,  // from where view colours are seen; \`center\`, unless they are held
+  lens: vec4f,  // fx, fy, cx, cy
+  size: vec2f,  // pixels
+  near: f32,
+  weight_bound: f32,
+  offset: f32,  // residual = offset + scale * texel
+  scale: f32,
+  atlas: vec2f,  // size of a page, texels
+  surfels: u32,
+  kind: u32,  // of the view colours, VIEW_*
+  through_pixel: u32,
+  layers: u32,  // batches of surfels that are drawn one after the other
+  show: u32,  // SHOW_*
+  residuals: u32,  // whether they are added
+  unused: vec2u,
+}
+
+// What is blended: see draw.wgsl.
+const SHOW_COLOR: u32 = 0;
+const SHOW_DEPTH: u32 = 1;
+const SHOW_NORMAL: u32 = 2;
+const SHOW_OVERDRAW: u32 = 3;
+const SHOW_RESIDUAL: u32 = 4;
+
+fn sigmoid(x: f32) -> f32 {
+  let e = exp(-abs(x));
+  return select(1.0, e, x < 0.0) / (1.0 + e);
+}
+`,ge=`// The visible surfels, front to back, are drawn in batches of equal size; this fills in how many each has.
+
+struct Draw {
+  vertices: u32,
+  instances: u32,
+  first_vertex: u32,
+  first_instance: u32,
+}
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> visible: u32;
+@group(0) @binding(2) var<storage, read_write> draws: array<Draw>;
+
+@compute @workgroup_size(64)
+fn share_out(@builtin(global_invocation_id) id: vec3u) {
+  let k = id.x;
+  if k >= frame.layers { return; }
+  draws[k] = Draw(4, layer_begin(visible, k + 1, frame.layers) - layer_begin(visible, k, frame.layers), 0, 0);
+}
+`,_e=`// Sorts (key, value) pairs by 4 bits of the key, lowest first; eight rounds sort them all. It is stable, so surfels of
+// equal depth keep their order. Three kernels per round; none waits for another group of its own launch, because
+// devices differ in whether that ever ends.
+//
+//   count    how often every digit occurs in every block of 1,024 keys
+//   scan     where the pairs of every digit and block begin
+//   scatter  moves them there
+
+const THREADS: u32 = 256;
+const PER_THREAD: u32 = 4;
+const BLOCK: u32 = 1024;
+const DIGITS: u32 = 16;
+
+struct Round {
+  count: u32,
+  blocks: u32,
+  shift: u32,
+  unused: u32,
+}
+
+@group(0) @binding(0) var<uniform> round: Round;
+@group(0) @binding(1) var<storage, read> keys_in: array<u32>;
+@group(0) @binding(2) var<storage, read> values_in: array<u32>;
+@group(0) @binding(3) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(4) var<storage, read_write> values_out: array<u32>;
+@group(0) @binding(5) var<storage, read_write> table: array<u32>;  // by digit, then by block
+
+var<workgroup> totals: array<atomic<u32>, DIGITS>;
+
+@compute @workgroup_size(THREADS)
+fn count(@builtin(local_invocation_index) thread: u32, @builtin(workgroup_id) group: vec3u) {
+  if thread < DIGITS { atomicStore(&totals[thread], 0u); }
+  workgroupBarrier();
+  for (var k = 0u; k < PER_THREAD; k++) {
+    let at = group.x * BLOCK + k * THREADS + thread;
+    if at < round.count { atomicAdd(&totals[(keys_in[at] >> round.shift) & (DIGITS - 1)], 1u); }
+  }
+  workgroupBarrier();
+  if thread < DIGITS { table[thread * round.blocks + group.x] = atomicLoad(&totals[thread]); }
+}
+
+var<workgroup> sums: array<u32, THREADS>;
+
+// One group; every thread takes a run of the table.
+@compute @workgroup_size(THREADS)
+fn scan(@builtin(local_invocation_index) thread: u32) {
+  let size = DIGITS * round.blocks;
+  let run = (size + THREADS - 1) / THREADS;
+  let begin = min(thread * run, size);
+  let end = min(begin + run, size);
+  var total = 0u;
+  for (var i = begin; i < end; i++) { total += table[i]; }
+  sums[thread] = total;
+  for (var step = 1u; step < THREADS; step *= 2) {
+    workgroupBarrier();
+    var other = 0u;
+    if thread >= step { other = sums[thread - step]; }
+    workgroupBarrier();
+    sums[thread] += other;
+  }
+  var before = sums[thread] - total;
+  for (var i = begin; i < end; i++) {
+    let found = table[i];
+    table[i] = before;
+    before += found;
+  }
+}
+
+// Counts of 16 digits, 16 bits each: digit d in half d % 2 of word d / 2.
+struct Counts {
+  low: vec4u,
+  high: vec4u,
+}
+var<workgroup> counts: array<Counts, THREADS>;
+
+fn one(digit: u32) -> Counts {
+  let value = 1u << (16 * (digit & 1));
+  let lanes = vec4u(0, 1, 2, 3) == vec4u((digit >> 1) & 3);
+  let word = select(vec4u(0), vec4u(value), lanes);
+  return Counts(select(vec4u(0), word, digit < 8), select(vec4u(0), word, digit >= 8));
+}
+fn of_digit(c: Counts, digit: u32) -> u32 {
+  let words = select(c.high, c.low, digit < 8);
+  return (words[(digit >> 1) & 3] >> (16 * (digit & 1))) & 0xffff;
+}
+
+@compute @workgroup_size(THREADS)
+fn scatter(@builtin(local_invocation_index) thread: u32, @builtin(workgroup_id) group: vec3u) {
+  let first = group.x * BLOCK + thread * PER_THREAD;
+  var mine = Counts(vec4u(0), vec4u(0));
+  for (var k = 0u; k < PER_THREAD; k++) {
+    if first + k < round.count {
+      let c = one((keys_in[first + k] >> round.shift) & (DIGITS - 1));
+      mine = Counts(mine.low + c.low, mine.high + c.high);
+    }
+  }
+  counts[thread] = mine;
+  for (var step = 1u; step < THREADS; step *= 2) {
+    workgroupBarrier();
+    var other = Counts(vec4u(0), vec4u(0));
+    if thread >= step { other = counts[thread - step]; }
+    workgroupBarrier();
+    counts[thread] = Counts(counts[thread].low + other.low, counts[thread].high + other.high);
+  }
+  var before = Counts(counts[thread].low - mine.low, counts[thread].high - mine.high);
+  for (var k = 0u; k < PER_THREAD; k++) {
+    if first + k >= round.count { break; }
+    let key = keys_in[first + k];
+    let digit = (key >> round.shift) & (DIGITS - 1);
+    let to = table[digit * round.blocks + group.x] + of_digit(before, digit);
+    keys_out[to] = key;
+    values_out[to] = values_in[first + k];
+    let c = one(digit);
+    before = Counts(before.low + c.low, before.high + c.high);
+  }
+}
+`,ve=`// View colours f_view(d), without the offset 0.5, as core/view_kinds.h has them: a base, and terms.
+
+const VIEW_SV: u32 = 0;  // lean: b, rgb
+const VIEW_SV_SITES: u32 = 1;  // all sites: site, log temperature, rgb
+const VIEW_SH: u32 = 2;  // coefficients from degree 1 on: rgb
+const VIEW_SB: u32 = 3;  // lobes: rgb, theta, phi, b
+const VIEW_SG: u32 = 4;  // lobes: mu, log sharpness, rgb
+const LOG_TAU_MAX: f32 = 16.0;
+const LOG_POWER_MAX: f32 = 10.0;
+const SH_C0: f32 = 0.28209479177387814;
+const SH_C1: f32 = 0.4886025119029199;
+const SH_C2A: f32 = 1.0925484305920792;
+const SH_C2B: f32 = 0.31539156525252005;
+const SH_C2C: f32 = 0.5462742152960396;
+const SH_C3A: f32 = 0.5900435899266435;
+const SH_C3B: f32 = 2.890611442640554;
+const SH_C3C: f32 = 0.4570457994644658;
+const SH_C3E: f32 = 0.3731763325901154;
+const SH_C3F: f32 = 1.445305721320277;
+const LOBE_SLOPE: f32 = 6.931471805599453;
+
+@group(0) @binding(2) var<storage, read> terms: array<f32>;
+
+fn term3(at: u32) -> vec3f {
+  return vec3f(terms[at], terms[at + 1], terms[at + 2]);
+}
+
+fn unit(a: vec3f) -> vec3f {
+  let big = max(abs(a.x), max(abs(a.y), abs(a.z)));
+  if !(big > 1e-12) { return a * 1e12; }
+  return normalize(a / big);
+}
+
+fn voronoi(s: Surfel, d: vec3f) -> vec3f {
+  if s.terms == 0 { return s.base; }
+  var top = 0.0;
+  for (var k = 0u; k < s.terms; k++) { top = max(top, dot(term3(s.first_term + 6 * k), d)); }
+  var total = exp(-top);
+  var c = total * s.base;
+  for (var k = 0u; k < s.terms; k++) {
+    let at = s.first_term + 6 * k;
+    let w = exp(dot(term3(at), d) - top);
+    total += w;
+    c += w * term3(at + 3);
+  }
+  return c / total;
+}
+
+fn voronoi_sites(s: Surfel, d: vec3f) -> vec3f {
+  var top = -1e30;
+  for (var k = 0u; k < s.terms; k++) {
+    let at = s.first_term + 7 * k;
+    top = max(top, exp(min(terms[at + 3], LOG_TAU_MAX)) * dot(unit(term3(at)), d));
+  }
+  var total = 0.0;
+  var c = vec3f(0.0);
+  for (var k = 0u; k < s.terms; k++) {
+    let at = s.first_term + 7 * k;
+    let w = exp(exp(min(terms[at + 3], LOG_TAU_MAX)) * dot(unit(term3(at)), d) - top);
+    total += w;
+    c += w * term3(at + 4);
+  }
+  return c / total;
+}
+
+fn harmonics(s: Surfel, d: vec3f) -> vec3f {
+  let x = d.x;
+  let y = d.y;
+  let z = d.z;
+  let xx = x * x;
+  let yy = y * y;
+  let zz = z * z;
+  let at = s.first_term;
+  var c = SH_C0 * s.base;
+  if s.terms >= 3 {
+    c += SH_C1 * (-y * term3(at) + z * term3(at + 3) - x * term3(at + 6));
+  }
+  if s.terms >= 8 {
+    c += SH_C2A * (x * y * term3(at + 9) - y * z * term3(at + 12) - x * z * term3(at + 18));
+    c += SH_C2B * (2.0 * zz - xx - yy) * term3(at + 15) + SH_C2C * (xx - yy) * term3(at + 21);
+  }
+  if s.terms >= 15 {
+    c += -SH_C3A * y * (3.0 * xx - yy) * term3(at + 24) + SH_C3B * x * y * z * term3(at + 27);
+    c += -SH_C3C * y * (4.0 * zz - xx - yy) * term3(at + 30);
+    c += SH_C3E * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * term3(at + 33);
+    c += -SH_C3C * x * (4.0 * zz - xx - yy) * term3(at + 36) + SH_C3F * z * (xx - yy) * term3(at + 39);
+    c += -SH_C3A * x * (xx - 3.0 * yy) * term3(at + 42);
+  }
+  return c;
+}
+
+fn lobe_softplus(x: vec3f) -> vec3f {
+  let a = LOBE_SLOPE * x;
+  return (max(a, vec3f(0.0)) + log(1.0 + exp(-abs(a)))) / LOBE_SLOPE;
+}
+
+fn beta_lobes(s: Surfel, d: vec3f) -> vec3f {
+  var c = s.base;
+  for (var k = 0u; k < s.terms; k++) {
+    let at = s.first_term + 6 * k;
+    let theta = terms[at + 3];
+    let phi = terms[at + 4];
+    let cosine = dot(vec3f(sin(theta) * cos(phi), sin(theta) * sin(phi), cos(theta)), d);
+    let power = 4.0 * exp(min(terms[at + 5], LOG_POWER_MAX));
+    if cosine > 0.0 { c += exp(power * log(cosine)) * lobe_softplus(term3(at)); }
+  }
+  return c;
+}
+
+fn gaussians(s: Surfel, d: vec3f) -> vec3f {
+  var c = s.base;
+  for (var k = 0u; k < s.terms; k++) {
+    let at = s.first_term + 7 * k;
+    let sharp = exp(min(terms[at + 3], LOG_TAU_MAX));
+    c += exp(sharp * (dot(unit(term3(at)), d) - 1.0)) * term3(at + 4);
+  }
+  return c;
+}
+
+fn view_color(kind: u32, s: Surfel, d: vec3f) -> vec3f {
+  switch kind {
+    case VIEW_SV: { return voronoi(s, d); }
+    case VIEW_SV_SITES: { return voronoi_sites(s, d); }
+    case VIEW_SH: { return harmonics(s, d); }
+    case VIEW_SB: { return beta_lobes(s, d); }
+    default: { return gaussians(s, d); }
+  }
+}
+`,A={color:0,depth:1,normal:2,overdraw:3,residual:4},ye=[`count`,`scan`,`scatter`],j={operation:`add`,srcFactor:`zero`,dstFactor:`one-minus-src-alpha`},M={blend:{operation:`add`,srcFactor:`dst-alpha`,dstFactor:`one`},count:{operation:`add`,srcFactor:`one`,dstFactor:`one`}},N=class{device;prepare;sort;shareOut;layouts;drawing;presenting;draws=new Map;presents=new Map;constructor(e){this.device=e;let t=(t,...n)=>e.createShaderModule({label:t,code:n.join(`
+`)}),n=(t,n)=>e.createComputePipeline({layout:`auto`,compute:{module:t,entryPoint:n}});this.prepare=n(t(`prepare`,k,ve,fe,me),`prepare`);let r=t(`sort`,_e);this.sort={count:n(r,`count`),scan:n(r,`scan`),scatter:n(r,`scatter`)},this.shareOut=n(t(`share_out`,k,O,ge),`share_out`),this.drawing=t(`draw`,k,O,pe),this.presenting=t(`present`,k,he),this.layouts=this.makeLayouts()}makeLayouts(){let{VERTEX:e,FRAGMENT:t}=GPUShaderStage,n=(...e)=>this.device.createBindGroupLayout({entries:e}),r=t=>({binding:t,visibility:e,buffer:{type:`read-only-storage`}});return[n({binding:0,visibility:e|t,buffer:{type:`uniform`}},...[1,2,3,4].map(e=>r(e))),n({binding:0,visibility:t,texture:{sampleType:`float`,viewDimension:`2d-array`}},{binding:1,visibility:t,sampler:{type:`filtering`}}),n({binding:0,visibility:e|t,buffer:{type:`uniform`,hasDynamicOffset:!0,minBindingSize:16}},{binding:1,visibility:t,texture:{sampleType:`unfilterable-float`}})]}draw(e,t){let n=`${e} ${t}`,r=this.draws.get(n);return r||(r=this.device.createRenderPipeline({layout:this.device.createPipelineLayout({bindGroupLayouts:this.layouts}),vertex:{module:this.drawing,entryPoint:`corner`},primitive:{topology:`triangle-strip`},fragment:{module:this.drawing,entryPoint:`surfel`,targets:[{format:e,blend:{color:M[t],alpha:j}}]}}),this.draws.set(n,r)),r}present(e){let t=this.presents.get(e);return t||(t=this.device.createRenderPipeline({layout:`auto`,vertex:{module:this.presenting,entryPoint:`whole`},fragment:{module:this.presenting,entryPoint:`present`,targets:[{format:e}]}}),this.presents.set(e,t)),t}},P=e=>String(Number(e.toPrecision(9))),F=(e,t)=>{let n=(e??``).split(`,`).map(Number);return e!==null&&n.length===t&&n.every(Number.isFinite)?n:null};function be({pose:e,lens:t,target:n,show:r,residuals:i}){let a=(e,t)=>`${e}=${t.map(P).join(`,`)}`,o=[a(`p`,e.position),a(`r`,[...e.right,...e.forward]),a(`t`,n),a(`l`,[t.fx,t.fy,t.cx,t.cy,t.width,t.height])];return r!==`color`&&o.push(`show=${r}`),i||o.push(`texture=off`),`#${o.join(`&`)}`}function I(e){let t=new URLSearchParams(e.replace(/^#/,``)),n=F(t.get(`p`),3),r=F(t.get(`r`),6),i=F(t.get(`t`),3),a=F(t.get(`l`),6);if(!n||!r||!i||!a||!a.every((e,t)=>t===2||t===3||e>0))return null;let[o,s]=[r.slice(0,3),r.slice(3)];if(!(Math.abs(g(o)-1)<.001&&Math.abs(g(s)-1)<.001)||Math.abs(m(o,s))>.001)return null;let c=t.get(`show`)??`color`,[l,u,d,f,p,_]=a;return{pose:{position:n,right:o,down:h(s,o),forward:s},lens:{fx:l,fy:u,cx:d,cy:f,width:p,height:_},target:i,show:c in A?c:`color`,residuals:t.get(`texture`)!==`off`}}var xe=65536;function Se(e){let t=new TextDecoder(`latin1`).decode(new Uint8Array(e,0,Math.min(e.byteLength,xe))),n=t.indexOf(`end_header
+`),r=t.slice(0,Math.max(n,0)).split(`
+`);if(n<0||r[0]!==`ply`||r[1]!==`format binary_little_endian 1.0`)throw new a(`surfels.ply is not a binary little-endian PLY file.`);let i=new Map,o=null;for(let e of r.slice(2)){let t=e.split(` `);if(t[0]===`element`&&t.length===3)o={count:Number(t[2]),stride:0,start:0,columns:new Map},i.set(t[1],o);else if(t[0]===`property`&&o&&(t[1]===`float`||t[1]===`int`))o.columns.set(t[2],{at:o.stride,type:t[1]}),o.stride+=4;else if(t[0]!==`comment`&&e!==``)throw new a(`surfels.ply has a header that cannot be read.`)}let s=n+11;for(let e of i.values())e.start=s,s+=e.count*e.stride;if(s!==e.byteLength)throw new a(`surfels.ply has ${e.byteLength} bytes; its header asks for ${s}.`);return i}var L=class{element;name;count;view;constructor(e,t,n){this.element=t,this.name=n,this.count=t.count,this.view=new DataView(e,t.start,t.count*t.stride)}has(e){return this.element.columns.has(e)}into(e,t,n,r){let i=this.element.columns.get(e),o=t instanceof Float32Array?`float`:`int`;if(!i||i.type!==o)throw new a(`surfels.ply: ${this.name} has no property ${e} of type ${o}.`);let s=this.element.stride;for(let e=0,a=i.at,c=n;e<this.count;e++,a+=s,c+=r)t[c]=o===`float`?this.view.getFloat32(a,!0):this.view.getInt32(a,!0)}width(e){let t=0;for(;this.has(`${e}_${t}`);)t++;return t}},R={sv:0,"sv sites":1,sh:2,sb:3,sg:4},Ce={sv:6,sh:3,sb:6,sg:7},we=32,z=0,Te=3,Ee=4,De=8,Oe=10,B=11,V=12,ke=15,H=16,U=19,W=20,Ae=22,G=23;function je(e,t,n,r){let i=new Uint32Array(n.buffer),o=Ce[r];for(let t=0;t<3;t++)e.into(`view_base_${t}`,n,H+t,24);let s=new Int32Array(e.count);e.into(`view_terms`,s,0,1);let c=0;for(let t=0;t<e.count;t++){if(s[t]<0||s[t]>we)throw new a(`surfels.ply: view_terms is wrong in row ${t}.`);i[t*24+U]=c*o,i[t*24+G]=s[t],c+=s[t]}if(c!==t.count)throw new a(`surfels.ply: view_terms does not count the rows of view_term.`);let l=new Float32Array(t.count*o);for(let e=0;e<o;e++)t.into(`term_${e}`,l,e,o);return l}function Me(e,t,n,r){let i=new Uint32Array(t.buffer),o=n.reduce((e,[,t])=>e+t,0),s=e.width(n[0][0])/n[0][1];if(n.some(([t,n])=>e.width(t)!==s*n))throw new a(`surfels.ply: the columns of the view colour do not fit together.`);let c=new Float32Array(e.count*s*o),l=0;for(let[t,r]of n){for(let n=0;n<s;n++)for(let i=0;i<r;i++)e.into(`${t}_${n*r+i}`,c,n*o+l+i,s*o);l+=r}if(r!==null)for(let n=0;n<3;n++)e.into(`${r}_${n}`,t,H+n,24);for(let t=0;t<e.count;t++)i[t*24+U]=t*s*o,i[t*24+G]=s;return c}var Ne={sv:{parts:[[`sv_sites`,3],[`sv_log_tau`,1],[`sv_rgb`,3]],base:null,kind:R[`sv sites`]},sh:{parts:[[`sh_rest`,3]],base:`sh_dc`,kind:R.sh},sb:{parts:[[`sb_lobes`,6]],base:`sb_base`,kind:R.sb},sg:{parts:[[`sg_lobes`,7]],base:`sg_base`,kind:R.sg}};function Pe(e,t,n){let r=new Uint32Array(t.buffer),i=[`tile_x`,`tile_y`,`tile_layer`,`tile_ru`,`tile_rv`].map(t=>{let n=new Int32Array(e.count);return e.into(t,n,0,1),n}),[o,s,c]=n.atlas?[n.atlas.width,n.atlas.height,n.atlas.layers]:[0,0,1];for(let t=0,n=0;t<e.count;t++,n+=24){let[e,l,u,d,f]=i.map(e=>e[t]);if(!(e>=0&&l>=0&&d>=0&&f>=0&&e+d<=o&&l+f<=s)||u<0||u>=c||d>0!=f>0)throw new a(`surfels.ply: the tile of surfel ${t} lies outside the atlas.`);r[n+W]=e,r[n+W+1]=l,r[n+ke]=u,r[n+Ae]=d|f<<16}}function Fe(e,t){let n=Se(e),r=n.get(`vertex`);if(!r||r.count!==t.count)throw new a(`surfels.ply has not the ${t.count} surfels of bundle.json.`);let i=new L(e,r,`vertex`),o=new Float32Array(i.count*24),s=(e,t)=>i.into(e,o,t,24);[`x`,`y`,`z`].forEach((e,t)=>s(e,z+t)),[0,1,2,3].forEach(e=>s(`rot_${e}`,Ee+e)),[0,1].forEach(e=>s(`scale_${e}`,De+e)),s(`opacity`,Te),s(`beta`,Oe);let c=t.atlas?.extent??3;if(i.has(`tile_extent`))s(`tile_extent`,B);else for(let e=B;e<o.length;e+=24)o[e]=c;i.has(`residual_0`)&&[0,1,2].forEach(e=>s(`residual_${e}`,V+e)),Pe(i,o,t);let l=n.get(`view_term`),u=Ne[t.viewColor],d=l?je(i,new L(e,l,`view_term`),o,t.viewColor):Me(i,o,u.parts,u.base);for(let e=0;e<o.length;e+=24)for(let t=z;t<V;t++)if(!Number.isFinite(o[e+t]))throw new a(`surfels.ply: surfel ${e/24} has a number that is not finite.`);let{min:f,max:p}=t.bounds,m=f.map((e,t)=>(e+p[t])/2);for(let e=0;e<o.length;e+=24)for(let t=0;t<3;t++)o[e+t]-=m[t];return{count:i.count,words:o,terms:d,kind:l?R[t.viewColor]:u.kind,origin:m}}var Ie=4e3;function Le(e){let t=Math.max(1,Math.floor(e.count/Ie)),n=[];for(let r=0;r<e.count;r+=t){let t=r*24;n.push([e.words[t],e.words[t+1],e.words[t+2]])}if(!n.length)return{middle:[0,0,0],size:1};let r=e=>e.sort((e,t)=>e-t)[e.length>>1],i=[0,1,2].map(e=>r(n.map(t=>t[e]))),a=r(n.map(e=>g([e[0]-i[0],e[1]-i[1],e[2]-i[2]])));return{middle:d(i,e.origin),size:Math.max(2*a,1e-6)}}function Re(e,t,n){let r=_(h(n,Math.abs(n[0])<.9?[1,0,0]:[0,1,0]));return re(d(e,d(p(1.6*t,r),p(.5*t,n))),e,n)}var ze=4,Be=16,Ve=250,He=class{canvas;screen;renderer;bundle;controls;cameras;pace=new de;size;lens=C;first;held=null;show=`color`;dirty=!0;still=!1;movedAt=0;drawing=!1;constructor(e,t,n,r){this.canvas=e,this.screen=t,this.renderer=n,this.bundle=r;let{info:i,surfels:a}=r,{middle:o,size:s}=Le(a),c=i.up??[0,0,1];if(this.size=s,this.cameras=te(r.cameras??``),this.first={pose:Re(o,s,c),target:o,lens:C},this.cameras.length){let e=this.cameras.find(e=>e.heldOut)??this.cameras[0];this.first={pose:e.pose,target:this.targetOf(e.pose),lens:e.lens}}this.controls=new ce(e,this.first.pose,this.first.target,c,s,()=>this.touch()),this.lens=this.first.lens,this.bind()}start(){let e=I(location.hash);e&&this.apply(e),new ResizeObserver(()=>this.touch()).observe(this.canvas),addEventListener(`hashchange`,()=>{let e=I(location.hash);e&&this.apply(e)}),this.canvas.focus(),requestAnimationFrame(e=>this.tick(e))}targetOf(e){let t=ne(this.cameras);return E(e,0,0,t?g(f(t,e.position)):this.size).position}apply(n){this.controls.pose=n.pose,this.controls.target=n.target,this.lens=n.lens,this.setShow(n.show),t(e(`texture`),n.residuals),this.touch()}touch(){this.dirty=!0,this.still=!1,this.movedAt=performance.now()}look(t){return{show:this.show,residuals:n(e(`texture`)),held:this.held,background:this.bundle.info.background,layers:t?Be:ze,fine:t}}farthest(){return g(f(this.controls.pose.position,this.first.target))+1.5*this.size}tick(e){requestAnimationFrame(e=>this.tick(e)),this.controls.advance(e),this.drawing||(this.dirty?this.frame(!1):!this.still&&e-this.movedAt>Ve&&this.frame(!0))}async frame(t){this.drawing=!0,this.dirty=!1;let n=Math.min(devicePixelRatio,2),[r,i]=[this.canvas.clientWidth,this.canvas.clientHeight].map(e=>Math.round(e*n));if(r>0&&i>0){let n=e(`resolution`).value,a=n===`auto`?t?1:this.pace.scale:Number(n),o=performance.now();try{let e=S.contain(this.controls.pose,this.lens,r,i);await this.screen.draw(e,a,this.look(t),this.farthest())}catch(e){c(e);return}let s=performance.now()-o;!t&&n===`auto`&&this.pace.took(s),this.still=t,this.report(s,a),document.documentElement.dataset.frame=t?`still`:`moving`}this.drawing=!1}report(t,n){let r=this.renderer.scene.count.toLocaleString(`en`);e(`status`).textContent=`${t.toFixed(+(t<10))} ms · ${Math.round(100*n)} % · ${r} surfels`}bind(){let t=(t,n)=>e(t).addEventListener(`click`,n);t(`orbit`,()=>this.setMode(`orbit`)),t(`fly`,()=>this.setMode(`fly`)),t(`home`,()=>this.goHome()),t(`previous`,()=>this.step(-1)),t(`next`,()=>this.step(1)),t(`beside`,()=>this.toggleBeside()),t(`texture`,()=>this.toggle(`texture`)),t(`colors`,()=>{this.held=this.toggle(`colors`)?null:this.controls.pose.position}),t(`screenshot`,()=>void this.screenshot()),t(`share`,()=>void this.share()),t(`theme`,()=>this.turnTheme()),t(`menu`,()=>{let t=e(`panel`).classList.toggle(`open`);e(`menu`).setAttribute(`aria-expanded`,String(t))}),e(`resolution`).addEventListener(`change`,()=>this.touch()),e(`show`).addEventListener(`change`,e=>this.setShow(e.target.value)),e(`camera`).addEventListener(`change`,e=>this.jump(Number(e.target.value))),addEventListener(`keydown`,e=>this.shortcut(e)),this.fillCameras()}shortcut(t){if(t.target instanceof HTMLSelectElement||((t.ctrlKey||t.metaKey)&&t.code===`KeyS`&&(t.preventDefault(),this.screenshot()),t.ctrlKey||t.metaKey||t.altKey))return;let n={o:`orbit`,f:`fly`,h:`home`,",":`previous`,".":`next`,p:`beside`,t:`texture`}[t.key],r={c:`colors`,l:`share`}[t.key],i=n??r;i&&!e(i).hidden&&e(i).click()}toggle(r){let i=!n(e(r));return t(e(r),i),this.touch(),i}setMode(n){this.controls.mode=n,t(e(`orbit`),n===`orbit`),t(e(`fly`),n===`fly`),this.canvas.focus()}setShow(t){this.show=t,e(`show`).value=t,this.touch()}goHome(){this.controls.pose=this.first.pose,this.controls.target=this.first.target,this.lens=this.first.lens,this.touch()}fillCameras(){e(`cameras`).hidden=!this.cameras.length,e(`beside`).hidden=!this.cameras.some(e=>e.photograph);let t=e(`camera`);this.cameras.forEach((e,n)=>t.add(new Option(e.name+(e.heldOut?` · held out`:``),`${n}`)));let n=this.cameras.findIndex(e=>e.heldOut);t.value=String(Math.max(0,n))}step(t){let n=e(`camera`),r=(Number(n.value)+t+this.cameras.length)%this.cameras.length;n.value=String(r),this.jump(r)}jump(e){let t=this.cameras[e];this.controls.pose=t.pose,this.controls.target=this.targetOf(t.pose),this.lens=t.lens,this.setPhotograph(),this.touch()}toggleBeside(){let t=this.toggle(`beside`);t&&!this.cameras[Number(e(`camera`).value)].photograph&&this.jumpToPhotograph(),t&&this.jump(Number(e(`camera`).value)),this.setPhotograph()}jumpToPhotograph(){let t=this.cameras.findIndex(e=>e.photograph);e(`camera`).value=String(t)}setPhotograph(){let t=this.cameras[Number(e(`camera`).value)],r=n(e(`beside`));if(e(`photograph`).hidden=!r,!r)return;let i=e(`photograph-image`);t.photograph?i.src=`bundle/${t.photograph}`:i.removeAttribute(`src`),e(`photograph-name`).textContent=t.photograph?`Photograph`:`No photograph of this camera`}turnTheme(){let t=document.documentElement,n={"":`light`,light:`dark`,dark:``}[t.dataset.theme??``]??``;n?t.dataset.theme=n:delete t.dataset.theme,e(`theme`).textContent=n?`Theme: ${n}`:`Theme`}async screenshot(){let e=Math.min(devicePixelRatio,2),[t,n]=[this.canvas.clientWidth,this.canvas.clientHeight].map(t=>Math.round(t*e)),r=S.contain(this.controls.pose,this.lens,t,n),i=await this.renderer.read(r,this.look(!0),this.farthest()),a=new OffscreenCanvas(t,n);a.getContext(`2d`)?.putImageData(i,0,0);let o=document.createElement(`a`);o.href=URL.createObjectURL(await a.convertToBlob({type:`image/png`})),o.download=`${document.title||`scene`}.png`,o.click(),setTimeout(()=>URL.revokeObjectURL(o.href),6e4),this.touch()}async share(){let{pose:t,target:r}=this.controls,i=n(e(`texture`));history.replaceState(null,``,be({pose:t,target:r,lens:this.lens,show:this.show,residuals:i}));try{await navigator.clipboard.writeText(location.href),u(`The link to this view was copied.`)}catch{u(`The link to this view is in the address bar.`)}}},Ue=(function(){let e=typeof document<`u`&&document.createElement(`link`).relList;return e&&e.supports&&e.supports(`modulepreload`)?`modulepreload`:`preload`})(),We=function(e,t){return new URL(e,t).href},Ge={},Ke=function(e){return e.pathname.endsWith(`.css`)},qe=function(e,t,n){if(t in e)return e[t];let r=n();if(!r){e[t]=void 0;return}let i=r.then(()=>{e[t]=void 0},n=>{throw e[t]=void 0,n});return e[t]=i,i},Je=function(e,t,n){let r=Promise.resolve();if(t&&t.length>0){let e,i=document.querySelector(`meta[property=csp-nonce]`),a=i?.nonce||i?.getAttribute(`nonce`);function o(e){return Promise.all(e.map(e=>Promise.resolve(e).then(e=>({status:`fulfilled`,value:e}),e=>({status:`rejected`,reason:e}))))}function s(e){return import.meta.resolve?new URL(import.meta.resolve(e)):new URL(e,import.meta.url)}r=o(t.map(t=>{t=We(t,n);let r=s(t),i=Ke(r);return qe(Ge,r.href,()=>{if(e===void 0){e={all:new Set,styles:new Set};let t=document.getElementsByTagName(`link`);for(let n=t.length-1;n>=0;n--){let r=t[n];e.all.add(r.href),r.rel===`stylesheet`&&e.styles.add(r.href)}}if((i?e.styles:e.all).has(r.href))return;let t=document.createElement(`link`);if(t.rel=i?`stylesheet`:Ue,i||(t.as=`script`),t.crossOrigin=``,t.href=r.href,a&&t.setAttribute(`nonce`,a),document.head.appendChild(t),i)return new Promise((e,n)=>{let i=a=>{t.removeEventListener(`load`,i),t.removeEventListener(`error`,i),a.type===`error`?n(Error(`Unable to preload CSS for ${r}`)):e(a)};t.addEventListener(`load`,i),t.addEventListener(`error`,i)})})}).filter(e=>e!==void 0))}function i(e){let t=new Event(`vite:preloadError`,{cancelable:!0});if(t.payload=e,window.dispatchEvent(t),!t.defaultPrevented)throw e}return r.then(t=>{for(let e of t||[])e.status===`rejected`&&i(e.reason);return e().catch(i)})},Ye=[171,75,84,88,32,50,48,187,13,10,26,10],Xe={145:`bc7`,37:`uint8`,97:`fp16`},K={bc7:{side:4,bytes:16},uint8:{side:1,bytes:4},fp16:{side:1,bytes:8}},Ze=e=>K[e];async function Qe(e,t){let n=new DataView(e);if(e.byteLength<104||Ye.some((e,t)=>n.getUint8(t)!==e))throw new a(`atlas.ktx2 is not a KTX2 file.`);let r=e=>n.getUint32(e,!0),[i,o,s,c,l]=[r(20),r(24),r(32),r(40),r(44)],u=Xe[r(12)];if(u!==t.format||i!==t.width||o!==t.height||s!==t.layers)throw new a(`atlas.ktx2: format and size are not those of bundle.json.`);let{side:d,bytes:f}=K[u],p=Math.ceil(i/d)*Math.ceil(o/d)*f,m=Number(n.getBigUint64(80,!0)),h=Number(n.getBigUint64(88,!0));if(c!==1||m+h>e.byteLength)throw new a(`atlas.ktx2 is truncated.`);let g=new Uint8Array(e,m,h);if(l===2){let{decompress:e}=await Je(async()=>{let{decompress:e}=await import(`./esm.js`);return{decompress:e}},[],import.meta.url);try{g=e(g,new Uint8Array(p*s))}catch{throw new a(`atlas.ktx2: its zstd data is damaged.`)}}else if(l!==0)throw new a(`atlas.ktx2 is compressed by a scheme (${l}) that is not known.`);if(g.byteLength!==p*s)throw new a(`atlas.ktx2 has not the bytes of its texels.`);return{format:u,width:i,height:o,layers:Array.from({length:s},(e,t)=>g.subarray(t*p,(t+1)*p))}}var $e=`bitymi-bundle`,et=class e{value;path;constructor(e,t){this.value=e,this.path=t}refuse(e,t){throw new a(`bundle.json: ${this.path}${e} must be ${t}.`)}has(e){return this.value[e]!==void 0&&this.value[e]!==null}part(t){let n=this.value[t];return(typeof n!=`object`||!n||Array.isArray(n))&&this.refuse(t,`an object`),new e(n,`${this.path}${t}.`)}number(e,t,n){let r=this.value[e];return typeof r==`number`&&r>=t&&r<=n||this.refuse(e,`a number from ${t} to ${n}`),r}whole(e,t,n){let r=this.number(e,t,n);return Number.isInteger(r)||this.refuse(e,`a whole number`),r}choice(e,t){let n=this.value[e];return t.includes(n)||this.refuse(e,`one of ${t.join(`, `)}`),n}point(e,t){let n=this.value[e];return Array.isArray(n)&&n.length===3&&n.every(e=>typeof e==`number`&&Math.abs(e)<=t)||this.refuse(e,`three numbers`),n}entries(){return Object.keys(this.value).map(e=>[e,this.part(e)])}text(e,t){let n=this.value[e];return typeof n==`string`&&t.test(n)||this.refuse(e,`a text like ${t.source}`),n}};function tt(e){let t=1<<20;return{format:e.choice(`format`,[`bc7`,`uint8`,`fp16`]),width:e.whole(`width`,1,t),height:e.whole(`height`,1,t),layers:e.whole(`layers`,1,t),extent:e.has(`extent`)?e.number(`extent`,1e-6,16):3,offset:e.number(`offset`,-256,256),scale:e.number(`scale`,0,512)}}function nt(e){let t;try{t=JSON.parse(e)}catch{throw new a(`bundle.json cannot be read as JSON.`)}if(typeof t!=`object`||!t||t.format!==`bitymi-bundle`)throw new r(`This is not a bundle`,`bundle.json has not the format ${$e}.`,`Open another folder.`);let n=new et(t,``),i=n.text(`version`,/^[0-9]{1,6}\.[0-9]{1,6}$/);if(Number(i.split(`.`)[0])>2)throw new r(`This bundle is newer than the viewer`,`It has version ${i}; this viewer reads up to 2.x.`,`Update bitymi-ns, and export the page again if this is an exported one.`);let o=n.part(`surfels`),s=n.part(`render`),c=n.part(`bounds`),l=n.has(`world`)?n.part(`world`):null,u=n.part(`files`).entries();return{version:i,count:o.whole(`count`,0,2**28),viewColor:o.choice(`view_color`,[`sv`,`sh`,`sb`,`sg`]),terms:o.has(`terms`)?o.whole(`terms`,0,2**31):null,atlas:n.has(`atlas`)?tt(n.part(`atlas`)):null,near:s.number(`near`,1e-9,1e6),weightBound:s.number(`weight_bound`,0,1),throughPixel:s.has(`prefilter`)&&s.choice(`prefilter`,[`low_pass`,`pixel`])===`pixel`,background:s.point(`background`,1),bounds:{min:c.point(`min`,1e9),max:c.point(`max`,1e9)},up:l?.has(`up`)?l.point(`up`,2):null,files:new Map(u.map(([e,t])=>[e,{bytes:t.whole(`bytes`,0,2**50),sha256:t.text(`sha256`,/^[0-9a-f]{64}$/)}]))}}async function q(e){let t;try{t=await fetch(e)}catch{throw new r(`The bundle cannot be reached`,`${e} was not answered.`,`Is the server still running?`)}if(!t.ok){let t=e.split(`/`).pop()??e;throw t===`bundle.json`?new r(`There is no bundle`,`${e} is not there.`,`Export the scene again with bitymi view.`):new a(`${t} is missing.`)}return t}async function rt(e,t,n){let r=await q(e),i=new Uint8Array(t),o=e.split(`/`).pop()??e,s=0,c=r.body?.getReader();for(;c;){let{done:e,value:r}=await c.read();if(e)break;if(s+r.length>t)throw new a(`${o} is longer than the ${t} bytes of bundle.json.`);i.set(r,s),s+=r.length,n(r.length)}if(s!==t)throw new a(`${o} is truncated: ${s} of ${t} bytes.`);return i.buffer}var it=e=>[...new Uint8Array(e)].map(e=>e.toString(16).padStart(2,`0`)).join(``);async function at(e,t){let n=nt(await(await q(`${e}bundle.json`)).text()),r=[`surfels.ply`,...n.atlas?[`atlas.ktx2`]:[]],i=r.reduce((e,t)=>e+(n.files.get(t)?.bytes??0),0),o=0,[s,c]=await Promise.all(r.map(async r=>{let s=n.files.get(r);if(!s)throw new a(`bundle.json does not list ${r}.`);let c=await rt(`${e}${r}`,s.bytes,e=>t(o+=e,i)),l=globalThis.crypto?.subtle;if(l&&it(await l.digest(`SHA-256`,c))!==s.sha256)throw new a(`${r} is altered: its SHA-256 is not the one in bundle.json.`);return c}));return{info:n,surfels:Fe(s,n),pages:n.atlas?await Qe(c,n.atlas):null,cameras:n.files.has(`cameras.json`)?await(await q(`${e}cameras.json`)).text():null}}var J=`Chrome and Edge from 113, Safari from 26 and Firefox from 141 have it. Update the browser and the graphics driver, and look whether hardware acceleration is switched on. Pages need https, or an address on this machine.`;async function ot(){let e=navigator.gpu;if(!e)throw new r(`This browser has no WebGPU`,`The viewer draws with WebGPU.`,J);let t=await e.requestAdapter({powerPreference:`high-performance`});if(!t)throw new r(`No graphics device`,`WebGPU finds nothing here that could draw.`,J);let n=[`texture-compression-bc`,`float32-blendable`,`float32-filterable`],i=n.filter(e=>t.features.has(e)),{maxTextureDimension2D:a,maxStorageBufferBindingSize:o,maxBufferSize:s}=t.limits,{architecture:c,device:l,description:u,vendor:d}=t.info;return{device:await t.requestDevice({requiredFeatures:i,requiredLimits:{maxTextureDimension2D:a,maxStorageBufferBindingSize:o,maxBufferSize:s}}),name:u||l||d||`unnamed`,blocks:i.includes(n[0]),floats:i.includes(n[1])&&i.includes(n[2]),software:t.info.isFallbackAdapter||/swiftshader|llvmpipe/i.test(`${c} ${l} ${u}`)}}var Y=(e,t,n,r,i,a,o,s,c)=>({subsets:e,partition:t,rotation:n,selector:r,color:i,alpha:a,shared:o,index:s,index2:c}),st=[Y(3,4,0,0,4,0,`endpoint`,3,0),Y(2,6,0,0,6,0,`subset`,3,0),Y(3,6,0,0,5,0,`none`,2,0),Y(2,6,0,0,7,0,`endpoint`,2,0),Y(1,0,2,1,5,6,`none`,2,3),Y(1,0,2,0,7,8,`none`,2,2),Y(1,0,0,0,7,7,`endpoint`,4,0),Y(2,6,0,0,5,5,`endpoint`,2,0)],X={2:[0,21,43,64],3:[0,9,18,27,37,46,55,64],4:[0,4,9,13,17,21,26,30,34,38,43,47,51,55,60,64]},ct=[52428,34952,61166,60616,51328,65260,65224,60544,51200,65516,65152,59392,65512,65280,65520,61440,63248,142,28928,2254,140,29456,12544,36046,2188,12560,26214,13932,6120,4080,29070,14748,43690,61680,23130,13260,15420,21930,38550,42330,29646,5064,12876,15324,27030,49980,39270,1632,626,1252,20032,10016,51510,37740,14790,25500,37686,40134,33150,59160,52464,4044,30532,60962],lt=[2858963024,1784303680,1515864576,1414570152,2779054080,2694860880,1431675040,1515868240,2857697280,2857719040,2863289600,2425393296,2492765332,2762253476,2846200912,705315408,2777960512,172118100,2779096320,1436590240,2829603924,1785348160,2762231808,437912832,5285028,2862977168,342452500,1768494080,2693105056,2860651540,1352967248,1784283648,2846195712,1351655592,2829094992,606348324,11162880,613566756,608801316,1352993360,1342874960,2863285316,1717960704,2778768800,1352683680,1764256040,1152035396,1717986816,2856600644,1420317864,2508232064,2526451200,2824098984,2157286784,2853442580,2526412800,2863272980,2689618080,2695210400,2516582400,1082146944,2846402984,2863311428,709513812],ut=[15,15,15,15,15,15,15,15,15,15,15,15,15,15,15,15,15,2,8,2,2,8,8,15,2,8,2,2,8,8,2,2,15,15,6,8,2,8,15,15,2,8,2,2,2,15,15,6,6,2,6,8,15,15,2,2,15,15,15,15,15,2,2,15],dt=[3,3,15,15,8,3,15,15,8,8,6,6,6,5,3,3,3,3,8,15,3,3,6,10,5,8,8,6,8,5,15,15,8,15,3,5,6,10,8,15,15,3,15,5,15,15,15,15,3,15,5,5,5,8,5,10,5,10,8,13,15,12,3,3],ft=[15,8,8,3,15,15,3,8,15,15,15,15,15,15,15,8,15,8,15,3,15,8,15,8,3,15,6,10,15,15,10,8,15,3,15,10,10,8,9,10,6,15,8,15,3,6,6,8,15,3,15,15,15,15,15,15,15,15,15,15,3,15,15,8],pt=class{data;start;at=0;constructor(e,t){this.data=e,this.start=t}take(e){let t=0;for(let n=0;n<e;n++,this.at++)t|=(this.data[this.start+(this.at>>3)]>>(this.at&7)&1)<<n;return t}},mt=(e,t,n)=>e===2?ct[t]>>>n&1:e===3?lt[t]>>>2*n&3:0,ht=(e,t,n)=>n===0?!0:e===2?n===ut[t]:e===3&&(n===dt[t]||n===ft[t]),gt=(e,t)=>{let n=e<<8-t;return n|n>>t},Z=(e,t,n)=>(64-n)*e+n*t+32>>6;function _t(e,t){let n=Array.from({length:t.subsets},()=>[[0,0,0,255],[0,0,0,255]]),r=t.alpha?4:3;for(let i=0;i<r;i++)for(let r of n)for(let n of r)n[i]=e.take(i<3?t.color:t.alpha);let i=t.shared===`none`?0:1;for(let a of n){let n=t.shared===`subset`?e.take(1):0;for(let o of a){let a=t.shared===`endpoint`?e.take(1):n;for(let e=0;e<r;e++){let n=e<3?t.color:t.alpha;o[e]=gt(i?o[e]<<1|a:o[e],n+i)}}}return n}function vt(e,t,n,r,i){let a=new pt(e,t),o=0;for(;o<8&&!a.take(1);)o++;let s=st[o];for(let e=0;e<16&&!s;e++)n.fill(0,r+(e>>2)*i+(e&3)*4,4);if(!s)return;let c=a.take(s.partition),l=a.take(s.rotation),u=a.take(s.selector),d=_t(a,s),f=e=>Array.from({length:16},(t,n)=>a.take(e-+!!ht(s.subsets,c,n))),p=f(s.index),m=s.index2?f(s.index2):p,[h,g]=u?[m,p]:[p,m],_=X[u?s.index2:s.index],v=X[s.index2&&!u?s.index2:s.index];for(let e=0;e<16;e++){let[t,a]=d[mt(s.subsets,c,e)],o=r+(e>>2)*i+(e&3)*4;for(let r=0;r<3;r++)n[o+r]=Z(t[r],a[r],_[h[e]]);if(n[o+3]=Z(t[3],a[3],v[g[e]]),l){let e=n[o+l-1];n[o+l-1]=n[o+3],n[o+3]=e}}}function yt(e,t,n){let r=new Uint8Array(t*n*4),i=t*4;for(let a=0,o=0;a<n;a+=4)for(let n=0;n<t;n+=4,o+=16)vt(e,o,r,a*i+n*4,i);return r}var bt=1024,Q=8,xt=160;function $(e,t,n){let r=[];return n.forEach((e,t)=>{e!==null&&r.push({binding:t,resource:e instanceof GPUBuffer?{buffer:e}:e})}),e.createBindGroup({layout:t,entries:r})}var St=class{programs;info;surfels;count;frame;visible;draws;layers;drawn;pages;decoded;atlasSize;device;preparing;rounds=[];sharing;blocks;constructor(e,t,n,r,i){this.programs=t,this.info=n,this.surfels=r;let{device:a}=e;this.device=a,this.count=r.count,this.blocks=Math.ceil(Math.max(1,this.count)/bt),this.checkRoom();let{STORAGE:o,UNIFORM:s,COPY_DST:c,INDIRECT:l}=GPUBufferUsage,u=Math.max(1,this.count),d=this.upload(r.words,o),f=this.upload(r.terms,o),p=this.empty(96*u,o),m=[0,1].map(()=>this.empty(4*u,o)),h=[0,1].map(()=>this.empty(4*u,o)),g=this.empty(64*this.blocks,o);this.frame=this.empty(xt,s|c),this.visible=this.empty(4,o|c),this.draws=this.empty(1024,o|l);let _=new Uint32Array(4096);for(let e=0;e<64;e++)_[e*256/4]=e;this.layers=this.upload(_,s);let v=(e,...t)=>$(a,e,t);this.preparing=v(t.prepare.getBindGroupLayout(0),this.frame,d,f,p,m[0],h[0],this.visible);for(let e=0;e<Q;e++){let[n,r]=[e%2,1-e%2],i=[this.upload(new Uint32Array([this.count,this.blocks,4*e,0]),s),m[n],h[n],m[r],h[r],g],a={count:[0,1,5],scan:[0,5],scatter:[0,1,2,3,4,5]},o=ye.map(e=>[e,v(t.sort[e].getBindGroupLayout(0),...i.map((t,n)=>a[e].includes(n)?t:null))]);this.rounds.push(Object.fromEntries(o))}this.sharing=v(t.shareOut.getBindGroupLayout(0),this.frame,this.visible,this.draws),this.drawn=v(t.layouts[0],this.frame,d,p,h[0],this.visible),this.decoded=i?.format===`bc7`&&!e.blocks;let y=this.texture(i,e.blocks);this.atlasSize=[y.width,y.height];let b=a.createSampler({magFilter:`linear`,minFilter:`linear`});this.pages=v(t.layouts[1],y.createView({dimension:`2d-array`}),b)}checkRoom(){let{maxStorageBufferBindingSize:e,maxTextureDimension2D:t}=this.device.limits,n=Math.max(96*this.count,this.surfels.terms.byteLength),i=Math.max(this.info.atlas?.width??0,this.info.atlas?.height??0);if(n>e||i>t)throw new r(`This scene is too large for this device`,`It has ${this.count.toLocaleString(`en`)} surfels and an atlas of up to ${i} texels a side.`,`Open it on a device with more graphics memory.`)}empty(e,t){return this.device.createBuffer({size:e,usage:t})}upload(e,t){let n=this.empty(Math.max(96,e.byteLength),t|GPUBufferUsage.COPY_DST);return e.byteLength&&this.device.queue.writeBuffer(n,0,e),n}texture(e,t){let{width:n,height:r,layers:i,format:a}=e??{width:1,height:1,layers:[new Uint8Array(4)],format:`uint8`},o=a===`bc7`&&!t,s={bc7:o?`rgba8unorm`:`bc7-rgba-unorm`,uint8:`rgba8unorm`,fp16:`rgba16float`},c=this.device.createTexture({size:[n,r,i.length],format:s[a],usage:GPUTextureUsage.TEXTURE_BINDING|GPUTextureUsage.COPY_DST}),{side:l,bytes:u}=Ze(o?`uint8`:a);return i.forEach((e,t)=>{let i=o?yt(e,n,r):e;this.device.queue.writeTexture({texture:c,origin:[0,0,t]},i,{bytesPerRow:Math.ceil(n/l)*u,rowsPerImage:Math.ceil(r/l)},[n,r,1])}),c}encodeSorting(e){let t=e.beginComputePass(),n=(e,n,r)=>{t.setPipeline(e),t.setBindGroup(0,n),t.dispatchWorkgroups(r)};n(this.programs.prepare,this.preparing,Math.ceil(Math.max(1,this.count)/64));for(let e of this.rounds)n(this.programs.sort.count,e.count,this.blocks),n(this.programs.sort.scan,e.scan,1),n(this.programs.sort.scatter,e.scatter,this.blocks);n(this.programs.shareOut,this.sharing,1),t.end()}},Ct=class{graphics;programs;scene;target=null;screen;smooth;constructor(e,t,n){this.graphics=e,this.programs=t,this.scene=n;let{device:r}=e;this.screen=r.createBuffer({size:32,usage:GPUBufferUsage.UNIFORM|GPUBufferUsage.COPY_DST}),this.smooth=r.createSampler({magFilter:`linear`,minFilter:`linear`})}targetOf(e,t,n){let r=this.target;if(r&&r.width===e&&r.height===t&&r.format===n)return r;r?.sums.destroy(),r?.before.destroy();let{device:i}=this.graphics,{RENDER_ATTACHMENT:a,COPY_SRC:o,COPY_DST:s,TEXTURE_BINDING:c}=GPUTextureUsage,l=r=>i.createTexture({size:[e,t],format:n,usage:r}),u=l(a|o|c),d=l(c|s),f=i.createBindGroup({layout:this.programs.layouts[2],entries:[{binding:0,resource:{buffer:this.scene.layers,size:16}},{binding:1,resource:d.createView()}]});return this.target={width:e,height:t,format:n,sums:u,before:d,batch:f},this.target}setFrame(e,t,n,r){let{info:i,surfels:a,atlasSize:o,count:s}=this.scene,c=new ArrayBuffer(160),[l,u]=[new Float32Array(c),new Uint32Array(c)],{right:d,down:f,forward:p}=e.pose;[d,f,p].forEach((e,t)=>l.set(e,4*t));let m=e=>e.map((e,t)=>e-a.origin[t]);l.set(m(e.pose.position),12),l.set(m(r.held??e.pose.position),16),l.set([e.fx,e.fy,e.cx,e.cy],20),l.set([t,n,i.near,i.weightBound],24),l.set([i.atlas?.offset??0,i.atlas?.scale??1,...o],28),u.set([s,a.kind,+!!i.throughPixel,r.layers],32),u.set([A[r.show],+!!r.residuals,0,0],36),this.graphics.device.queue.writeBuffer(this.scene.frame,0,c)}encode(e,t,n,r,i){let{scene:a,programs:o}=this,s=this.targetOf(n,r,i.fine&&this.graphics.floats?`rgba32float`:`rgba16float`);this.setFrame(t,n,r,i),e.clearBuffer(a.visible),a.encodeSorting(e);let c=o.draw(s.format,i.show===`overdraw`?`count`:`blend`),l=s.sums.createView();for(let t=0;t<i.layers;t++){t&&e.copyTextureToTexture({texture:s.sums},{texture:s.before},[n,r]);let i=e.beginRenderPass({colorAttachments:[{view:l,loadOp:t?`load`:`clear`,storeOp:`store`,clearValue:[0,0,0,1]}]});i.setPipeline(c),i.setBindGroup(0,a.drawn),i.setBindGroup(1,a.pages),i.setBindGroup(2,s.batch,[t*256]),i.drawIndirect(a.draws,16*t),i.end()}return s}encodePresent(e,t,n,r,i){let{device:a}=this.graphics,o=this.programs.present(n.format),s=new ArrayBuffer(32);new Float32Array(s).set([...r.background,1,n.width,n.height]),new Uint32Array(s)[6]=A[r.show],new Float32Array(s)[7]=r.show===`overdraw`?64:i,a.queue.writeBuffer(this.screen,0,s);let c=$(a,o.getBindGroupLayout(0),[this.screen,t.sums.createView(),this.smooth]),l=e.beginRenderPass({colorAttachments:[{view:n.createView(),loadOp:`clear`,storeOp:`store`}]});l.setPipeline(o),l.setBindGroup(0,c),l.draw(3),l.end()}draw(e,t,n,r,i){let a=this.graphics.device.createCommandEncoder(),[o,s]=[t.width,t.height].map(e=>Math.max(1,Math.round(e*n))),c=this.encode(a,e.scaledTo(o,s),o,s,r);this.encodePresent(a,c,t,r,i),this.graphics.device.queue.submit([a.finish()])}done(){return this.graphics.device.queue.onSubmittedWorkDone()}async read(e,t,n){let{device:r}=this.graphics,{width:i,height:a}=e,{RENDER_ATTACHMENT:o,COPY_SRC:s}=GPUTextureUsage,c=r.createTexture({size:[i,a],format:`rgba8unorm`,usage:o|s}),l=Math.ceil(4*i/256)*256,{COPY_DST:u,MAP_READ:d}=GPUBufferUsage,f=r.createBuffer({size:l*a,usage:u|d}),p=r.createCommandEncoder();this.encodePresent(p,this.encode(p,e,i,a,t),c,t,n),p.copyTextureToBuffer({texture:c},{buffer:f,bytesPerRow:l},[i,a]),r.queue.submit([p.finish()]),await f.mapAsync(GPUMapMode.READ);let m=new Uint8Array(f.getMappedRange()),h=new ImageData(i,a);for(let e=0;e<a;e++)h.data.set(m.subarray(e*l,e*l+4*i),4*i*e);return f.destroy(),c.destroy(),h}},wt=class{canvas;renderer;context;constructor(e,t,n){this.canvas=e,this.renderer=t;let r=e.getContext(`webgpu`);if(!r)throw Error(`The canvas gives no WebGPU context.`);r.configure({device:n,format:navigator.gpu.getPreferredCanvasFormat(),alphaMode:`opaque`}),this.context=r}async draw(e,t,n,r){(this.canvas.width!==e.width||this.canvas.height!==e.height)&&(this.canvas.width=e.width,this.canvas.height=e.height),this.renderer.draw(e,this.context.getCurrentTexture(),t,n,r),await this.renderer.done()}},Tt=class{canvas;renderer;context;constructor(e,t){this.canvas=e,this.renderer=t;let n=e.getContext(`2d`,{alpha:!1});if(!n)throw Error(`The canvas gives no 2D context.`);this.context=n}async draw(e,t,n,r){let[i,a]=[e.width,e.height].map(e=>Math.max(1,Math.round(e*t))),o=await this.renderer.read(e.scaledTo(i,a),n,r);this.canvas.width=i,this.canvas.height=a,this.context.putImageData(o,0,0)}},Et=(e,t,n)=>n.software?new Tt(e,t):new wt(e,t,n.device),Dt=`bundle/`;async function Ot(){try{let e=await(await fetch(`view.json`)).json();return typeof e.title==`string`?e.title.slice(0,120):`Scene`}catch{return`Scene`}}async function kt(){let t=await ot(),{device:n}=t,r=at(Dt,s),i=new N(n),a=await r,o=new St(t,i,a.info,a.surfels,a.pages),d=e(`canvas`);n.lost.then(e=>{e.reason!==`destroyed`&&c(Error(`The graphics device was lost: ${e.message}`))}),document.title=e(`title`).textContent=await Ot(),l();let f=new Ct(t,i,o),p=new He(d,Et(d,f,t),f,a);t.software&&u(`No graphics card draws here: the processor does, slowly.`),o.decoded&&u(`This device draws no BC7 textures: the texture was decoded, at four times the graphics memory.`),p.start()}kt().catch(c);

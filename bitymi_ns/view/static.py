@@ -1,0 +1,46 @@
+"""A page with its bundle as a folder, which any web server can send."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from bitymi_ns.files import complete_folder
+
+from .page import PageError, Site
+
+
+def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
+    """Writes what is served to a folder, which appears complete or not at all.
+
+    Args:
+        site: the page and its bundle.
+        folder: where to.
+        overwrite: replace a page that was written there before.
+
+    Returns:
+        bytes written.
+
+    Raises:
+        PageError: something else is there.
+        OSError: the folder cannot be written.
+    """
+
+    def check() -> None:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        ours = (folder / "index.html").is_file() and (folder / "bundle" / "bundle.json").is_file()
+        if not ours:
+            raise PageError(f"{folder} holds something else than an exported page: choose another folder")
+        if not overwrite:
+            raise PageError(f"{folder} is there already: choose another folder, or add --overwrite")
+
+    with complete_folder(folder, check) as new:
+        for path in site.paths:
+            to = new / path
+            to.parent.mkdir(exist_ok=True)
+            if path in site.texts:
+                to.write_bytes(site.texts[path])
+            else:
+                shutil.copyfile(site.files[path], to)
+        return sum(path.stat().st_size for path in new.rglob("*") if path.is_file())

@@ -1,0 +1,296 @@
+// The viewer: what is shown, drawn when something has changed, and the elements that change it.
+import type { Bundle } from './bundle/load';
+import type { Vec3 } from './bundle/manifest';
+import type { Look, Renderer } from './render/renderer';
+import type { Show } from './render/programs';
+import type { Screen } from './render/screen';
+import { element, press, pressed } from './ui/dom';
+import { notify, showError } from './ui/pages';
+import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
+import { Controls, type Mode } from './view/controls';
+import { Pace } from './view/pace';
+import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
+import { fromHash, toHash } from './view/share';
+import { extentOf, firstPose } from './view/start';
+import { length, subtract } from './view/vector';
+
+const MOVING_LAYERS = 4; // batches while the camera moves, and of a picture that stays
+const STILL_LAYERS = 16;
+const STILL_AFTER = 250; // milliseconds
+
+export class App {
+  private readonly controls: Controls;
+  private readonly cameras: CaptureCamera[];
+  private readonly pace = new Pace();
+  private readonly size: number;
+  private lens: Lens = DEFAULT_LENS;
+  private first: { pose: Pose; target: Vec3; lens: Lens };
+  private held: Vec3 | null = null;
+  private show: Show = 'color';
+  private dirty = true;
+  private still = false;
+  private movedAt = 0;
+  private drawing = false;
+
+  constructor(
+    private readonly canvas: HTMLCanvasElement,
+    private readonly screen: Screen,
+    private readonly renderer: Renderer,
+    private readonly bundle: Bundle,
+  ) {
+    const { info, surfels } = bundle;
+    const { middle, size } = extentOf(surfels);
+    const up = info.up ?? [0, 0, 1];
+    this.size = size;
+    this.cameras = parseCameras(bundle.cameras ?? '');
+    this.first = { pose: firstPose(middle, size, up), target: middle, lens: DEFAULT_LENS };
+    if (this.cameras.length) {
+      const start = this.cameras.find((camera) => camera.heldOut) ?? this.cameras[0];
+      this.first = { pose: start.pose, target: this.targetOf(start.pose), lens: start.lens };
+    }
+    this.controls = new Controls(canvas, this.first.pose, this.first.target, up, size, () => this.touch());
+    this.lens = this.first.lens;
+    this.bind();
+  }
+
+  start(): void {
+    const shared = fromHash(location.hash);
+    if (shared) this.apply(shared);
+    new ResizeObserver(() => this.touch()).observe(this.canvas);
+    addEventListener('hashchange', () => {
+      const given = fromHash(location.hash);
+      if (given) this.apply(given);
+    });
+    this.canvas.focus();
+    requestAnimationFrame((now) => this.tick(now));
+  }
+
+  private targetOf(pose: Pose): Vec3 {
+    const common = commonTarget(this.cameras);
+    const ahead = common ? length(subtract(common, pose.position)) : this.size;
+    return moved(pose, 0, 0, ahead).position;
+  }
+
+  private apply(shared: ReturnType<typeof fromHash> & object): void {
+    this.controls.pose = shared.pose;
+    this.controls.target = shared.target;
+    this.lens = shared.lens;
+    this.setShow(shared.show);
+    press(element('texture'), shared.residuals);
+    this.touch();
+  }
+
+  private touch(): void {
+    this.dirty = true;
+    this.still = false;
+    this.movedAt = performance.now();
+  }
+
+  private look(still: boolean): Look {
+    return {
+      show: this.show,
+      residuals: pressed(element('texture')),
+      held: this.held,
+      background: this.bundle.info.background,
+      layers: still ? STILL_LAYERS : MOVING_LAYERS,
+      fine: still,
+    };
+  }
+
+  // Farthest depth that the map of depths tells apart.
+  private farthest(): number {
+    return length(subtract(this.controls.pose.position, this.first.target)) + 1.5 * this.size;
+  }
+
+  private tick(now: number): void {
+    requestAnimationFrame((next) => this.tick(next));
+    this.controls.advance(now);
+    if (this.drawing) return;
+    if (this.dirty) void this.frame(false);
+    else if (!this.still && now - this.movedAt > STILL_AFTER) void this.frame(true);
+  }
+
+  private async frame(still: boolean): Promise<void> {
+    this.drawing = true;
+    this.dirty = false;
+    const ratio = Math.min(devicePixelRatio, 2);
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((s) => Math.round(s * ratio));
+    if (width > 0 && height > 0) {
+      const chosen = element<HTMLSelectElement>('resolution').value;
+      const scale = chosen !== 'auto' ? Number(chosen) : still ? 1 : this.pace.scale;
+      const begin = performance.now();
+      try {
+        const view = View.contain(this.controls.pose, this.lens, width, height);
+        await this.screen.draw(view, scale, this.look(still), this.farthest());
+      } catch (error) {
+        showError(error);
+        return;
+      }
+      const took = performance.now() - begin;
+      if (!still && chosen === 'auto') this.pace.took(took);
+      this.still = still;
+      this.report(took, scale);
+      document.documentElement.dataset.frame = still ? 'still' : 'moving';
+    }
+    this.drawing = false;
+  }
+
+  private report(milliseconds: number, scale: number): void {
+    const count = this.renderer.scene.count.toLocaleString('en');
+    element('status').textContent =
+      `${milliseconds.toFixed(milliseconds < 10 ? 1 : 0)} ms · ${Math.round(100 * scale)} % · ${count} surfels`;
+  }
+
+  private bind(): void {
+    const on = (id: string, run: () => void): void => element(id).addEventListener('click', run);
+    on('orbit', () => this.setMode('orbit'));
+    on('fly', () => this.setMode('fly'));
+    on('home', () => this.goHome());
+    on('previous', () => this.step(-1));
+    on('next', () => this.step(1));
+    on('beside', () => this.toggleBeside());
+    on('texture', () => this.toggle('texture'));
+    on('colors', () => {
+      this.held = this.toggle('colors') ? null : this.controls.pose.position;
+    });
+    on('screenshot', () => void this.screenshot());
+    on('share', () => void this.share());
+    on('theme', () => this.turnTheme());
+    on('menu', () => {
+      const open = element('panel').classList.toggle('open');
+      element('menu').setAttribute('aria-expanded', String(open));
+    });
+    element('resolution').addEventListener('change', () => this.touch());
+    element('show').addEventListener('change', (e) => this.setShow((e.target as HTMLSelectElement).value as Show));
+    element('camera').addEventListener('change', (e) => this.jump(Number((e.target as HTMLSelectElement).value)));
+    addEventListener('keydown', (e) => this.shortcut(e));
+    this.fillCameras();
+  }
+
+  private shortcut(e: KeyboardEvent): void {
+    if (e.target instanceof HTMLSelectElement) return;
+    if ((e.ctrlKey || e.metaKey) && e.code === 'KeyS') {
+      e.preventDefault();
+      void this.screenshot();
+    }
+    if (e.ctrlKey || e.metaKey || e.altKey) return;
+    const id = { o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture' }[e.key];
+    const other = { c: 'colors', l: 'share' }[e.key];
+    const found = id ?? other;
+    if (found && !element(found).hidden) element(found).click();
+  }
+
+  private toggle(id: string): boolean {
+    const now = !pressed(element(id));
+    press(element(id), now);
+    this.touch();
+    return now;
+  }
+
+  private setMode(mode: Mode): void {
+    this.controls.mode = mode;
+    press(element('orbit'), mode === 'orbit');
+    press(element('fly'), mode === 'fly');
+    this.canvas.focus();
+  }
+
+  private setShow(show: Show): void {
+    this.show = show;
+    element<HTMLSelectElement>('show').value = show;
+    this.touch();
+  }
+
+  private goHome(): void {
+    this.controls.pose = this.first.pose;
+    this.controls.target = this.first.target;
+    this.lens = this.first.lens;
+    this.touch();
+  }
+
+  private fillCameras(): void {
+    element('cameras').hidden = !this.cameras.length;
+    element('beside').hidden = !this.cameras.some((camera) => camera.photograph);
+    const list = element<HTMLSelectElement>('camera');
+    this.cameras.forEach((camera, k) =>
+      list.add(new Option(camera.name + (camera.heldOut ? ' · held out' : ''), `${k}`)),
+    );
+    const start = this.cameras.findIndex((camera) => camera.heldOut);
+    list.value = String(Math.max(0, start));
+  }
+
+  private step(by: number): void {
+    const list = element<HTMLSelectElement>('camera');
+    const next = (Number(list.value) + by + this.cameras.length) % this.cameras.length;
+    list.value = String(next);
+    this.jump(next);
+  }
+
+  private jump(k: number): void {
+    const camera = this.cameras[k];
+    this.controls.pose = camera.pose;
+    this.controls.target = this.targetOf(camera.pose);
+    this.lens = camera.lens;
+    this.setPhotograph();
+    this.touch();
+  }
+
+  private toggleBeside(): void {
+    const shown = this.toggle('beside');
+    if (shown && !this.cameras[Number(element<HTMLSelectElement>('camera').value)].photograph) {
+      this.jumpToPhotograph();
+    }
+    if (shown) this.jump(Number(element<HTMLSelectElement>('camera').value));
+    this.setPhotograph();
+  }
+
+  private jumpToPhotograph(): void {
+    const k = this.cameras.findIndex((camera) => camera.photograph);
+    element<HTMLSelectElement>('camera').value = String(k);
+  }
+
+  private setPhotograph(): void {
+    const camera = this.cameras[Number(element<HTMLSelectElement>('camera').value)];
+    const shown = pressed(element('beside'));
+    element('photograph').hidden = !shown;
+    if (!shown) return;
+    const image = element<HTMLImageElement>('photograph-image');
+    if (camera.photograph) image.src = `bundle/${camera.photograph}`;
+    else image.removeAttribute('src');
+    element('photograph-name').textContent = camera.photograph ? 'Photograph' : 'No photograph of this camera';
+  }
+
+  private turnTheme(): void {
+    const root = document.documentElement;
+    const next = { '': 'light', light: 'dark', dark: '' }[root.dataset.theme ?? ''] ?? '';
+    if (next) root.dataset.theme = next;
+    else delete root.dataset.theme;
+    element('theme').textContent = next ? `Theme: ${next}` : 'Theme';
+  }
+
+  private async screenshot(): Promise<void> {
+    const ratio = Math.min(devicePixelRatio, 2);
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((s) => Math.round(s * ratio));
+    const view = View.contain(this.controls.pose, this.lens, width, height);
+    const image = await this.renderer.read(view, this.look(true), this.farthest());
+    const canvas = new OffscreenCanvas(width, height);
+    canvas.getContext('2d')?.putImageData(image, 0, 0);
+    const link = document.createElement('a');
+    link.href = URL.createObjectURL(await canvas.convertToBlob({ type: 'image/png' }));
+    link.download = `${document.title || 'scene'}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+    this.touch();
+  }
+
+  private async share(): Promise<void> {
+    const { pose, target } = this.controls;
+    const residuals = pressed(element('texture'));
+    history.replaceState(null, '', toHash({ pose, target, lens: this.lens, show: this.show, residuals }));
+    try {
+      await navigator.clipboard.writeText(location.href);
+      notify('The link to this view was copied.');
+    } catch {
+      notify('The link to this view is in the address bar.');
+    }
+  }
+}

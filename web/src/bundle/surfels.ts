@@ -1,0 +1,148 @@
+// Surfels as the shaders read them: the struct Surfel of scene.wgsl, and the terms of the view colours.
+import { DamagedBundle } from '../errors';
+import type { Manifest, Vec3, ViewKind } from './manifest';
+import { Table, parsePly } from './ply';
+
+export const SURFEL_WORDS = 24;
+export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const; // VIEW_* of view_color.wgsl
+const LEAN_WIDTH: Record<ViewKind, number> = { sv: 6, sh: 3, sb: 6, sg: 7 };
+const MAX_TERMS = 32;
+// words of a surfel
+const MEAN = 0;
+const OPACITY = 3;
+const QUAT = 4;
+const LOG_SCALE = 8;
+const BETA = 10;
+const EXTENT = 11;
+const RESIDUAL = 12;
+const LAYER = 15;
+const BASE = 16;
+const FIRST_TERM = 19;
+const TILE = 20;
+const SIDES = 22;
+const TERMS = 23;
+
+export interface Surfels {
+  count: number;
+  words: Float32Array;
+  terms: Float32Array;
+  kind: number;
+  origin: Vec3; // taken off the means
+}
+
+function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): Float32Array {
+  const numbers = new Uint32Array(words.buffer);
+  const width = LEAN_WIDTH[kind];
+  for (let c = 0; c < 3; c++) rows.into(`view_base_${c}`, words, BASE + c, SURFEL_WORDS);
+  const counts = new Int32Array(rows.count);
+  rows.into('view_terms', counts, 0, 1);
+  let first = 0;
+  for (let i = 0; i < rows.count; i++) {
+    if (counts[i] < 0 || counts[i] > MAX_TERMS)
+      throw new DamagedBundle(`surfels.ply: view_terms is wrong in row ${i}.`);
+    numbers[i * SURFEL_WORDS + FIRST_TERM] = first * width;
+    numbers[i * SURFEL_WORDS + TERMS] = counts[i];
+    first += counts[i];
+  }
+  if (first !== terms.count) throw new DamagedBundle('surfels.ply: view_terms does not count the rows of view_term.');
+  const out = new Float32Array(terms.count * width);
+  for (let c = 0; c < width; c++) terms.into(`term_${c}`, out, c, width);
+  return out;
+}
+
+// All terms of every surfel: [columns of a term as (name, width)], interleaved term by term.
+function whole(rows: Table, words: Float32Array, parts: [string, number][], base: string | null): Float32Array {
+  const numbers = new Uint32Array(words.buffer);
+  const width = parts.reduce((sum, [, w]) => sum + w, 0);
+  const count = rows.width(parts[0][0]) / parts[0][1];
+  if (parts.some(([name, w]) => rows.width(name) !== count * w)) {
+    throw new DamagedBundle('surfels.ply: the columns of the view colour do not fit together.');
+  }
+  const out = new Float32Array(rows.count * count * width);
+  let from = 0;
+  for (const [name, w] of parts) {
+    for (let k = 0; k < count; k++) {
+      for (let c = 0; c < w; c++) rows.into(`${name}_${k * w + c}`, out, k * width + from + c, count * width);
+    }
+    from += w;
+  }
+  if (base !== null) for (let c = 0; c < 3; c++) rows.into(`${base}_${c}`, words, BASE + c, SURFEL_WORDS);
+  for (let i = 0; i < rows.count; i++) {
+    numbers[i * SURFEL_WORDS + FIRST_TERM] = i * count * width;
+    numbers[i * SURFEL_WORDS + TERMS] = count;
+  }
+  return out;
+}
+
+const WHOLE: Record<ViewKind, { parts: [string, number][]; base: string | null; kind: number }> = {
+  sv: {
+    parts: [
+      ['sv_sites', 3],
+      ['sv_log_tau', 1],
+      ['sv_rgb', 3],
+    ],
+    base: null,
+    kind: KINDS['sv sites'],
+  },
+  sh: { parts: [['sh_rest', 3]], base: 'sh_dc', kind: KINDS.sh },
+  sb: { parts: [['sb_lobes', 6]], base: 'sb_base', kind: KINDS.sb },
+  sg: { parts: [['sg_lobes', 7]], base: 'sg_base', kind: KINDS.sg },
+};
+
+function tiles(rows: Table, words: Float32Array, info: Manifest): void {
+  const numbers = new Uint32Array(words.buffer);
+  const columns = ['tile_x', 'tile_y', 'tile_layer', 'tile_ru', 'tile_rv'].map((name) => {
+    const column = new Int32Array(rows.count);
+    rows.into(name, column, 0, 1);
+    return column;
+  });
+  const [width, height, layers] = info.atlas ? [info.atlas.width, info.atlas.height, info.atlas.layers] : [0, 0, 1];
+  for (let i = 0, to = 0; i < rows.count; i++, to += SURFEL_WORDS) {
+    const [x, y, layer, ru, rv] = columns.map((column) => column[i]);
+    const fits = x >= 0 && y >= 0 && ru >= 0 && rv >= 0 && x + ru <= width && y + rv <= height;
+    if (!fits || layer < 0 || layer >= layers || ru > 0 !== rv > 0) {
+      throw new DamagedBundle(`surfels.ply: the tile of surfel ${i} lies outside the atlas.`);
+    }
+    numbers[to + TILE] = x;
+    numbers[to + TILE + 1] = y;
+    numbers[to + LAYER] = layer;
+    numbers[to + SIDES] = ru | (rv << 16);
+  }
+}
+
+export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
+  const elements = parsePly(data);
+  const vertex = elements.get('vertex');
+  if (!vertex || vertex.count !== info.count) {
+    throw new DamagedBundle(`surfels.ply has not the ${info.count} surfels of bundle.json.`);
+  }
+  const rows = new Table(data, vertex, 'vertex');
+  const words = new Float32Array(rows.count * SURFEL_WORDS);
+  const copy = (column: string, at: number): void => rows.into(column, words, at, SURFEL_WORDS);
+  ['x', 'y', 'z'].forEach((name, c) => copy(name, MEAN + c));
+  [0, 1, 2, 3].forEach((c) => copy(`rot_${c}`, QUAT + c));
+  [0, 1].forEach((c) => copy(`scale_${c}`, LOG_SCALE + c));
+  copy('opacity', OPACITY);
+  copy('beta', BETA);
+  const extent = info.atlas?.extent ?? 3;
+  if (rows.has('tile_extent')) copy('tile_extent', EXTENT);
+  else for (let at = EXTENT; at < words.length; at += SURFEL_WORDS) words[at] = extent;
+  if (rows.has('residual_0')) [0, 1, 2].forEach((c) => copy(`residual_${c}`, RESIDUAL + c));
+  tiles(rows, words, info);
+  const term = elements.get('view_term');
+  const form = WHOLE[info.viewColor];
+  const terms = term
+    ? lean(rows, new Table(data, term, 'view_term'), words, info.viewColor)
+    : whole(rows, words, form.parts, form.base);
+  for (let i = 0; i < words.length; i += SURFEL_WORDS) {
+    for (let c = MEAN; c < RESIDUAL; c++) {
+      if (!Number.isFinite(words[i + c])) {
+        throw new DamagedBundle(`surfels.ply: surfel ${i / SURFEL_WORDS} has a number that is not finite.`);
+      }
+    }
+  }
+  const { min, max } = info.bounds;
+  const origin = min.map((low, c) => (low + max[c]) / 2) as Vec3;
+  for (let i = 0; i < words.length; i += SURFEL_WORDS) for (let c = 0; c < 3; c++) words[i + c] -= origin[c];
+  return { count: rows.count, words, terms, kind: term ? KINDS[info.viewColor] : form.kind, origin };
+}

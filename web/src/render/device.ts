@@ -1,0 +1,37 @@
+// The graphics device.
+import { ViewerError } from '../errors';
+
+const NEEDS =
+  'Chrome and Edge from 113, Safari from 26 and Firefox from 141 have it. Update the browser and the graphics driver, ' +
+  'and look whether hardware acceleration is switched on. Pages need https, or an address on this machine.';
+
+export interface Graphics {
+  device: GPUDevice;
+  name: string;
+  blocks: boolean; // BC7 textures
+  floats: boolean; // blends and filters rgba32float
+  software: boolean; // the processor draws
+}
+
+export async function openDevice(): Promise<Graphics> {
+  const gpu = (navigator as Partial<Navigator>).gpu;
+  if (!gpu) throw new ViewerError('This browser has no WebGPU', 'The viewer draws with WebGPU.', NEEDS);
+  const adapter = await gpu.requestAdapter({ powerPreference: 'high-performance' });
+  if (!adapter) throw new ViewerError('No graphics device', 'WebGPU finds nothing here that could draw.', NEEDS);
+  const wanted = ['texture-compression-bc', 'float32-blendable', 'float32-filterable'] as GPUFeatureName[];
+  const features = wanted.filter((name) => adapter.features.has(name));
+  const { maxTextureDimension2D, maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
+  const { architecture, device: deviceName, description, vendor } = adapter.info;
+  const device = await adapter.requestDevice({
+    requiredFeatures: features,
+    requiredLimits: { maxTextureDimension2D, maxStorageBufferBindingSize, maxBufferSize },
+  });
+  return {
+    device,
+    name: description || deviceName || vendor || 'unnamed',
+    blocks: features.includes(wanted[0]),
+    floats: features.includes(wanted[1]) && features.includes(wanted[2]),
+    software:
+      adapter.info.isFallbackAdapter || /swiftshader|llvmpipe/i.test(`${architecture} ${deviceName} ${description}`),
+  };
+}

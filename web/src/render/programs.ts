@@ -1,0 +1,112 @@
+// The shaders, put together and compiled. bitymi_ns/ops/webgpu/programs.py does the same in Python.
+import batches from '../../../bitymi_ns/ops/shaders/batches.wgsl?raw';
+import bounds from '../../../bitymi_ns/ops/shaders/bounds.wgsl?raw';
+import draw from '../../../bitymi_ns/ops/shaders/draw.wgsl?raw';
+import prepare from '../../../bitymi_ns/ops/shaders/prepare.wgsl?raw';
+import present from '../../../bitymi_ns/ops/shaders/present.wgsl?raw';
+import scene from '../../../bitymi_ns/ops/shaders/scene.wgsl?raw';
+import shareOut from '../../../bitymi_ns/ops/shaders/share_out.wgsl?raw';
+import sort from '../../../bitymi_ns/ops/shaders/sort.wgsl?raw';
+import viewColor from '../../../bitymi_ns/ops/shaders/view_color.wgsl?raw';
+
+export const SHOW = { color: 0, depth: 1, normal: 2, overdraw: 3, residual: 4 } as const; // SHOW_* of scene.wgsl
+export type Show = keyof typeof SHOW;
+export type TargetFormat = 'rgba16float' | 'rgba32float';
+export const SORT_ENTRIES = ['count', 'scan', 'scatter'] as const;
+export type SortEntry = (typeof SORT_ENTRIES)[number];
+
+const TRANSMITTANCE: GPUBlendComponent = { operation: 'add', srcFactor: 'zero', dstFactor: 'one-minus-src-alpha' };
+const COLOR: Record<'blend' | 'count', GPUBlendComponent> = {
+  blend: { operation: 'add', srcFactor: 'dst-alpha', dstFactor: 'one' },
+  count: { operation: 'add', srcFactor: 'one', dstFactor: 'one' },
+};
+
+export class Programs {
+  readonly prepare: GPUComputePipeline;
+  readonly sort: Record<SortEntry, GPUComputePipeline>;
+  readonly shareOut: GPUComputePipeline;
+  readonly layouts: [GPUBindGroupLayout, GPUBindGroupLayout, GPUBindGroupLayout];
+  private readonly drawing: GPUShaderModule;
+  private readonly presenting: GPUShaderModule;
+  private readonly draws = new Map<string, GPURenderPipeline>();
+  private readonly presents = new Map<string, GPURenderPipeline>();
+
+  constructor(private readonly device: GPUDevice) {
+    const module = (label: string, ...parts: string[]): GPUShaderModule =>
+      device.createShaderModule({ label, code: parts.join('\n') });
+    const compute = (from: GPUShaderModule, entryPoint: string): GPUComputePipeline =>
+      device.createComputePipeline({ layout: 'auto', compute: { module: from, entryPoint } });
+    this.prepare = compute(module('prepare', scene, viewColor, bounds, prepare), 'prepare');
+    const sorting = module('sort', sort);
+    this.sort = {
+      count: compute(sorting, 'count'),
+      scan: compute(sorting, 'scan'),
+      scatter: compute(sorting, 'scatter'),
+    };
+    this.shareOut = compute(module('share_out', scene, batches, shareOut), 'share_out');
+    this.drawing = module('draw', scene, batches, draw);
+    this.presenting = module('present', scene, present);
+    this.layouts = this.makeLayouts();
+  }
+
+  private makeLayouts(): [GPUBindGroupLayout, GPUBindGroupLayout, GPUBindGroupLayout] {
+    const { VERTEX, FRAGMENT } = GPUShaderStage;
+    const make = (...entries: GPUBindGroupLayoutEntry[]): GPUBindGroupLayout =>
+      this.device.createBindGroupLayout({ entries });
+    const read = (binding: number): GPUBindGroupLayoutEntry => ({
+      binding,
+      visibility: VERTEX,
+      buffer: { type: 'read-only-storage' },
+    });
+    return [
+      make(
+        { binding: 0, visibility: VERTEX | FRAGMENT, buffer: { type: 'uniform' } },
+        ...[1, 2, 3, 4].map((k) => read(k)),
+      ),
+      make(
+        { binding: 0, visibility: FRAGMENT, texture: { sampleType: 'float', viewDimension: '2d-array' } },
+        { binding: 1, visibility: FRAGMENT, sampler: { type: 'filtering' } },
+      ),
+      make(
+        {
+          binding: 0,
+          visibility: VERTEX | FRAGMENT,
+          buffer: { type: 'uniform', hasDynamicOffset: true, minBindingSize: 16 },
+        },
+        { binding: 1, visibility: FRAGMENT, texture: { sampleType: 'unfilterable-float' } },
+      ),
+    ];
+  }
+
+  draw(format: TargetFormat, how: 'blend' | 'count'): GPURenderPipeline {
+    const key = `${format} ${how}`;
+    let found = this.draws.get(key);
+    if (!found) {
+      found = this.device.createRenderPipeline({
+        layout: this.device.createPipelineLayout({ bindGroupLayouts: this.layouts }),
+        vertex: { module: this.drawing, entryPoint: 'corner' },
+        primitive: { topology: 'triangle-strip' },
+        fragment: {
+          module: this.drawing,
+          entryPoint: 'surfel',
+          targets: [{ format, blend: { color: COLOR[how], alpha: TRANSMITTANCE } }],
+        },
+      });
+      this.draws.set(key, found);
+    }
+    return found;
+  }
+
+  present(format: GPUTextureFormat): GPURenderPipeline {
+    let found = this.presents.get(format);
+    if (!found) {
+      found = this.device.createRenderPipeline({
+        layout: 'auto',
+        vertex: { module: this.presenting, entryPoint: 'whole' },
+        fragment: { module: this.presenting, entryPoint: 'present', targets: [{ format }] },
+      });
+      this.presents.set(format, found);
+    }
+    return found;
+  }
+}

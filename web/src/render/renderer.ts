@@ -1,0 +1,171 @@
+// Draws frames of a scene: to a target of sums, and from there to a screen.
+import type { Vec3 } from '../bundle/manifest';
+import type { View } from '../view/pose';
+import type { Graphics } from './device';
+import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
+import { type SceneOnDevice, STRIDE, group } from './scene';
+
+export interface Look {
+  show: Show;
+  residuals: boolean;
+  held: Vec3 | null; // from where view colours are seen; null: from the camera
+  background: Vec3;
+  layers: number; // batches: draw.wgsl
+  fine: boolean; // in single precision, where the device blends it
+}
+
+interface Target {
+  width: number;
+  height: number;
+  format: TargetFormat;
+  sums: GPUTexture;
+  before: GPUTexture;
+  batch: GPUBindGroup;
+}
+
+export const MOST_OVERDRAW = 64; // of the last colour of the map
+
+export class Renderer {
+  private target: Target | null = null;
+  private readonly screen: GPUBuffer;
+  private readonly smooth: GPUSampler;
+
+  constructor(
+    private readonly graphics: Graphics,
+    private readonly programs: Programs,
+    readonly scene: SceneOnDevice,
+  ) {
+    const { device } = graphics;
+    this.screen = device.createBuffer({ size: 32, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
+    this.smooth = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
+  }
+
+  private targetOf(width: number, height: number, format: TargetFormat): Target {
+    const t = this.target;
+    if (t && t.width === width && t.height === height && t.format === format) return t;
+    t?.sums.destroy();
+    t?.before.destroy();
+    const { device } = this.graphics;
+    const { RENDER_ATTACHMENT, COPY_SRC, COPY_DST, TEXTURE_BINDING } = GPUTextureUsage;
+    const make = (usage: number): GPUTexture => device.createTexture({ size: [width, height], format, usage });
+    const sums = make(RENDER_ATTACHMENT | COPY_SRC | TEXTURE_BINDING);
+    const before = make(TEXTURE_BINDING | COPY_DST);
+    const batch = device.createBindGroup({
+      layout: this.programs.layouts[2],
+      entries: [
+        { binding: 0, resource: { buffer: this.scene.layers, size: 16 } },
+        { binding: 1, resource: before.createView() },
+      ],
+    });
+    this.target = { width, height, format, sums, before, batch };
+    return this.target;
+  }
+
+  private setFrame(view: View, width: number, height: number, look: Look): void {
+    const { info, surfels, atlasSize, count } = this.scene;
+    const data = new ArrayBuffer(160);
+    const [f, u] = [new Float32Array(data), new Uint32Array(data)];
+    const { right, down, forward } = view.pose;
+    [right, down, forward].forEach((row, k) => f.set(row, 4 * k));
+    const relative = (at: Vec3): number[] => at.map((x, c) => x - surfels.origin[c]);
+    f.set(relative(view.pose.position), 12);
+    f.set(relative(look.held ?? view.pose.position), 16);
+    f.set([view.fx, view.fy, view.cx, view.cy], 20);
+    f.set([width, height, info.near, info.weightBound], 24);
+    f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
+    u.set([count, surfels.kind, info.throughPixel ? 1 : 0, look.layers], 32);
+    u.set([SHOW[look.show], look.residuals ? 1 : 0, 0, 0], 36);
+    this.graphics.device.queue.writeBuffer(this.scene.frame, 0, data);
+  }
+
+  private encode(encoder: GPUCommandEncoder, view: View, width: number, height: number, look: Look): Target {
+    const { scene, programs } = this;
+    const target = this.targetOf(width, height, look.fine && this.graphics.floats ? 'rgba32float' : 'rgba16float');
+    this.setFrame(view, width, height, look);
+    encoder.clearBuffer(scene.visible);
+    scene.encodeSorting(encoder);
+    const pipeline = programs.draw(target.format, look.show === 'overdraw' ? 'count' : 'blend');
+    const attachment = target.sums.createView();
+    for (let k = 0; k < look.layers; k++) {
+      if (k) encoder.copyTextureToTexture({ texture: target.sums }, { texture: target.before }, [width, height]);
+      const work = encoder.beginRenderPass({
+        colorAttachments: [
+          { view: attachment, loadOp: k ? 'load' : 'clear', storeOp: 'store', clearValue: [0, 0, 0, 1] },
+        ],
+      });
+      work.setPipeline(pipeline);
+      work.setBindGroup(0, scene.drawn);
+      work.setBindGroup(1, scene.pages);
+      work.setBindGroup(2, target.batch, [k * STRIDE]);
+      work.drawIndirect(scene.draws, 16 * k);
+      work.end();
+    }
+    return target;
+  }
+
+  private encodePresent(
+    encoder: GPUCommandEncoder,
+    target: Target,
+    to: GPUTexture,
+    look: Look,
+    farthest: number,
+  ): void {
+    const { device } = this.graphics;
+    const pipeline = this.programs.present(to.format);
+    const data = new ArrayBuffer(32);
+    new Float32Array(data).set([...look.background, 1, to.width, to.height]);
+    new Uint32Array(data)[6] = SHOW[look.show];
+    new Float32Array(data)[7] = look.show === 'overdraw' ? MOST_OVERDRAW : farthest;
+    device.queue.writeBuffer(this.screen, 0, data);
+    const bound = group(device, pipeline.getBindGroupLayout(0), [this.screen, target.sums.createView(), this.smooth]);
+    const work = encoder.beginRenderPass({
+      colorAttachments: [{ view: to.createView(), loadOp: 'clear', storeOp: 'store' }],
+    });
+    work.setPipeline(pipeline);
+    work.setBindGroup(0, bound);
+    work.draw(3);
+    work.end();
+  }
+
+  // Draws a view for a screen, at `scale` of the screen's resolution.
+  draw(view: View, to: GPUTexture, scale: number, look: Look, farthest: number): void {
+    const encoder = this.graphics.device.createCommandEncoder();
+    const [width, height] = [to.width, to.height].map((side) => Math.max(1, Math.round(side * scale)));
+    const target = this.encode(encoder, view.scaledTo(width, height), width, height, look);
+    this.encodePresent(encoder, target, to, look, farthest);
+    this.graphics.device.queue.submit([encoder.finish()]);
+  }
+
+  // When what was asked for so far is drawn.
+  done(): Promise<undefined> {
+    return this.graphics.device.queue.onSubmittedWorkDone();
+  }
+
+  // Draws a view to RGBA bytes.
+  async read(view: View, look: Look, farthest: number): Promise<ImageData> {
+    const { device } = this.graphics;
+    const { width, height } = view;
+    const { RENDER_ATTACHMENT, COPY_SRC } = GPUTextureUsage;
+    const to = device.createTexture({
+      size: [width, height],
+      format: 'rgba8unorm',
+      usage: RENDER_ATTACHMENT | COPY_SRC,
+    });
+    const bytesPerRow = Math.ceil((4 * width) / 256) * 256;
+    const { COPY_DST, MAP_READ } = GPUBufferUsage;
+    const buffer = device.createBuffer({ size: bytesPerRow * height, usage: COPY_DST | MAP_READ });
+    const encoder = device.createCommandEncoder();
+    this.encodePresent(encoder, this.encode(encoder, view, width, height, look), to, look, farthest);
+    encoder.copyTextureToBuffer({ texture: to }, { buffer, bytesPerRow }, [width, height]);
+    device.queue.submit([encoder.finish()]);
+    await buffer.mapAsync(GPUMapMode.READ);
+    const mapped = new Uint8Array(buffer.getMappedRange());
+    const image = new ImageData(width, height);
+    for (let y = 0; y < height; y++) {
+      image.data.set(mapped.subarray(y * bytesPerRow, y * bytesPerRow + 4 * width), 4 * width * y);
+    }
+    buffer.destroy();
+    to.destroy();
+    return image;
+  }
+}

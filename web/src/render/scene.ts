@@ -1,0 +1,160 @@
+// A bundle in the memory of the graphics device.
+import { decodeBc7 } from '../bundle/bc7';
+import { type Pages, blockOf } from '../bundle/ktx2';
+import type { Manifest } from '../bundle/manifest';
+import type { Surfels } from '../bundle/surfels';
+import { ViewerError } from '../errors';
+import type { Graphics } from './device';
+import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
+
+export const MOST_LAYERS = 64;
+export const STRIDE = 256; // between the uniforms of batches, which devices want so
+const BLOCK = 1024; // of sort.wgsl: keys per block, digits, rounds
+const DIGITS = 16;
+const ROUNDS = 8;
+const FRAME_BYTES = 160;
+
+type Resource = GPUBuffer | GPUTextureView | GPUSampler;
+
+export function group(device: GPUDevice, layout: GPUBindGroupLayout, resources: (Resource | null)[]): GPUBindGroup {
+  const entries: GPUBindGroupEntry[] = [];
+  resources.forEach((r, binding) => {
+    if (r !== null) entries.push({ binding, resource: r instanceof GPUBuffer ? { buffer: r } : r });
+  });
+  return device.createBindGroup({ layout, entries });
+}
+
+export class SceneOnDevice {
+  readonly count: number;
+  readonly frame: GPUBuffer;
+  readonly visible: GPUBuffer;
+  readonly draws: GPUBuffer;
+  readonly layers: GPUBuffer;
+  readonly drawn: GPUBindGroup;
+  readonly pages: GPUBindGroup;
+  readonly decoded: boolean; // BC7 that this device does not draw as it is
+  readonly atlasSize: [number, number];
+  private readonly device: GPUDevice;
+  private readonly preparing: GPUBindGroup;
+  private readonly rounds: Record<SortEntry, GPUBindGroup>[] = [];
+  private readonly sharing: GPUBindGroup;
+  private readonly blocks: number;
+
+  constructor(
+    graphics: Graphics,
+    private readonly programs: Programs,
+    readonly info: Manifest,
+    readonly surfels: Surfels,
+    pages: Pages | null,
+  ) {
+    const { device } = graphics;
+    this.device = device;
+    this.count = surfels.count;
+    this.blocks = Math.ceil(Math.max(1, this.count) / BLOCK);
+    this.checkRoom();
+    const { STORAGE, UNIFORM, COPY_DST, INDIRECT } = GPUBufferUsage;
+    const n = Math.max(1, this.count);
+    const stored = this.upload(surfels.words, STORAGE);
+    const terms = this.upload(surfels.terms, STORAGE);
+    const seen = this.empty(96 * n, STORAGE);
+    const keys = [0, 1].map(() => this.empty(4 * n, STORAGE));
+    const order = [0, 1].map(() => this.empty(4 * n, STORAGE));
+    const table = this.empty(4 * DIGITS * this.blocks, STORAGE);
+    this.frame = this.empty(FRAME_BYTES, UNIFORM | COPY_DST);
+    this.visible = this.empty(4, STORAGE | COPY_DST);
+    this.draws = this.empty(16 * MOST_LAYERS, STORAGE | INDIRECT);
+    const numbers = new Uint32Array((MOST_LAYERS * STRIDE) / 4);
+    for (let k = 0; k < MOST_LAYERS; k++) numbers[(k * STRIDE) / 4] = k;
+    this.layers = this.upload(numbers, UNIFORM);
+    const bind = (layout: GPUBindGroupLayout, ...r: (Resource | null)[]): GPUBindGroup => group(device, layout, r);
+    this.preparing = bind(
+      programs.prepare.getBindGroupLayout(0),
+      ...[this.frame, stored, terms, seen, keys[0], order[0], this.visible],
+    );
+    for (let k = 0; k < ROUNDS; k++) {
+      const [from, to] = [k % 2, 1 - (k % 2)];
+      const uniform = this.upload(new Uint32Array([this.count, this.blocks, 4 * k, 0]), UNIFORM);
+      const given = [uniform, keys[from], order[from], keys[to], order[to], table];
+      const used: Record<SortEntry, number[]> = { count: [0, 1, 5], scan: [0, 5], scatter: [0, 1, 2, 3, 4, 5] };
+      const groups = SORT_ENTRIES.map((entry) => [
+        entry,
+        bind(programs.sort[entry].getBindGroupLayout(0), ...given.map((r, i) => (used[entry].includes(i) ? r : null))),
+      ]);
+      this.rounds.push(Object.fromEntries(groups) as Record<SortEntry, GPUBindGroup>);
+    }
+    this.sharing = bind(programs.shareOut.getBindGroupLayout(0), this.frame, this.visible, this.draws);
+    this.drawn = bind(programs.layouts[0], this.frame, stored, seen, order[0], this.visible);
+    this.decoded = pages?.format === 'bc7' && !graphics.blocks;
+    const texture = this.texture(pages, graphics.blocks);
+    this.atlasSize = [texture.width, texture.height];
+    const sampler = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
+    this.pages = bind(programs.layouts[1], texture.createView({ dimension: '2d-array' }), sampler);
+  }
+
+  private checkRoom(): void {
+    const { maxStorageBufferBindingSize, maxTextureDimension2D } = this.device.limits;
+    const needed = Math.max(96 * this.count, this.surfels.terms.byteLength);
+    const side = Math.max(this.info.atlas?.width ?? 0, this.info.atlas?.height ?? 0);
+    if (needed > maxStorageBufferBindingSize || side > maxTextureDimension2D) {
+      throw new ViewerError(
+        'This scene is too large for this device',
+        `It has ${this.count.toLocaleString('en')} surfels and an atlas of up to ${side} texels a side.`,
+        'Open it on a device with more graphics memory.',
+      );
+    }
+  }
+
+  private empty(size: number, usage: number): GPUBuffer {
+    return this.device.createBuffer({ size, usage });
+  }
+  private upload(data: Float32Array | Uint32Array, usage: number): GPUBuffer {
+    const buffer = this.empty(Math.max(96, data.byteLength), usage | GPUBufferUsage.COPY_DST);
+    if (data.byteLength) this.device.queue.writeBuffer(buffer, 0, data as Float32Array<ArrayBuffer>);
+    return buffer;
+  }
+
+  private texture(pages: Pages | null, blocks: boolean): GPUTexture {
+    const { width, height, layers, format } = pages ?? {
+      width: 1,
+      height: 1,
+      layers: [new Uint8Array(4)],
+      format: 'uint8' as const,
+    };
+    const decode = format === 'bc7' && !blocks;
+    const names = { bc7: decode ? 'rgba8unorm' : 'bc7-rgba-unorm', uint8: 'rgba8unorm', fp16: 'rgba16float' } as const;
+    const texture = this.device.createTexture({
+      size: [width, height, layers.length],
+      format: names[format],
+      usage: GPUTextureUsage.TEXTURE_BINDING | GPUTextureUsage.COPY_DST,
+    });
+    const { side, bytes } = decode ? blockOf('uint8') : blockOf(format);
+    layers.forEach((layer, k) => {
+      const data = decode ? decodeBc7(layer, width, height) : layer;
+      this.device.queue.writeTexture(
+        { texture, origin: [0, 0, k] },
+        data as Uint8Array<ArrayBuffer>,
+        { bytesPerRow: Math.ceil(width / side) * bytes, rowsPerImage: Math.ceil(height / side) },
+        [width, height, 1],
+      );
+    });
+    return texture;
+  }
+
+  // Projects, sorts, and shares out the surfels.
+  encodeSorting(encoder: GPUCommandEncoder): void {
+    const work = encoder.beginComputePass();
+    const run = (pipeline: GPUComputePipeline, bound: GPUBindGroup, groups: number): void => {
+      work.setPipeline(pipeline);
+      work.setBindGroup(0, bound);
+      work.dispatchWorkgroups(groups);
+    };
+    run(this.programs.prepare, this.preparing, Math.ceil(Math.max(1, this.count) / 64));
+    for (const round of this.rounds) {
+      run(this.programs.sort.count, round.count, this.blocks);
+      run(this.programs.sort.scan, round.scan, 1);
+      run(this.programs.sort.scatter, round.scatter, this.blocks);
+    }
+    run(this.programs.shareOut, this.sharing, 1);
+    work.end();
+  }
+}

@@ -1,0 +1,74 @@
+// The capture's cameras, from cameras.json, which a bundle may have.
+import type { Vec3 } from '../bundle/manifest';
+import type { Lens, Pose } from './pose';
+import { add, dot, subtract, times } from './vector';
+
+export interface CaptureCamera {
+  name: string;
+  heldOut: boolean;
+  pose: Pose;
+  lens: Lens;
+  photograph: string | null; // a file of the bundle
+}
+
+const FILE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
+const MOST = 100_000;
+
+const isNumber = (x: unknown): x is number => typeof x === 'number' && Number.isFinite(x);
+
+function camera(row: unknown): CaptureCamera | null {
+  if (typeof row !== 'object' || row === null) return null;
+  const r = row as Record<string, unknown>;
+  const [m, fx, fy, cx, cy, width, height] = [r.viewmat, r.fx, r.fy, r.cx, r.cy, r.width, r.height];
+  if (!Array.isArray(m) || m.length !== 16 || !m.every(isNumber)) return null;
+  if (![fx, fy, cx, cy, width, height].every(isNumber) || typeof r.name !== 'string') return null;
+  const lens = { fx, fy, cx, cy, width, height } as Lens;
+  if (!(lens.fx > 0 && lens.fy > 0 && lens.width >= 1 && lens.height >= 1)) return null;
+  const [right, down, forward] = [0, 4, 8].map((k) => m.slice(k, k + 3) as Vec3);
+  const back = add(add(times(m[3], right), times(m[7], down)), times(m[11], forward));
+  const photograph = typeof r.photograph === 'string' && FILE.test(r.photograph) ? r.photograph : null;
+  return {
+    name: r.name.slice(0, 200),
+    heldOut: r.held_out === true,
+    pose: { position: times(-1, back), right, down, forward },
+    lens,
+    photograph,
+  };
+}
+
+export function parseCameras(text: string): CaptureCamera[] {
+  let json: unknown;
+  try {
+    json = JSON.parse(text);
+  } catch {
+    return [];
+  }
+  const rows = (json as { cameras?: unknown } | null)?.cameras;
+  if (!Array.isArray(rows)) return [];
+  return rows
+    .slice(0, MOST)
+    .map(camera)
+    .filter((found) => found !== null);
+}
+
+// The point that is nearest to what all cameras look at, by least squares; null where they look the same way.
+export function commonTarget(cameras: CaptureCamera[]): Vec3 | null {
+  // sum over cameras of (1 - f f^T) (x - p) = 0
+  const a = [0, 0, 0, 0, 0, 0, 0, 0, 0];
+  let b: Vec3 = [0, 0, 0];
+  for (const { pose } of cameras) {
+    const f = pose.forward;
+    for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++) a[3 * i + j] += (i === j ? 1 : 0) - f[i] * f[j];
+    b = add(b, subtract(pose.position, times(dot(f, pose.position), f)));
+  }
+  const column = (k: number): Vec3 => [a[k], a[3 + k], a[6 + k]];
+  const det3 = (p: Vec3, q: Vec3, r: Vec3): number =>
+    p[0] * (q[1] * r[2] - q[2] * r[1]) + p[1] * (q[2] * r[0] - q[0] * r[2]) + p[2] * (q[0] * r[1] - q[1] * r[0]);
+  const det = det3(column(0), column(1), column(2));
+  if (!(Math.abs(det) > 1e-4 * cameras.length ** 3)) return null;
+  return [
+    det3(b, column(1), column(2)) / det,
+    det3(column(0), b, column(2)) / det,
+    det3(column(0), column(1), b) / det,
+  ];
+}

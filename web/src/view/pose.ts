@@ -1,0 +1,97 @@
+// Where a camera stands, how it looks, and its lens.
+import type { Vec3 } from '../bundle/manifest';
+import { add, cross, dot, length, subtract, times, turned, unit } from './vector';
+
+export interface Pose {
+  position: Vec3;
+  right: Vec3; // rows of the rotation from the world to the camera: x right, y down, z forward
+  down: Vec3;
+  forward: Vec3;
+}
+
+// A lens, for an image of `width` x `height`.
+export interface Lens {
+  fx: number;
+  fy: number;
+  cx: number;
+  cy: number;
+  width: number;
+  height: number;
+}
+
+export class View implements Lens {
+  constructor(
+    readonly pose: Pose,
+    readonly fx: number,
+    readonly fy: number,
+    readonly cx: number,
+    readonly cy: number,
+    readonly width: number,
+    readonly height: number,
+  ) {}
+
+  // The same view in another number of pixels.
+  scaledTo(width: number, height: number): View {
+    const [x, y] = [width / this.width, height / this.height];
+    return new View(this.pose, this.fx * x, this.fy * y, this.cx * x, this.cy * y, width, height);
+  }
+  // The view through a lens, of which a screen shows all, and more on two sides.
+  static contain(pose: Pose, lens: Lens, width: number, height: number): View {
+    const k = Math.min(width / lens.width, height / lens.height);
+    const cx = width / 2 + k * (lens.cx - lens.width / 2);
+    const cy = height / 2 + k * (lens.cy - lens.height / 2);
+    return new View(pose, k * lens.fx, k * lens.fy, cx, cy, width, height);
+  }
+}
+
+export const DEFAULT_LENS: Lens = { fx: 1000, fy: 1000, cx: 500, cy: 500, width: 1000, height: 1000 };
+
+export function lookAt(position: Vec3, target: Vec3, up: Vec3): Pose {
+  const forward = unit(subtract(target, position));
+  const side = cross(forward, up);
+  const right = unit(length(side) > 1e-6 ? side : cross(forward, [up[1], up[2], up[0]]));
+  return { position, right, down: cross(forward, right), forward };
+}
+
+function turnedPose(pose: Pose, axis: Vec3, angle: number): Pose {
+  return {
+    position: pose.position,
+    right: turned(pose.right, axis, angle),
+    down: turned(pose.down, axis, angle),
+    forward: turned(pose.forward, axis, angle),
+  };
+}
+
+const STEEPEST = 0.998; // cosine between the view and the vertical, beyond which it does not tilt
+
+function tilts(pose: Pose, up: Vec3, angle: number): boolean {
+  const now = Math.abs(dot(pose.forward, up));
+  return now < STEEPEST || Math.abs(dot(turned(pose.forward, pose.right, angle), up)) < now;
+}
+
+// Looks elsewhere: `across` to the right, `upwards` towards the sky, radians.
+export function look(pose: Pose, up: Vec3, across: number, upwards: number): Pose {
+  const aside = turnedPose(pose, up, -across);
+  return tilts(aside, up, upwards) ? turnedPose(aside, aside.right, upwards) : aside;
+}
+
+// Goes around a point, which stays where it is on the screen.
+export function orbit(pose: Pose, target: Vec3, up: Vec3, across: number, upwards: number): Pose {
+  const from = subtract(pose.position, target);
+  const coordinates: Vec3 = [dot(from, pose.right), dot(from, pose.down), dot(from, pose.forward)];
+  const next = look(pose, up, across, upwards);
+  const offset = add(
+    add(times(coordinates[0], next.right), times(coordinates[1], next.down)),
+    times(coordinates[2], next.forward),
+  );
+  return { ...next, position: add(target, offset) };
+}
+
+export function moved(pose: Pose, right: number, down: number, forward: number): Pose {
+  const step = add(add(times(right, pose.right), times(down, pose.down)), times(forward, pose.forward));
+  return { ...pose, position: add(pose.position, step) };
+}
+
+export function rolled(pose: Pose, angle: number): Pose {
+  return turnedPose(pose, pose.forward, angle);
+}

@@ -1,0 +1,28 @@
+// Where the first view is taken from, where no camera says it, and how large the scene is.
+import type { Vec3 } from '../bundle/manifest';
+import { SURFEL_WORDS, type Surfels } from '../bundle/surfels';
+import { type Pose, lookAt } from './pose';
+import { add, cross, length, times, unit } from './vector';
+
+const SAMPLES = 4000;
+
+// The middle of the surfels, and the distance from there that half of them keep: far ones do not count.
+export function extentOf(surfels: Surfels): { middle: Vec3; size: number } {
+  const step = Math.max(1, Math.floor(surfels.count / SAMPLES));
+  const rows: Vec3[] = [];
+  for (let i = 0; i < surfels.count; i += step) {
+    const at = i * SURFEL_WORDS;
+    rows.push([surfels.words[at], surfels.words[at + 1], surfels.words[at + 2]]);
+  }
+  if (!rows.length) return { middle: [0, 0, 0], size: 1 };
+  const median = (values: number[]): number => values.sort((a, b) => a - b)[values.length >> 1];
+  const middle = [0, 1, 2].map((c) => median(rows.map((row) => row[c]))) as Vec3;
+  const size = median(rows.map((row) => length([row[0] - middle[0], row[1] - middle[1], row[2] - middle[2]])));
+  return { middle: add(middle, surfels.origin), size: Math.max(2 * size, 1e-6) };
+}
+
+export function firstPose(middle: Vec3, size: number, up: Vec3): Pose {
+  const aside = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  const position = add(middle, add(times(1.6 * size, aside), times(0.5 * size, up)));
+  return lookAt(position, middle, up);
+}

@@ -1,0 +1,140 @@
+import { describe, expect, it } from 'vitest';
+import { parseKtx2 } from '../src/bundle/ktx2';
+import { parseManifest } from '../src/bundle/manifest';
+import { SURFEL_WORDS, readSurfels } from '../src/bundle/surfels';
+import { DamagedBundle, ViewerError } from '../src/errors';
+
+const HASH = 'a'.repeat(64);
+const manifest = (changes: object = {}): string =>
+  JSON.stringify({
+    format: 'bitymi-bundle',
+    version: '2.2',
+    surfels: { count: 2, view_color: 'sv', terms: 1 },
+    atlas: null,
+    render: { near: 0.1, weight_bound: 0.02, background: [0, 0, 0] },
+    bounds: { min: [0, 0, 0], max: [2, 2, 2] },
+    files: { 'surfels.ply': { bytes: 1, sha256: HASH } },
+    ...changes,
+  });
+
+const FLOATS = [
+  ...['x', 'y', 'z', 'opacity', 'scale_0', 'scale_1', 'rot_0', 'rot_1', 'rot_2', 'rot_3', 'beta'],
+  ...['view_base_0', 'view_base_1', 'view_base_2'],
+];
+const INTS = ['view_terms', 'tile_x', 'tile_y', 'tile_layer', 'tile_ru', 'tile_rv'];
+
+function ply(rows: number[][], terms: number[][]): ArrayBuffer {
+  const header = [
+    'ply',
+    'format binary_little_endian 1.0',
+    'comment made by a test',
+    `element vertex ${rows.length}`,
+    ...FLOATS.map((name) => `property float ${name}`),
+    ...INTS.map((name) => `property int ${name}`),
+    `element view_term ${terms.length}`,
+    ...[0, 1, 2, 3, 4, 5].map((k) => `property float term_${k}`),
+    'end_header\n',
+  ].join('\n');
+  const head = new TextEncoder().encode(header);
+  const words = FLOATS.length + INTS.length;
+  const data = new DataView(new ArrayBuffer(head.length + 4 * (rows.length * words + terms.length * 6)));
+  head.forEach((byte, i) => data.setUint8(i, byte));
+  let at = head.length;
+  for (const row of rows) {
+    row.forEach((value, k) => {
+      if (k < FLOATS.length) data.setFloat32(at, value, true);
+      else data.setInt32(at, value, true);
+      at += 4;
+    });
+  }
+  for (const row of terms) for (const value of row) data.setFloat32((at += 4) - 4, value, true);
+  return data.buffer;
+}
+const row = (x: number, terms: number): number[] => [
+  x,
+  1,
+  1,
+  0.5,
+  -1,
+  -2,
+  1,
+  0,
+  0,
+  0,
+  2,
+  0.1,
+  0.2,
+  0.3,
+  terms,
+  0,
+  0,
+  0,
+  0,
+  0,
+];
+
+describe('bundle.json', () => {
+  it('is read', () => {
+    const info = parseManifest(manifest());
+    expect(info.count).toBe(2);
+    expect(info.throughPixel).toBe(false);
+    expect(info.files.get('surfels.ply')?.bytes).toBe(1);
+  });
+  it('of a newer major version is refused, with what to do', () => {
+    expect(() => parseManifest(manifest({ version: '3.0' }))).toThrowError(/version 3.0/);
+    try {
+      parseManifest(manifest({ version: '7.1' }));
+    } catch (error) {
+      expect((error as ViewerError).advice).toMatch(/Update/);
+    }
+  });
+  it.each([
+    ['not json', '{'],
+    ['a number out of range', manifest({ render: { near: 0, weight_bound: 0, background: [0, 0, 0] } })],
+    ['a kind that is none', manifest({ surfels: { count: 1, view_color: 'xx' } })],
+    ['a count that is no whole number', manifest({ surfels: { count: 1.5, view_color: 'sv' } })],
+    ['files that are no objects', manifest({ files: { 'surfels.ply': 3 } })],
+  ])('with %s is refused', (_, text) => {
+    expect(() => parseManifest(text)).toThrowError(DamagedBundle);
+  });
+  it('of something else is refused', () => {
+    expect(() => parseManifest('{"format":"x"}')).toThrowError(ViewerError);
+  });
+});
+
+describe('surfels.ply', () => {
+  const info = parseManifest(manifest());
+  it('is packed as the shaders read it', () => {
+    const data = ply([row(0, 0), row(2, 1)], [[1, 2, 3, 4, 5, 6]]);
+    const { words, terms, kind, origin } = readSurfels(data, info);
+    const numbers = new Uint32Array(words.buffer);
+    expect(origin).toEqual([1, 1, 1]);
+    expect([words[0], words[1], words[SURFEL_WORDS]]).toEqual([-1, 0, 1]);
+    expect(words[11]).toBe(3);
+    expect(kind).toBe(0);
+    expect([...terms]).toEqual([1, 2, 3, 4, 5, 6]);
+    expect([numbers[SURFEL_WORDS + 19], numbers[SURFEL_WORDS + 23]]).toEqual([0, 1]);
+  });
+  it.each([
+    ['truncated', ply([row(0, 0), row(2, 1)], [[1, 2, 3, 4, 5, 6]]).slice(0, -4)],
+    ['of another number of surfels', ply([row(0, 1)], [[1, 2, 3, 4, 5, 6]])],
+    ['with terms that are not counted', ply([row(0, 0), row(2, 0)], [[1, 2, 3, 4, 5, 6]])],
+    ['with a number that is not finite', ply([row(0, 0), row(NaN, 1)], [[1, 2, 3, 4, 5, 6]])],
+    ['that is something else', new ArrayBuffer(64)],
+  ])('%s is refused', (_, data) => {
+    expect(() => readSurfels(data, info)).toThrowError(DamagedBundle);
+  });
+  it('with a tile outside of the atlas is refused', () => {
+    const bad = row(0, 0);
+    bad[FLOATS.length + 4] = 4;
+    bad[FLOATS.length + 5] = 4;
+    expect(() => readSurfels(ply([bad, row(2, 1)], [[1, 2, 3, 4, 5, 6]]), info)).toThrowError(/tile of surfel 0/);
+  });
+});
+
+describe('atlas.ktx2', () => {
+  it('that is something else is refused', async () => {
+    const atlas = { format: 'bc7', width: 4, height: 4, layers: 1, extent: 3, offset: 0, scale: 1 } as const;
+    await expect(parseKtx2(new ArrayBuffer(200), atlas)).rejects.toThrowError(DamagedBundle);
+  });
+});

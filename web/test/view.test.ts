@@ -1,0 +1,93 @@
+import { describe, expect, it } from 'vitest';
+import type { Vec3 } from '../src/bundle/manifest';
+import { commonTarget, parseCameras } from '../src/view/cameras';
+import { Pace } from '../src/view/pace';
+import { DEFAULT_LENS, View, look, lookAt, orbit } from '../src/view/pose';
+import { fromHash, toHash } from '../src/view/share';
+import { dot, length, subtract } from '../src/view/vector';
+
+const UP: Vec3 = [0, 0, 1];
+const pose = lookAt([4, 0, 1], [0, 0, 0], UP);
+
+describe('poses', () => {
+  it('are right-handed and look at their target', () => {
+    expect(dot(pose.right, pose.down)).toBeCloseTo(0);
+    expect(dot(pose.down, UP)).toBeLessThan(0);
+    expect(length(pose.down)).toBeCloseTo(1);
+  });
+  it('keep distance and aim while they orbit', () => {
+    const next = orbit(pose, [0, 0, 0], UP, 0.7, 0.3);
+    expect(length(next.position)).toBeCloseTo(length(pose.position));
+    expect(dot(next.forward, next.position) / length(next.position)).toBeCloseTo(-1);
+    expect(dot(next.right, UP)).toBeCloseTo(0);
+  });
+  it('do not tilt beyond the vertical', () => {
+    let p = pose;
+    for (let k = 0; k < 200; k++) p = look(p, UP, 0, 0.05);
+    expect(dot(p.down, UP)).toBeLessThan(0.01);
+  });
+  it('show all of a photograph on any screen', () => {
+    const view = View.contain(pose, { fx: 100, fy: 110, cx: 20, cy: 30, width: 40, height: 60 }, 300, 120);
+    expect([view.fx, view.fy, view.cx, view.cy]).toEqual([200, 220, 150, 60]);
+  });
+});
+
+describe('links', () => {
+  it('bring back the view', () => {
+    const shared = { pose, lens: DEFAULT_LENS, target: [0, 0, 0] as Vec3, show: 'depth' as const, residuals: false };
+    const found = fromHash(toHash(shared));
+    expect(found?.show).toBe('depth');
+    expect(found?.residuals).toBe(false);
+    expect(length(subtract(found!.pose.position, pose.position))).toBeLessThan(1e-6);
+    expect(length(subtract(found!.pose.down, pose.down))).toBeLessThan(1e-6);
+  });
+  it.each([
+    '',
+    '#p=1,2',
+    '#p=1,2,x&r=1,0,0,0,0,1&t=0,0,0&l=1,1,1,1,1,1',
+    '#p=1,2,3&r=9,0,0,0,0,1&t=0,0,0&l=1,1,1,1,1,1',
+  ])('that are none are not taken: %s', (hash) => expect(fromHash(hash)).toBeNull());
+});
+
+describe('the capture', () => {
+  const row = {
+    name: 'a',
+    held_out: true,
+    viewmat: [1, 0, 0, -1, 0, 1, 0, -2, 0, 0, 1, -3, 0, 0, 0, 1],
+    ...{ fx: 1, fy: 1, cx: 1, cy: 1, width: 2, height: 2 },
+  };
+  it('has cameras where its file says so', () => {
+    const [camera] = parseCameras(JSON.stringify({ cameras: [row, { name: 'broken' }, 3] }));
+    expect(camera.pose.position).toEqual([1, 2, 3]);
+    expect(camera.heldOut).toBe(true);
+    expect(parseCameras('{')).toEqual([]);
+    expect(parseCameras('{"cameras": 3}')).toEqual([]);
+  });
+  it('does not reach out of the bundle', () => {
+    const photograph = (name: string): string | null =>
+      parseCameras(JSON.stringify({ cameras: [{ ...row, photograph: name }] }))[0].photograph;
+    expect(photograph('a.jpg')).toBe('a.jpg');
+    expect(photograph('../a.jpg')).toBeNull();
+    expect(photograph('https://x/a.jpg')).toBeNull();
+  });
+  it('is looked at in the middle of what its cameras see', () => {
+    const make = (at: Vec3): ReturnType<typeof parseCameras>[number] => ({
+      ...parseCameras(JSON.stringify({ cameras: [row] }))[0],
+      pose: lookAt(at, [1, 1, 0], UP),
+    });
+    const found = commonTarget([make([5, 0, 1]), make([0, 6, 1]), make([-3, -2, 2])]);
+    expect(length(subtract(found!, [1, 1, 0]))).toBeLessThan(1e-6);
+    expect(commonTarget([make([5, 0, 1])])).toBeNull();
+  });
+});
+
+describe('the pace', () => {
+  it('lowers the resolution until frames take a sixtieth of a second, and raises it again', () => {
+    const pace = new Pace();
+    for (let k = 0; k < 60; k++) pace.took(40 * pace.scale ** 2);
+    expect(40 * pace.scale ** 2).toBeLessThan(17);
+    expect(pace.scale).toBeGreaterThan(0.4);
+    for (let k = 0; k < 60; k++) pace.took(4 * pace.scale ** 2);
+    expect(pace.scale).toBe(1);
+  });
+});

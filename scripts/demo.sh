@@ -84,4 +84,6 @@ Done in $SECONDS s.
   bundle    $out/bundle             (ns-viewer --load-config $out/bundle/config.yml)
   renders   $out/renders            held-out views, of the trained model and of the bundle
   model     $run
+
+Look at it in the browser:  bitymi view $out/bundle        (.venv/bin/bitymi after make demo)
 END

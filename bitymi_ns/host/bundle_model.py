@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.models.base_model import ModelConfig
@@ -14,7 +15,12 @@ from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
 from bitymi_ns.bundle.manifest import ATLAS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
+from bitymi_ns.ops import webgpu
+from bitymi_ns.scene.baked import BakedOutput
 from bitymi_ns.scene.camera import Camera
+
+RENDERER = "BITYMI_RENDERER"
+"""Environment variable that goes before `BakedModelConfig.renderer`: ns-eval has no option for it."""
 
 
 @dataclass
@@ -27,6 +33,8 @@ class BakedModelConfig(ModelConfig):
     """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the scene."""
+    renderer: Literal["kernels", "webgpu"] = "kernels"
+    """kernels: on CUDA or the CPU; webgpu: on graphics of any maker, which needs the package wgpu."""
 
 
 class BakedModel(SurfelModel):
@@ -43,10 +51,26 @@ class BakedModel(SurfelModel):
             fail(f"{error}. {REMEDY}", error)
         self._atlas_bytes = bundle.info.files[ATLAS].bytes if ATLAS in bundle.info.files else 0
         self._scene = bundle.scene
+        self._scene.through_webgpu = self._asks_for_webgpu()
         self._count = len(bundle)
 
+    def _asks_for_webgpu(self) -> bool:
+        """Whether WebGPU is asked for; stops where it is not there."""
+        asked = os.environ.get(RENDERER) or self.config.renderer
+        if asked not in ("kernels", "webgpu"):
+            fail(f"{RENDERER} must be kernels or webgpu, not {asked!r}")
+        if asked == "webgpu":
+            try:
+                webgpu.require()
+            except webgpu.WebGpuUnavailable as error:
+                fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
+        return asked == "webgpu"
+
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        return self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+        drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+        if not self._scene.through_webgpu:
+            return drawn
+        return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
 
     def surfel_count(self) -> int:
         return self._count
@@ -60,7 +84,7 @@ class BakedModel(SurfelModel):
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)
-        if self._scene.tiles.device != self.device:
+        if self._scene.tiles.device != self.device and not self._scene.through_webgpu:
             self._scene = self._scene.to(self.device)
         return self
 

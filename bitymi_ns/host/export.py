@@ -37,6 +37,7 @@ from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say, warn
+from bitymi_ns.host.export_cameras import camera_files
 from bitymi_ns.host.export_summary import print_summary
 from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
@@ -80,6 +81,10 @@ class ExportAtlas(BakeOptions):
     not."""
     compare: bool = True
     """Render the held-out views from the bundle and from the trained scene and state the difference."""
+
+    photographs: bool = False
+    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders; who is given the
+    bundle is given them."""
 
     def main(self) -> None:
         """Run the export."""
@@ -167,7 +172,10 @@ class ExportAtlas(BakeOptions):
             background=background,
             world=world_of(datamanager),
             statistics={"options": asdict(options), "method": config.method_name},
-            extra_files={"preview.png": preview(model, datamanager, views)},
+            extra_files={
+                "preview.png": preview(model, datamanager, views),
+                **camera_files(datamanager, views, self.photographs),
+            },
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
         )

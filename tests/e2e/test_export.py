@@ -32,8 +32,12 @@ from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> None:
     assert {p.name for p in bundle.iterdir()} == {
-        "bundle.json", "surfels.ply", "atlas.ktx2", "config.yml", "preview.png"
+        "bundle.json", "surfels.ply", "atlas.ktx2", "config.yml", "preview.png", "cameras.json"
     }  # fmt: skip
+    cameras = json.loads((bundle / "cameras.json").read_text())["cameras"]
+    assert sum(camera["held_out"] for camera in cameras) == 2 and all(
+        len(camera["viewmat"]) == 16 for camera in cameras
+    )
     info = json.loads((bundle / "bundle.json").read_text())
     held_out = info["statistics"]["held_out"]
     assert held_out["views"] == 2

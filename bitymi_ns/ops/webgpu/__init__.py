@@ -3,7 +3,7 @@
 Needs the package `wgpu`, which is optional (`pip install 'bitymi-ns[webgpu]'`).
 """
 
-from .device import WebGpuUnavailable, adapters
+from .device import WebGpuUnavailable, adapters, require
 from .draw import draw
 
-__all__ = ["WebGpuUnavailable", "adapters", "draw"]
+__all__ = ["WebGpuUnavailable", "adapters", "draw", "require"]

@@ -63,3 +63,12 @@ def device() -> Any:
         )
     except RuntimeError as error:
         raise WebGpuUnavailable(f"the graphics device {adapter.info['device']} cannot be used: {error}") from error
+
+
+def require() -> None:
+    """Sees that something can be drawn here.
+
+    Raises:
+        WebGpuUnavailable: it cannot; says what to do.
+    """
+    device()

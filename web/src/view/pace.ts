@@ -12,8 +12,9 @@ export class Pace {
     const wish = this.scale * Math.sqrt((0.85 * WANTED) / Math.max(this.milliseconds, 0.5));
     const next = Math.min(1, Math.max(LEAST, wish));
     // small steps, and none for small differences: each asks for new targets
-    if (Math.abs(next - this.scale) > 0.12 * this.scale) {
-      this.scale = Math.round(20 * (0.5 * this.scale + 0.5 * next)) / 20;
+    if (Math.abs(next - this.scale) > 0.08 * this.scale) {
+      const step = 0.5 * (next - this.scale);
+      this.scale += Math.sign(step) * Math.max(Math.abs(step), Math.min(0.05, Math.abs(2 * step)));
       this.milliseconds = 0;
     }
   }

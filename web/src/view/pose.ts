@@ -64,9 +64,11 @@ function turnedPose(pose: Pose, axis: Vec3, angle: number): Pose {
 
 const STEEPEST = 0.998; // cosine between the view and the vertical, beyond which it does not tilt
 
+// Whether a camera may tilt: it does not come too close to the vertical, nor turn over beyond it.
 function tilts(pose: Pose, up: Vec3, angle: number): boolean {
-  const now = Math.abs(dot(pose.forward, up));
-  return now < STEEPEST || Math.abs(dot(turned(pose.forward, pose.right, angle), up)) < now;
+  const next = turnedPose(pose, pose.right, angle);
+  const [before, after] = [Math.abs(dot(pose.forward, up)), Math.abs(dot(next.forward, up))];
+  return (after < STEEPEST || after < before) && dot(pose.down, up) * dot(next.down, up) > 0;
 }
 
 // Looks elsewhere: `across` to the right, `upwards` towards the sky, radians.

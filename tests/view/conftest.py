@@ -1,0 +1,56 @@
+"""A small bundle with cameras and a photograph."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from bitymi_ns.bake import bake
+from bitymi_ns.bake.pipeline import BakeOptions
+from bitymi_ns.bundle import export
+from bitymi_ns.scene import Camera
+from tests.bake.conftest import make_surfels
+from tests.bake.test_real_scene import real_scene
+from tests.cuda.baked_scenes import front
+
+WIDTH, HEIGHT = 160, 120
+
+
+def view() -> Camera:
+    """A camera before the scene, of the size of the tests' screens."""
+    return front(WIDTH, HEIGHT, 3.0)
+
+
+def write(folder: Path, format: str = "bc7", count: int = 120, **options: object) -> Path:
+    """A bundle of the bake's test scene, with a camera and its photograph."""
+    made = real_scene(make_surfels, count=count)
+    camera = view()
+    picture = io.BytesIO()
+    Image.new("RGB", (WIDTH, HEIGHT), (200, 80, 40)).save(picture, "JPEG")
+    K = camera.K.tolist()
+    row = {
+        **{"name": "first.jpg", "held_out": True, "width": WIDTH, "height": HEIGHT},
+        **{"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
+        **{"viewmat": camera.viewmat.flatten().tolist(), "photograph": "photograph-0001.jpg"},
+    }
+    moved = camera.viewmat.clone()
+    moved[0, 3] = 0.5
+    other = {**row, "name": "second.jpg", "held_out": False, "viewmat": moved.flatten().tolist()}
+    del other["photograph"]
+    extra = {
+        "cameras.json": json.dumps({"cameras": [row, other]}).encode(),
+        "photograph-0001.jpg": picture.getvalue(),
+    }
+    with torch.no_grad():
+        export(bake(made, options=BakeOptions(format=format, **options)), folder, extra_files=extra)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("view") / "little")

@@ -1,0 +1,72 @@
+// Drives a headless Chromium through steps, given as JSON on standard input; the results go to standard output.
+import { readFileSync } from 'node:fs';
+import { createRequire } from 'node:module';
+
+const [modules, chromium] = process.argv.slice(2);
+const playwright = createRequire(`${modules}/`)('playwright-core');
+const { steps, viewport, touch, scheme } = JSON.parse(readFileSync(0, 'utf8'));
+const browser = await playwright.chromium.launch({
+  executablePath: chromium,
+  args: [
+    ...['--enable-unsafe-webgpu', '--no-sandbox', '--disable-quic', '--no-first-run', '--disable-gpu-watchdog'],
+    ...['--disable-background-networking', '--disable-component-update', '--disable-sync'],
+  ],
+});
+const context = await browser.newContext({ viewport, hasTouch: touch, isMobile: touch, colorScheme: scheme });
+context.setDefaultTimeout(90_000);
+const page = await context.newPage();
+const problems = [];
+page.on('console', (message) => message.type() === 'error' && problems.push(message.text()));
+page.on('pageerror', (error) => problems.push(error.message));
+
+// a function and no text, which the page's policy would not evaluate
+const settled = () => {
+  const { state, frame } = document.documentElement.dataset;
+  return state === 'error' || frame === 'still';
+};
+
+const actions = {
+  init: ([script]) => page.addInitScript(script),
+  goto: async ([url]) => {
+    await page.goto('about:blank');
+    await page.goto(url);
+  },
+  // until the picture stays, or the page says why there is none
+  settle: () => page.waitForFunction(settled, null, { polling: 200 }),
+  stir: () => page.evaluate(() => void (document.documentElement.dataset.frame = 'moving')),
+  click: ([selector]) => page.click(selector),
+  key: ([key, held]) => page.keyboard.press(key, { delay: held ?? 0 }),
+  select: ([selector, value]) => page.selectOption(selector, value),
+  wheel: ([by]) => page.mouse.wheel(0, by),
+  drag: async ([from, to]) => {
+    await page.mouse.move(...from);
+    await page.mouse.down();
+    await page.mouse.move(...to, { steps: 4 });
+    await page.mouse.up();
+  },
+  // two fingers that move apart
+  pinch: async ([from, to]) => {
+    const session = await context.newCDPSession(page);
+    const send = (type, points) =>
+      session.send('Input.dispatchTouchEvent', { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
+    await send('touchStart', from);
+    for (let k = 1; k <= 4; k++) {
+      await send('touchMove', from.map((p, i) => p.map((v, c) => v + ((to[i][c] - v) * k) / 4)));
+    }
+    await send('touchEnd', []);
+  },
+  save: async ([selector, path]) => {
+    const [download] = await Promise.all([page.waitForEvent('download'), page.click(selector)]);
+    await download.saveAs(path);
+  },
+  shot: ([path]) => page.screenshot({ path }),
+  ask: ([expression]) => page.evaluate(expression),
+};
+
+const results = [];
+try {
+  for (const [action, ...given] of steps) results.push((await actions[action](given)) ?? null);
+} finally {
+  await browser.close();
+}
+process.stdout.write(JSON.stringify({ results, problems }));

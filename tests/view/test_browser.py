@@ -1,0 +1,183 @@
+"""The viewer in a browser whose graphics are drawn in software, against the CPU renderer.
+
+It is slow there, so bundles and screens are small. Pictures that stay are drawn in single precision where the device
+blends it, else in half.
+"""
+
+from __future__ import annotations
+
+import http.server
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bitymi_ns.bundle import read_bundle
+from bitymi_ns.view import site_of, write_static
+from tests.view.browser import drive, served
+from tests.view.conftest import HEIGHT, WIDTH, view, write
+
+SCREEN = (WIDTH, HEIGHT)
+MEAN = 1 / 255
+"""Largest mean difference of colours; the largest of a single pixel is stated in docs/viewer.md."""
+STATE = "document.documentElement.dataset.state"
+LINK = "location.hash"
+
+
+def difference(path: Path, bundle: Path) -> tuple[float, float]:
+    """Mean and largest difference of a saved picture from the CPU's."""
+    scene = read_bundle(bundle).scene
+    want = scene.render(view()).rgb.clamp(0, 1).numpy()
+    got = np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
+    assert got.shape == want.shape
+    off = np.abs(got - want)
+    return float(off.mean()), float(off.max())
+
+
+@pytest.mark.parametrize(
+    "format, options",
+    [("bc7", {}), ("uint8", {}), ("fp16", {}), ("bc7", {"tolerance": 0.0})],
+    ids=["bc7", "uint8", "fp16", "all terms"],
+)
+def test_frames_are_those_of_the_cpu_renderer(format: str, options: dict, tmp_path: Path) -> None:
+    bundle = write(tmp_path / "b", format, **options)
+    with served(site_of(bundle)) as address:
+        found = drive([["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]], SCREEN)
+    assert not found.problems
+    mean, largest = difference(tmp_path / "p.png", bundle)
+    assert mean < MEAN and largest < 12 / 255
+
+
+def test_every_control(bundle: Path, tmp_path: Path) -> None:
+    """Each changes what it names: the view, as its link tells, or the picture."""
+    shots = iter(range(100))
+    names: list[Path] = []
+
+    def shot() -> list:
+        names.append(tmp_path / f"{next(shots)}.png")
+        return ["save", "#screenshot", names[-1]]
+
+    def link() -> list:
+        return [["click", "#share"], ["ask", LINK]]
+
+    steps: list = [["goto", "@"], ["settle"], *link(), shot()]  # 0
+    steps += [["drag", [300, 200], [380, 240]], *link()]  # orbit
+    steps += [["wheel", -400], *link()]
+    steps += [["click", "#home"], *link()]
+    steps += [["click", "#fly"], ["drag", [300, 200], [380, 240]], *link()]
+    steps += [["click", "#canvas"], ["key", "w", 300], *link()]
+    steps += [["key", "h"], ["key", "ArrowLeft", 300], *link()]
+    steps += [["click", "#next"], *link(), ["ask", "document.getElementById('camera').value"]]
+    steps += [["select", "#camera", "0"], *link()]
+    steps += [["click", "#texture"], *link(), shot(), ["click", "#texture"]]  # 1
+    for show in ("residual", "depth", "normal", "overdraw"):  # 2 to 5
+        steps += [["select", "#show", show], shot()]
+    steps += [["select", "#show", "color"], ["click", "#colors"], ["click", "#next"], shot()]  # 6: held colours
+    steps += [["click", "#colors"], shot(), ["click", "#previous"]]  # 7
+    steps += [["click", "#beside"], ["ask", "document.getElementById('photograph-image').naturalWidth > -1"]]
+    steps += [["ask", "document.getElementById('photograph').hidden"], ["click", "#beside"]]
+    steps += [
+        ["select", "#resolution", "0.25"],
+        ["stir"],
+        ["settle"],
+        ["ask", "document.getElementById('status').textContent"],
+    ]
+    steps += [["click", "#theme"], ["click", "#theme"], ["ask", "document.documentElement.dataset.theme"]]
+    with served(site_of(bundle)) as address:
+        steps[0][1] = address
+        found = drive(steps, (800, 500))
+    assert not found.problems
+    links = [r for r in found.results if isinstance(r, str) and r.startswith("#p=")]
+    first, orbited, nearer, home, turned, walked, looked, second, again, plain = links
+    assert home == first == again and len({first, orbited, nearer, turned, walked, looked, second}) == 7
+    assert plain.endswith("texture=off")
+    pictures = [np.asarray(Image.open(name).convert("RGB"), np.float32) for name in names]
+    for i, picture in enumerate(pictures[1:6], 1):
+        assert np.abs(picture - pictures[0]).mean() > 0.2, i
+    assert np.abs(pictures[6] - pictures[7]).mean() > 0.02
+    answers = [r for r in found.results if not (isinstance(r, str) and r.startswith("#"))]
+    assert "1" in answers and False in answers and "dark" in answers
+    assert any(isinstance(r, str) and "25 %" in r for r in answers)
+
+
+def test_a_shared_link_brings_the_same_picture(bundle: Path, tmp_path: Path) -> None:
+    with served(site_of(bundle)) as address:
+        first = drive(
+            [
+                *(["goto", address], ["settle"], ["drag", [60, 60], [90, 80]], ["click", "#menu"], ["click", "#share"]),
+                *(["ask", "location.href"], ["save", "#screenshot", tmp_path / "a.png"]),
+            ],
+            SCREEN,
+        )
+        href = next(r for r in first.results if isinstance(r, str))
+        drive([["goto", href], ["settle"], ["save", "#screenshot", tmp_path / "b.png"]], SCREEN)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_fingers_on_a_phone(bundle: Path) -> None:
+    ask = [["click", "#share"], ["ask", LINK]]
+    with served(site_of(bundle)) as address:
+        found = drive(
+            [
+                *(["goto", address], ["settle"], ["click", "#menu"], *ask, ["click", "#menu"]),
+                *(["pinch", [[150, 200], [200, 300]], [[120, 150], [240, 380]]], ["click", "#menu"], *ask),
+                *(["click", "#menu"], ["pinch", [[150, 200]], [[190, 260]]], ["click", "#menu"], *ask),
+            ],
+            (360, 640),
+            touch=True,
+        )
+    links = [r for r in found.results if isinstance(r, str)]
+    assert len(set(links)) == 3 and not found.problems
+
+
+def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None:
+    hide = "Object.defineProperty(Navigator.prototype, 'gpu', { value: undefined })"
+    with served(site_of(bundle)) as address:
+        found = drive([["init", hide], ["goto", address], ["settle"], ["ask", "document.body.innerText"]], SCREEN)
+    assert "no WebGPU" in found.results[-1] and "Update the browser" in found.results[-1]
+
+
+@pytest.mark.parametrize("damage", ["truncated", "altered", "missing", "newer"])
+def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path, tmp_path: Path) -> None:
+    """Damaged after the server has started: nothing but the browser could see it."""
+    copy = shutil.copytree(bundle, tmp_path / "copy")
+    with served(site_of(copy)) as address:
+        table = copy / "surfels.ply"
+        data = table.read_bytes()
+        if damage == "truncated":
+            table.write_bytes(data[:-40])
+        elif damage == "altered":
+            table.write_bytes(data[:-4] + bytes([data[-4] ^ 1]) + data[-3:])
+        elif damage == "missing":
+            table.unlink()
+        else:
+            info = json.loads((copy / "bundle.json").read_text())
+            (copy / "bundle.json").write_text(json.dumps({**info, "version": "9.0"}))
+        found = drive([["goto", address], ["settle"], ["ask", STATE], ["ask", "document.body.innerText"]], SCREEN)
+    state, text = found.results[-2:]
+    assert state == "error"
+    expected = "newer than the viewer" if damage == "newer" else "damaged"
+    assert expected in text and ("Update" in text or "Copy the bundle again" in text)
+
+
+def test_an_exported_folder_is_shown_by_a_plain_file_server(bundle: Path, tmp_path: Path) -> None:
+    write_static(site_of(bundle), tmp_path / "site")
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            """Says nothing."""
+
+    handler = partial(Quiet, directory=str(tmp_path / "site"))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        address = f"http://127.0.0.1:{server.server_address[1]}/"
+        found = drive([["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]], SCREEN)
+        server.shutdown()
+    assert not found.problems
+    assert difference(tmp_path / "p.png", bundle)[0] < MEAN

@@ -1,0 +1,131 @@
+"""What the server sends, and what not."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from bitymi_ns.bundle import BundleError
+from bitymi_ns.cli import main
+from bitymi_ns.view import PageError, serve, site_of, write_static
+from tests.view.browser import served
+
+
+def ask(address: str, path: str, method: str = "GET", host: str | None = None) -> tuple[int, dict[str, str], bytes]:
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=20)
+    connection.putrequest(method, path, skip_host=True)
+    connection.putheader("Host", host or parts.netloc)
+    connection.endheaders()
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, dict(answer.getheaders()), body
+
+
+def test_the_page_and_the_bundle_are_sent_with_their_types_and_a_policy(bundle: Path) -> None:
+    with served(site_of(bundle)) as address:
+        for path, kind in {
+            "/": "text/html; charset=utf-8",
+            "/index.js": "text/javascript; charset=utf-8",
+            "/index.css": "text/css; charset=utf-8",
+            "/bundle/bundle.json": "application/json",
+            "/bundle/surfels.ply": "application/octet-stream",
+            "/bundle/atlas.ktx2": "image/ktx2",
+            "/bundle/photograph-0001.jpg": "image/jpeg",
+        }.items():
+            status, headers, body = ask(address, path)
+            assert (status, headers["Content-Type"]) == (200, kind), path
+            assert "default-src 'none'" in headers["Content-Security-Policy"]
+            assert headers["X-Content-Type-Options"] == "nosniff" and len(body) == int(headers["Content-Length"])
+        assert ask(address, "/bundle/surfels.ply")[2] == (bundle / "surfels.ply").read_bytes()
+        status, headers, body = ask(address, "/", "HEAD")
+        assert status == 200 and not body and int(headers["Content-Length"]) > 0
+        assert json.loads(ask(address, "/view.json")[2]) == {"title": "little"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *(
+            "/bundle/../../../../etc/passwd",
+            "/..%2f..%2fetc/passwd",
+            "/bundle/%2e%2e/%2e%2e/etc/passwd",
+            "//etc/passwd",
+        ),
+        *("/bundle/config.yml", "/bundle/", "/bundle", "/nothing", "/bundle/surfels.ply%00.js", "/serve.py", "*"),
+    ],
+)
+def test_nothing_else_is_found(bundle: Path, path: str) -> None:
+    (bundle / "config.yml").write_text("secret: 1\n")
+    with served(site_of(bundle)) as address:
+        status, headers, body = ask(address, path)
+        assert status == 404 and b"secret" not in body and b"root:" not in body
+        assert headers["Content-Type"].startswith("text/plain")
+
+
+def test_requests_in_the_name_of_another_host_and_other_methods_are_refused(bundle: Path) -> None:
+    with served(site_of(bundle)) as address:
+        port = urlsplit(address).port
+        assert ask(address, "/", host="evil.example")[0] == 403
+        assert ask(address, "/", host=f"evil.example:{port}")[0] == 403
+        assert ask(address, "/", host=f"localhost:{port}")[0] == 200
+        assert ask(address, "/", "POST")[0] == 501
+
+
+def test_the_server_listens_on_the_loopback_address_alone(bundle: Path) -> None:
+    server = serve(site_of(bundle))
+    try:
+        assert server.server_address[0] == "127.0.0.1"
+        with pytest.raises(PageError, match="cannot be listened at"):
+            serve(site_of(bundle), port=server.server_address[1])
+    finally:
+        server.server_close()
+
+
+def test_a_link_out_of_the_bundle_is_not_followed(bundle: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(bundle, tmp_path / "copy")
+    (copy / "surfels.ply").unlink()
+    (copy / "surfels.ply").symlink_to("/etc/passwd")
+    with pytest.raises(PageError, match="leads out of the bundle"):
+        site_of(copy)
+    with pytest.raises(BundleError, match="not a bundle"):
+        site_of(tmp_path)
+
+
+def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "site"
+    assert main(["view", str(bundle), "--export", str(folder)]) == 0
+    assert "any web server" in capsys.readouterr().out
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {"index.html", "index.js", "index.css", "view.json", "bundle/bundle.json", "bundle/surfels.ply"} <= names
+    assert "bundle/config.yml" not in names
+    assert (folder / "bundle" / "atlas.ktx2").read_bytes() == (bundle / "atlas.ktx2").read_bytes()
+    assert main(["view", str(bundle), "--export", str(folder)]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["view", str(bundle), "--export", str(folder), "--overwrite"]) == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "precious").write_text("x")
+    with pytest.raises(PageError, match="something else"):
+        write_static(site_of(bundle), other, overwrite=True)
+    assert (other / "precious").read_text() == "x"
+
+
+def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
+    import signal
+
+    command = [sys.executable, "-m", "bitymi_ns.cli", "view", str(bundle), "--no-open-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert "http://127.0.0.1:" in line and str(bundle) in line
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0

@@ -25,6 +25,8 @@ const settled = () => {
   return state === 'error' || frame === 'still';
 };
 
+const press = (selector) => document.querySelector(selector).click();
+
 const actions = {
   init: ([script]) => page.addInitScript(script),
   goto: async ([url]) => {
@@ -35,6 +37,7 @@ const actions = {
   settle: () => page.waitForFunction(settled, null, { polling: 200 }),
   stir: () => page.evaluate(() => void (document.documentElement.dataset.frame = 'moving')),
   click: ([selector]) => page.click(selector),
+  press: ([selector]) => page.evaluate(press, selector), // also where the screen is too small to show it
   key: ([key, held]) => page.keyboard.press(key, { delay: held ?? 0 }),
   select: ([selector, value]) => page.selectOption(selector, value),
   wheel: ([by]) => page.mouse.wheel(0, by),
@@ -56,7 +59,7 @@ const actions = {
     await send('touchEnd', []);
   },
   save: async ([selector, path]) => {
-    const [download] = await Promise.all([page.waitForEvent('download'), page.click(selector)]);
+    const [download] = await Promise.all([page.waitForEvent('download'), page.evaluate(press, selector)]);
     await download.saveAs(path);
   },
   shot: ([path]) => page.screenshot({ path }),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -120,8 +121,6 @@ def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, t
 
 
 def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
-    import signal
-
     command = [sys.executable, "-m", "bitymi_ns.cli", "view", str(bundle), "--no-open-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -52,8 +52,8 @@ def device() -> Any:
     found = _usable()
     if not found:
         raise WebGpuUnavailable(
-            "no graphics device for WebGPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Debian and "
-            "Ubuntu: apt install mesa-vulkan-drivers, which also draws without a card)"
+            "no graphics device for WebGPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Debian "
+            "and Ubuntu: apt install mesa-vulkan-drivers, which also draws without a card)"
         )
     adapter = found[0]
     try:

@@ -1,8 +1,8 @@
 """Scenes drawn through WebGPU against the CPU renderer.
 
-On the golden scenes, whose targets are in single precision, images agreed to 2.5e-5 on llvmpipe; the bounds leave a card
-room for its exponentials. Where a weight bound is set, the weight is judged from above (shaders/draw.wgsl), so that
-residuals are added which are not in the CPU's picture: by at most the bound times the residual.
+On the golden scenes, whose targets are in single precision, images agreed to 2.5e-5 on llvmpipe; the bounds leave a
+card room for its exponentials. Where a weight bound is set, the weight is judged from above (shaders/draw.wgsl), so
+that residuals are added which are not in the picture of the CPU: by at most the bound times the residual.
 """
 
 from __future__ import annotations

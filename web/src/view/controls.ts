@@ -3,6 +3,8 @@ import type { Vec3 } from '../bundle/manifest';
 import { type Pose, look, moved, orbit, rolled } from './pose';
 import { add, length, subtract } from './vector';
 
+const TAP = 50; // milliseconds, for which a key counts as held at least
+
 export type Mode = 'orbit' | 'fly';
 
 export class Controls {
@@ -39,8 +41,11 @@ export class Controls {
     surface.addEventListener('keydown', (e) => {
       if (e.ctrlKey || e.metaKey || e.altKey || !MOVES[e.code]) return;
       e.preventDefault();
+      if (this.held.has(e.code)) return;
       this.held.add(e.code);
-      this.changed();
+      // a key that is let go before the next frame moves, too
+      this.last = e.timeStamp - TAP;
+      this.advance(e.timeStamp);
     });
     surface.addEventListener('keyup', (e) => this.held.delete(e.code));
     surface.addEventListener('blur', () => this.held.clear());

@@ -40,7 +40,10 @@ const actions = {
   press: ([selector]) => page.evaluate(press, selector), // also where the screen is too small to show it
   key: ([key, held]) => page.keyboard.press(key, { delay: held ?? 0 }),
   select: ([selector, value]) => page.selectOption(selector, value),
-  wheel: ([by]) => page.mouse.wheel(0, by),
+  wheel: async ([at, by]) => {
+    await page.mouse.move(...at);
+    await page.mouse.wheel(0, by);
+  },
   drag: async ([from, to]) => {
     await page.mouse.move(...from);
     await page.mouse.down();

@@ -67,7 +67,7 @@ def test_every_control(bundle: Path, tmp_path: Path) -> None:
 
     steps: list = [["goto", "@"], ["settle"], *link(), shot()]  # 0
     steps += [["drag", [300, 200], [380, 240]], *link()]  # orbit
-    steps += [["wheel", -400], *link()]
+    steps += [["wheel", [300, 200], -400], *link()]
     steps += [["click", "#home"], *link()]
     steps += [["click", "#fly"], ["drag", [300, 200], [380, 240]], *link()]
     steps += [["click", "#canvas"], ["key", "w", 300], *link()]

@@ -38,8 +38,9 @@ export class Controls {
       },
       { passive: false },
     );
-    surface.addEventListener('keydown', (e) => {
-      if (e.ctrlKey || e.metaKey || e.altKey || !MOVES[e.code]) return;
+    addEventListener('keydown', (e) => {
+      const choosing = e.target instanceof HTMLSelectElement;
+      if (choosing || e.ctrlKey || e.metaKey || e.altKey || !MOVES[e.code]) return;
       e.preventDefault();
       if (this.held.has(e.code)) return;
       this.held.add(e.code);
@@ -47,8 +48,8 @@ export class Controls {
       this.last = e.timeStamp - TAP;
       this.advance(e.timeStamp);
     });
-    surface.addEventListener('keyup', (e) => this.held.delete(e.code));
-    surface.addEventListener('blur', () => this.held.clear());
+    addEventListener('keyup', (e) => this.held.delete(e.code));
+    addEventListener('blur', () => this.held.clear());
   }
 
   private distance(): number {

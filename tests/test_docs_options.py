@@ -24,6 +24,7 @@ ELSEWHERE = {
     "--max-num-iterations",
     "ns-export ... --exact",
     "ns-export ... --finetune-steps",
+    "ns-export ... --photographs",
     "ns-export ... --polish-steps",
 }
 """Options that are declared with the commands, which need nerfstudio."""

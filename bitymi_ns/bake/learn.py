@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from bitymi_ns.bake.compact import Compact, with_coded_texels, with_rounded_surfels
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
 from bitymi_ns.bake.polish import PolishOptions, polish_scene
@@ -25,11 +26,13 @@ class Learning:
         polish: texels and surfels together; None = surfels stay as they were trained.
         tune: texels alone, after that; None = they stay as they are.
         train: options of the training, for the rates of the polish.
+        compact: what makes the bundle compact, before the texels are tuned alone; None = it is not.
     """
 
     polish: PolishOptions | None = None
     tune: TuneOptions | None = None
     train: TrainConfig = field(default_factory=TrainConfig)
+    compact: Compact | None = None
 
 
 def bake_and_learn(
@@ -66,6 +69,12 @@ def bake_and_learn(
         if baked.texels is not None:
             baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
         baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
+    coding = None
+    if learning.compact is not None:
+        baked = with_rounded_surfels(baked, photographs, background, learning.compact.precision, progress)
+        coding = learning.compact.coding_of(baked)
     if tune is not None and baked.texels is not None:
-        baked = tune_atlas(baked, photographs, background, tune, progress, held_out)
+        baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
+    if baked.codes is not None and baked.codes.texels is None:
+        baked = with_coded_texels(baked, coding)
     return baked.encoded(progress)

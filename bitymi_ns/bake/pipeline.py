@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.codes import Codes
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.inputs import BakeInput, drawable
 from bitymi_ns.bake.methods import BakeMethod, Blank, FineBake, Tiles, bake_method, reduced_tiles
@@ -20,6 +21,7 @@ from bitymi_ns.bake.photographed import photographed
 from bitymi_ns.bake.plan import Field, paper_texels
 from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
+from bitymi_ns.bake.texel_codes import TexelCodes, pages
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
@@ -47,6 +49,8 @@ class Baked:
         texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
         atlas: the encoded atlas, None without texture.
         options: what it was baked with.
+        codes: the integers that the surfels, and once they are coded the texels, stand for; None = they are stored as
+            they are.
         statistics: what was left out, what it cost, and the error of the quantisation.
     """
 
@@ -57,6 +61,7 @@ class Baked:
     atlas: EncodedAtlas | None
     options: BakeOptions
     statistics: Statistics = field(default_factory=Statistics)
+    codes: Codes | None = None
 
     @property
     def mean_residual(self) -> Tensor:
@@ -139,6 +144,22 @@ class Baked:
             return self
         atlas = _encode(self.texels, self.packing, self.options, progress)
         return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=_cost(self.packing, atlas)))
+
+    def with_texel_codes(self, codes: TexelCodes) -> Baked:
+        """The same bake with the residual colours of codes, which are those of its tiles."""
+        assert self.codes is not None
+        texels = pages(codes, self.packing)
+        value_range = choose_range(
+            texels.numpy(), self.packing, self.options.range, self.options.range_samples, self.options.seed
+        )
+        atlas = replace(encode(texels.numpy(), self.packing, "uint8", value_range), encoder="cosine transform")
+        return replace(
+            self.with_mean_residual(codes.constants),
+            texels=texels,
+            atlas=atlas,
+            statistics=self.statistics.but(atlas=_cost(self.packing, atlas), error=None),
+            codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
+        )
 
 
 @torch.no_grad()

@@ -152,6 +152,15 @@ class Gain(Part):
     after: Decibels = None
 
 
+class Rounding(Part):
+    """How the surfels of a compact bundle were rounded."""
+
+    mse: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """Mean square error that it made in the training views before the texels were tuned, colours from 0 to 1."""
+    steps: dict[str, NotNegative] = {}
+    """By column, as in `surfel_codes.REFERENCE`."""
+
+
 class FineTuning(Part):
     """What the fine-tuning or the polish did; no steps where there were too few views."""
 
@@ -196,6 +205,7 @@ class Statistics(Part):
     field: FieldLevels | None = None
     atlas: AtlasCost | None = None
     polish: FineTuning | None = None
+    rounding: Rounding | None = None
     finetune: FineTuning | None = None
     seconds: NotNegative | None = None
     """Of the bake, without the fine-tuning."""

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
-from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
+from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes, places
 from bitymi_ns.ops import (
     Fragments,
     TexelFragments,
@@ -33,6 +33,8 @@ from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.views import View, shown, training_order
 
+TO_START = 0.93
+"""Share of the bytes that coded texels may have before their last steps, in which they grow a little."""
 FEWEST_VIEWS = 4
 """With fewer views none can be set aside: an atlas is then not tuned."""
 
@@ -61,10 +63,17 @@ class TuneOptions:
     fit is traced anew whenever it is needed."""
     seed: int = 0
     """Of the order of the views."""
+    coded_steps: int = 120
+    """Further steps for texels that will be coded: they see what the coding makes of the texels."""
+    coded_every: int = 10
+    """How often it is looked what the coding makes of them."""
+    coded_rate: float = 0.02
+    """Their rate at the start."""
 
     def check(self) -> None:
         """Refuses values that make no sense."""
-        for name, least in (("steps", 1), ("held_in_every", 2), ("checks", 1), ("patience", 1), ("cache_bytes", 0)):
+        least_of = {"steps": 1, "held_in_every": 2, "checks": 1, "patience": 1, "cache_bytes": 0}
+        for name, least in {**least_of, "coded_steps": 0, "coded_every": 1}.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} of the fine-tuning must be at least {least}, not {getattr(self, name)}")
         if not self.rate > 0 or not self.prior > 0 or not 0 <= self.ssim_weight <= 1:
@@ -106,6 +115,7 @@ class TexelScene:
     Attributes:
         tiles: where the texels lie. A surfel without a tile has one texel, its constant residual.
         texels: [T, 3] as baked.
+        sizes: [N, 2] int32 sides of the tiles; (0, 0) = none.
     """
 
     def __init__(self, baked: Baked, background: Tensor) -> None:
@@ -124,6 +134,7 @@ class TexelScene:
         require("the fine-tuning", "cpu", baked.scene.tiles.device, advice)
         self._baked, self._background = baked, background.cpu()
         rectangles = torch.from_numpy(baked.packing.tiles)
+        self.sizes = rectangles[:, 3:]
         self.tiles = TexelTiles.of_sizes(rectangles[:, 3:].clamp(min=1), baked.extent.float())
         self.texels = torch.empty(self.tiles.count, 3)
         pages = baked.texels.reshape(-1, 3)
@@ -134,12 +145,8 @@ class TexelScene:
 
     def _places(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Rows of the list and rows of the flattened pages that are the same texels, one pair a tile size."""
-        rectangles = torch.from_numpy(self._baked.packing.tiles)
-        for r_u, r_v, rows in size_classes(rectangles):
-            listed = self.tiles.first[rows, None] + torch.arange(r_u * r_v)
-            packing = self._baked.packing
-            paged = texel_index(rectangles[rows], (r_u, r_v), packing.width, packing.height)
-            yield listed.reshape(-1), paged.reshape(-1)
+        packing = self._baked.packing
+        return places(torch.from_numpy(packing.tiles), packing.width, packing.height)
 
     def baked(self, texels: Tensor) -> Baked:
         """The bake with these texels [T, 3], to be `encoded`."""
@@ -225,6 +232,7 @@ def tune_atlas(
     options: TuneOptions | None = None,
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
+    coding: TexelCodeOptions | None = None,
 ) -> Baked:
     """Fine-tunes the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
@@ -244,6 +252,8 @@ def tune_atlas(
         options: see `TuneOptions`.
         progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
+        coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
+            the coding makes of the texels, and the codes that show the set-aside views best are kept.
 
     Returns:
         a new bake, encoded, with `statistics.finetune`; `baked` itself without change where there are fewer than 4
@@ -263,12 +273,15 @@ def tune_atlas(
     looks = _descend(scene, tuned, held_in, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = looks.statistics(len(tuned), len(held_in), *spent)
-    held_out = TexelViews(scene, eval_views, MemoryBudget(0))
+    held_out, texels, codes = TexelViews(scene, eval_views, MemoryBudget(0)), looks.best, None
+    if baked.codes is not None:
+        codes = _coded(scene, tuned, held_in, texels, coding or TexelCodeOptions(), options, progress)
+        texels = codes.texels()
     statistics = statistics.but(
         error_before=baked.statistics.error,
-        psnr_held_out=gain(held_out.psnr(scene.texels), held_out.psnr(looks.best)) if eval_views else None,
+        psnr_held_out=gain(held_out.psnr(scene.texels), held_out.psnr(texels)) if eval_views else None,
     )
-    result = scene.baked(looks.best).encoded(progress)
+    result = scene.baked(texels).encoded(progress) if codes is None else baked.with_texel_codes(codes)
     return replace(result, statistics=result.statistics.but(finetune=statistics))
 
 
@@ -294,18 +307,58 @@ def _descend(
     return looks
 
 
+def _coded(
+    scene: TexelScene,
+    views: TexelViews,
+    held_in: TexelViews,
+    texels: Tensor,
+    coding: TexelCodeOptions,
+    options: TuneOptions,
+    progress: Progress,
+) -> TexelCodes:
+    """Codes of texels [T, 3] after steps that see what the coding makes of them: the picture is that of the coded
+    texels, and its gradient moves the texels behind them. The codes that show the set-aside views best."""
+    inverse = 1.0 / (coverage(scene, views, progress) + options.prior)
+    coder = TexelCoder(scene.sizes, coverage(scene, views, progress, squared=True)[:, 0], coding)
+    codes = coder.code(texels) if coding.most_bytes is None else coder.fit(texels, coding.most_bytes * TO_START)
+    texels = codes.texels()
+    looks = Looks(replace(options, steps=max(1, options.coded_steps)), held_in.psnr(texels, progress), codes)
+    shift, gradient = torch.zeros_like(texels), torch.zeros_like(texels)
+    for step in range(options.coded_steps):
+        view = views[training_order(len(views), options.seed, step)]
+        rgb = scene.render(view, texels + shift).requires_grad_()
+        photometric(scene.shown(view, rgb), view.target, options.ssim_weight, view.mask).backward()
+        gradient.zero_()
+        scene.add_gradient(view, texels + shift, rgb.grad * numbers(rgb, view.mask), gradient)
+        texels.addcmul_(gradient, inverse, value=-falling(options.coded_rate, step, options.coded_steps))
+        progress("tuning coded texels", step + 1, options.coded_steps)
+        last = step + 1 == options.coded_steps
+        if (step + 1) % options.coded_every == 0 or last:
+            codes = coder.code(texels, rounds=0)
+            shown = codes.texels()
+            shift = shown - texels
+            if looks.due(step + 1) or last:
+                looks.note(step + 1, held_in.psnr(shown), lambda codes=codes: codes)
+    best = looks.best
+    if coding.most_bytes is not None and best.nbytes() > coding.most_bytes:
+        best = coder.fit(best.texels(), coding.most_bytes, rounds=1)
+    return best
+
+
 def numbers(rgb: Tensor, mask: Tensor | None) -> int:
     """How many numbers of a picture [H, W, 3] the mean of its loss is taken over."""
     return rgb.numel() if mask is None else 3 * int(mask.sum())
 
 
 @torch.no_grad()
-def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progress) -> Tensor:
+def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progress, squared: bool = False) -> Tensor:
     """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
-    weight times the bilinear weight, in pixels that count; 0 where no view sees it."""
+    weight, or its square, times the bilinear weight, in pixels that count; 0 where no view sees it."""
     total = torch.zeros_like(scene.texels)
     for index in range(len(views)):
         view = views[index]
+        if squared:
+            view = replace(view, fragments=replace(view.fragments, weight=view.fragments.weight.square()))
         shown = torch.ones_like(view.rest) if view.mask is None else view.mask.to(view.rest).expand_as(view.rest)
         scene.add_gradient(view, scene.texels, shown.contiguous(), total)
         progress("tracing the training views", index + 1, len(views))

@@ -16,19 +16,21 @@ from pydantic_core import PydanticCustomError
 from torch import Tensor
 
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
-from bitymi_ns.bake.quantise import Format
 from bitymi_ns.bake.statistics import Decibels, Part, Share, Statistics, Whole
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (2, 3)
-"""The newest version that is read. Lean view colours are version 2, which readers of version 1 refuse."""
+VERSION = (3, 0)
+"""The newest version that is read: surfels and texels as columns of integers."""
+LEAN_VERSION = (2, 3)
+"""Version of a bundle with lean view colours in a PLY file, which readers of version 1 refuse."""
 FULL_VERSION = (1, 4)
 """Version of a bundle whose surfels have all parameters."""
-_DIGEST_SINCE = {1: 2, 2: 1}  # major version to the minor one from which on bundle.json has a digest
+_DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
+COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 UNIT_LENGTH = 1e-3
 """By how much the length of a direction may differ from 1."""
@@ -104,15 +106,38 @@ Positive = Annotated[float, Field(gt=0, le=1e12)]
 Side = Annotated[int, Field(ge=1, le=1 << 20)]
 Coordinate = Annotated[float, Field(ge=-LIMITS["means"][0], le=LIMITS["means"][0])]
 Cosine = Annotated[float, Field(ge=-2, le=2)]
+Bent = Annotated[float, Field(ge=-100, le=100)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
-class Surfels(Part):
-    """What surfels.ply holds, and how it is to be read."""
+class Column(Part):
+    """A column of integers, as `streams.pack` packs it."""
 
-    file: Literal["surfels.ply"] = SURFELS
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
+    step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
+    low: Annotated[list[Annotated[int, Field(ge=-(1 << 40), le=1 << 40)]], Field(max_length=16)]
+    planes: Annotated[
+        list[Annotated[list[Annotated[int, Field(ge=1, le=1 << 40)]], Field(max_length=6)]], Field(max_length=16)
+    ]
+
+
+class PlaceFrame(Part):
+    """The grid of the surfels' places: x = center + scale sinh(low + step k), see `bake.surfel_codes.Frame`."""
+
+    center: tuple[Coordinate, Coordinate, Coordinate]
+    scale: Annotated[float, Field(gt=0, le=LIMITS["means"][0])]
+    low: tuple[Bent, Bent, Bent]
+
+
+class Surfels(Part):
+    """What surfels.ply or surfels.bin holds, and how it is to be read."""
+
+    file: Literal["surfels.ply", "surfels.bin"] = SURFELS
     count: Whole
+    frame: PlaceFrame | None = None
+    columns: Annotated[list[Column], Field(max_length=64)] | None = None
+    """Of surfels.bin, in their order."""
     view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
     support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
@@ -127,10 +152,20 @@ class Surfels(Part):
 
 
 class Atlas(Part):
-    """What atlas.ktx2 holds: residual = offset + scale * value, value = stored / 255 for bc7 and uint8."""
+    """What atlas.ktx2 holds: residual = offset + scale * value, value = stored / 255 for bc7 and uint8. Or what
+    texels.bin holds, of the format dct: texels that are rounded to 8 bits of that range."""
 
-    file: Literal["atlas.ktx2"] = ATLAS
-    format: Format
+    file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
+    format: Literal["bc7", "uint8", "fp16", "dct"]
+    texels: Whole | None = None
+    """Of all tiles, in texels.bin."""
+    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None
+    """Of coefficients of grade 0, in texels.bin."""
+    page_width: Side | None = None
+    page_rows: Side | None = None
+    """What `bake.packing.pack` is given for where tiles lie to follow from their sizes, in a compact bundle."""
+    columns: Annotated[list[Column], Field(max_length=64)] | None = None
+    """Of texels.bin, in their order."""
     width: Side
     height: Side
     layers: Side
@@ -148,6 +183,14 @@ class Atlas(Part):
     def _half_floats_are_residuals(self) -> Atlas:
         if self.format == "fp16" and (self.offset, self.scale) != (0.0, 1.0):
             raise PydanticCustomError("range", "must have offset 0 and scale 1, as its format is fp16")
+        return self
+
+    @model_validator(mode="after")
+    def _file_fits(self) -> Atlas:
+        parts = (self.texels, self.step, self.page_width, self.page_rows, self.columns)
+        coded = self.format == "dct"
+        if coded != (self.file == TEXELS) or (coded and None in parts):
+            raise PydanticCustomError("file", "file, format, texels, step, pages and columns do not fit each other")
         return self
 
 
@@ -225,10 +268,23 @@ class Manifest(Part):
         for name in self.files:
             if not _is_file_name(name):
                 raise PydanticCustomError("files", "files: {name} cannot be the name of a file", {"name": _short(name)})
-        if SURFELS not in self.files:
-            raise PydanticCustomError("files", f"files must list {SURFELS}")
-        if (ATLAS in self.files) != (self.atlas is not None):
-            raise PydanticCustomError("files", f"files and atlas disagree whether there is an {ATLAS}")
+        if self.surfels.file not in self.files:
+            raise PydanticCustomError("files", f"files must list {self.surfels.file}")
+        atlas = None if self.atlas is None else self.atlas.file
+        for name in (ATLAS, TEXELS):
+            if (name in self.files) != (name == atlas):
+                raise PydanticCustomError("files", f"files and atlas disagree whether there is an {name}")
+        return self
+
+    @model_validator(mode="after")
+    def _surfels_fit(self) -> Manifest:
+        surfels, compact = self.surfels, self.version.split(".")[0] == "3"
+        if compact != (surfels.file == COMPACT_SURFELS):
+            raise PydanticCustomError("file", "surfels.file must be surfels.bin in version 3, and in no other")
+        if compact and None in (surfels.frame, surfels.columns, surfels.terms):
+            raise PydanticCustomError("file", "surfels.bin needs surfels.frame, columns and terms")
+        if self.atlas is not None and compact != (self.atlas.file == TEXELS):
+            raise PydanticCustomError("file", "atlas.file must be texels.bin in version 3, and in no other")
         return self
 
 

@@ -14,9 +14,22 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
-from bitymi_ns.bake.quantise import decode_pages
-from bitymi_ns.bundle import ktx2, ply
-from bitymi_ns.bundle.manifest import ATLAS, MANIFEST, SURFELS, BundleError, FileEntry, Manifest, parse, points_of
+from bitymi_ns.bake.quantise import Range, decode_pages
+from bitymi_ns.bake.streams import StreamError
+from bitymi_ns.bake.texel_codes import constants, pages
+from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns.bundle.manifest import (
+    ATLAS,
+    COMPACT_SURFELS,
+    MANIFEST,
+    SURFELS,
+    TEXELS,
+    BundleError,
+    FileEntry,
+    Manifest,
+    parse,
+    points_of,
+)
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
@@ -85,7 +98,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> bytearray:
-    """The bytes of a file that bundle.json lists: all of surfels.ply and atlas.ktx2, none of others.
+    """The bytes of a file that bundle.json lists: all of those with surfels and texels, none of others.
 
     Args:
         folder: the bundle's folder.
@@ -98,27 +111,48 @@ def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> b
             bundle.json. What the header says is checked before more than it is read.
     """
     path = folder / name
-    check = {SURFELS: _check_surfels_header, ATLAS: _check_atlas_header}.get(name)
+    check = _CHECKS.get(name)
     try:
         return _read(path, info.files[name], verify, None if check is None else lambda *head: check(info, *head))
-    except (ply.PlyError, ktx2.Ktx2Error) as error:
+    except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
         raise BundleError(f"{path}: {error}") from error
     except OSError as error:
         raise BundleError(f"{path} cannot be read: {error}") from error
 
 
-def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
+def check_bytes(path: Path, info: Manifest, name: str, data: bytes, verify: bool = True) -> None:
+    """Checks the bytes of a file that bundle.json lists as `read_file` does.
+
+    Raises:
+        BundleError: size, hash or header are not as stated.
+    """
+    entry = info.files[name]
+    if len(data) != entry.bytes or (verify and hashlib.sha256(data).hexdigest() != entry.sha256):
+        raise BundleError(f"{path} is altered: its size or sha256 is not the one in {MANIFEST}")
+    try:
+        if name in _CHECKS:
+            _CHECKS[name](info, data[:_HEAD], len(data))
+    except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
+        raise BundleError(f"{path}: {error}") from error
+
+
+def assemble(
+    folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True, textured: bool = True
+) -> Bundle:
     """The bundle of what `read_file` read.
 
     Args:
         folder: the bundle's folder, for messages.
         info: bundle.json.
-        files: contents of surfels.ply and atlas.ktx2 by name.
+        files: contents of the files with surfels and texels, by name.
         decode: as in `read_bundle`.
+        textured: False leaves the texels of a compact bundle alone: its surfels show their constant residuals.
 
     Raises:
         BundleError: a file is malformed, or a value is out of range.
     """
+    if info.surfels.file == COMPACT_SURFELS:
+        return _assemble_compact(folder, info, files, textured)
     path = folder / SURFELS
     kind = info.surfels.view_color
     try:
@@ -151,6 +185,47 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
     scene.atlas, scene.blocks = _texels(image, decode, folder / ATLAS)
     scene.offset, scene.scale = info.atlas.offset, info.atlas.scale
     return Bundle(scene, info)
+
+
+def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray], textured: bool) -> Bundle:
+    """The bundle of surfels.bin and texels.bin."""
+    atlas, where = info.atlas, folder / COMPACT_SURFELS
+    try:
+        codes, residual, step = compact.unpack_surfels(info.surfels, memoryview(files[COMPACT_SURFELS]))
+        sizes = torch.from_numpy(codes.sizes)
+        tiles, texels = torch.zeros(len(codes), 5, dtype=torch.int32), None
+        if atlas is not None and textured:
+            packing = compact.packing_of(atlas, sizes)
+            tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
+            found = compact.unpack_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]))
+            value_range = Range(atlas.offset, atlas.scale, "")
+            texels = _rounded(pages(found, packing).numpy(), value_range)
+        elif atlas is None and bool((sizes > 0).any()):
+            raise StreamError("a surfel has a tile, and there is no atlas")
+    except StreamError as error:
+        raise BundleError(f"{where}: {error}") from error
+    scene = BakedScene(
+        codes.surfels(),
+        info.surfels.view_color,
+        tiles,
+        texels,
+        extent=codes.extent(SUPPORT),
+        mean_residual=constants(residual, step),
+        near=info.render.near,
+        weight_bound=info.render.weight_bound,
+        prefilter=info.render.prefilter,
+    )
+    if atlas is not None:
+        scene.offset, scene.scale = atlas.offset, atlas.scale
+    return Bundle(scene, info)
+
+
+def _rounded(pages: np.ndarray, value_range: Range) -> Tensor:
+    """[layers, height, width, 4] uint8 of residual colours [layers, height, width, 3]."""
+    rgba = np.full((*pages.shape[:3], 4), 255, dtype=np.uint8)
+    for page, values in zip(rgba, pages, strict=True):
+        page[..., :3] = value_range.to_unorm8(values)
+    return torch.from_numpy(rgba)
 
 
 @contextmanager
@@ -208,6 +283,24 @@ def _check_atlas_header(info: Manifest, head: bytes, size: int) -> None:
     found = (header.format, header.width, header.height, header.layers)
     if stated is None or found != (stated.format, stated.width, stated.height, stated.layers):
         raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
+
+
+def _check_compact_size(info: Manifest, head: bytes, size: int) -> None:
+    compact.check_surfels_size(info.surfels, size)
+
+
+def _check_texels_size(info: Manifest, head: bytes, size: int) -> None:
+    if info.atlas is not None:
+        compact.check_texels_size(info.atlas, size)
+
+
+_CHECKS: dict[str, Callable[[Manifest, bytes, int], None]] = {
+    SURFELS: _check_surfels_header,
+    ATLAS: _check_atlas_header,
+    COMPACT_SURFELS: _check_compact_size,
+    TEXELS: _check_texels_size,
+}
+"""What the size of a file has to fit, before it is read."""
 
 
 def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:

@@ -139,6 +139,8 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
         return Check(name, True, "not stated")
     if bundle.info.statistics.polish is not None and bundle.info.statistics.polish.steps:
         return Check(name, True, "not measured: the surfels learned after the bake and are those of no run")
+    if bundle.info.statistics.rounding is not None:
+        return Check(name, True, "not measured: the surfels were rounded after it, for a compact bundle")
     trained = {name: value.detach().float().cpu() for name, value in surfels.items()}
     places = {key: row for row, key in enumerate(_keys(trained))}
     rows = [places.get(key) for key in _keys(bundle.scene.surfels)]

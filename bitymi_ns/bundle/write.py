@@ -15,16 +15,19 @@ import torch
 
 from bitymi_ns import __version__
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
-from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.pipeline import Baked, Codes
 from bitymi_ns.bake.quantise import EncodedAtlas
-from bitymi_ns.bundle import ktx2, ply
+from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,
+    COMPACT_SURFELS,
     FULL_VERSION,
+    LEAN_VERSION,
     MANIFEST,
     SURFELS,
+    TEXELS,
     VERSION,
     BundleError,
     check_file_name,
@@ -90,6 +93,7 @@ def export(
     extra_files: Mapping[str, bytes] | None = None,
     loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
+    interchange: bool = False,
 ) -> Path:
     """Writes a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
 
@@ -100,12 +104,14 @@ def export(
         folder,
         replace(baked.scene, mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),
         baked.atlas,
+        baked.codes,
         background=background,
         world=world,
         statistics={**baked.statistics.model_dump(), **(statistics or {})},
         extra_files=extra_files,
         loose_files=loose_files,
         overwrite=overwrite,
+        interchange=interchange,
     )
 
 
@@ -113,6 +119,7 @@ def write_bundle(
     folder: str | Path,
     scene: BakedScene,
     atlas: EncodedAtlas | None = None,
+    codes: Codes | None = None,
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     world: World | None = None,
@@ -120,6 +127,7 @@ def write_bundle(
     extra_files: Mapping[str, bytes] | None = None,
     loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
+    interchange: bool = False,
 ) -> Path:
     """Writes a bundle; the folder appears complete or not at all.
 
@@ -128,12 +136,14 @@ def write_bundle(
         scene: on the CPU, all numbers finite, the view colours all or lean. Its own atlas is not looked at. The mean
             residuals are also a part of the colour that other viewers show.
         atlas: the encoded atlas, None for a scene without texture.
+        codes: what surfels and texels stand for, for a compact bundle; the scene and the atlas are decoded from them.
         background: colour behind the surfels.
         world: place in the capture's own frame.
         statistics: anything worth knowing about the bake, for people and reports.
         extra_files: further files by name, such as preview.png.
         loose_files: files that bundle.json does not vouch for, because they may be edited later.
         overwrite: replace an existing bundle.
+        interchange: write surfels.ply into a compact bundle, too, for other programs.
 
     Returns:
         the folder.
@@ -147,17 +157,17 @@ def write_bundle(
     _check_surfels(scene)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
-        if name in (SURFELS, ATLAS):
+        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS):
             raise BundleError(f"extra_files may not replace {name}")
     info = _describe(scene, atlas, background, world or World(), statistics)
+    parts = {} if codes is None else _compact_parts(codes, info)
     try:
         with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
-            columns = to_columns(surfels, scene.tiles.numpy(), scene.mean_residual, scene.extent, scene.view_color)
-            terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
-            ply.write_ply(new / SURFELS, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
-            if atlas is not None:
+            if codes is None or interchange:
+                write_surfels(new / SURFELS, scene)
+            if codes is None and atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
-            for name, data in (extra_files or {}).items():
+            for name, data in {**parts, **(extra_files or {})}.items():
                 (new / name).write_bytes(data)
             info["files"] = {path.name: _fingerprint(path) for path in sorted(new.iterdir())}
             (new / MANIFEST).write_bytes(dump(describe(info)))
@@ -171,6 +181,30 @@ def write_bundle(
     return folder
 
 
+def write_surfels(path: Path, scene: BakedScene) -> None:
+    """Writes the surfels of a scene on the CPU as a PLY file, which viewers of Gaussian splats open, too."""
+    columns = to_columns(scene.surfels, scene.tiles.numpy(), scene.mean_residual, scene.extent, scene.view_color)
+    terms = {TERMS: term_columns(scene.surfels)} if "view_terms" in scene.surfels else None
+    ply.write_ply(path, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
+
+
+def _compact_parts(codes: Codes, info: dict[str, Any]) -> dict[str, bytes]:
+    """The two files of a compact bundle; their description goes into `info`."""
+    of_surfels, surfels = compact.pack_surfels(codes.surfels, codes.residual, codes.residual_step)
+    info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
+    info["version"] = f"{VERSION[0]}.{VERSION[1]}"
+    parts = {COMPACT_SURFELS: surfels}
+    if codes.texels is not None:
+        of_texels, parts[TEXELS] = compact.pack_texels(codes.texels)
+        pages = {"page_width": codes.page_width, "page_rows": codes.page_rows}
+        info["atlas"] |= {"file": TEXELS, "format": "dct", **pages, **of_texels}
+        info["atlas"].pop("extent_column")
+        if "atlas" in info["statistics"]:
+            cost = dict(info["statistics"]["atlas"])
+            info["statistics"]["atlas"] = {**cost, "bytes": len(parts[TEXELS])}
+    return parts
+
+
 def _describe(
     scene: BakedScene,
     atlas: EncodedAtlas | None,
@@ -182,7 +216,7 @@ def _describe(
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
-    version = VERSION if lean else FULL_VERSION
+    version = LEAN_VERSION if lean else FULL_VERSION
     empty = len(means) == 0
     described: dict[str, Any] = {
         "version": f"{version[0]}.{version[1]}",

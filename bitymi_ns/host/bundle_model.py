@@ -12,7 +12,6 @@ from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
-from bitymi_ns.bundle.manifest import ATLAS
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
 from bitymi_ns.ops import webgpu
@@ -49,7 +48,8 @@ class BakedModel(SurfelModel):
             bundle = read_bundle(folder)
         except BundleError as error:
             fail(f"{error}. {REMEDY}", error)
-        self._atlas_bytes = bundle.info.files[ATLAS].bytes if ATLAS in bundle.info.files else 0
+        atlas = bundle.info.atlas
+        self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
         self._scene = bundle.scene
         self._scene.through_webgpu = self._asks_for_webgpu()
         self._count = len(bundle)

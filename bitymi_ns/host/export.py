@@ -28,6 +28,7 @@ from bitymi_ns.bake import (
     bake_and_learn,
     rich_progress,
 )
+from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import BundleError, export, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, dump
@@ -36,6 +37,7 @@ from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
+from bitymi_ns.host.compact_options import CompactOptions
 from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.export_cameras import camera_files
 from bitymi_ns.host.export_summary import print_summary
@@ -54,7 +56,7 @@ STEPS_AFTER_POLISH = 100
 
 
 @dataclass(kw_only=True)
-class ExportAtlas(BakeOptions):
+class ExportAtlas(BakeOptions, CompactOptions):
     """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
 
     The bundle is written aside and renamed, opened again, and compared with the trained scene and with the photographs
@@ -118,10 +120,11 @@ class ExportAtlas(BakeOptions):
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
+        self.check_compact(options.tolerance)
         return options
 
-    def _learning(self, model: BitymiModel, views: int) -> Learning:
-        """What learns from so many training photographs."""
+    def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
+        """What learns from so many training photographs, and whether the bundle is compact."""
         if self.exact:
             return Learning()
         steps = self.polish_steps
@@ -133,14 +136,15 @@ class ExportAtlas(BakeOptions):
         if steps is None:
             steps = TuneOptions.steps if polish is None else STEPS_AFTER_POLISH
         tune = TuneOptions(steps=steps, cache_bytes=int(self.finetune_memory * 1e9)) if textured and steps else None
-        return Learning(polish, tune, model.train_config)
+        return Learning(polish, tune, model.train_config, compact)
 
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        learning = self._learning(model, len(views))
+        shown = preview(model, datamanager, views, "JPEG" if self.compact else "PNG")
+        learning = self._learning(model, len(views), self.compact_of(len(shown)))
         polish, tune = learning.polish, learning.tune
         for name, options_of in (("polish", polish), ("finetune", None if polish else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
@@ -158,7 +162,7 @@ class ExportAtlas(BakeOptions):
                 held_out = datamanager.eval_views if self.compare else ()
                 background = model.background.cpu()
                 photographs = datamanager.train_views
-                if polish or tune:
+                if polish or tune or self.compact:
                     photographs = corrected(photographs, model.resume_state.get("exposure"))
                 baked = bake_and_learn(
                     model.scene, views, photographs, background, options, learning, progress, held_out
@@ -173,11 +177,12 @@ class ExportAtlas(BakeOptions):
             world=world_of(datamanager),
             statistics={"options": asdict(options), "method": config.method_name},
             extra_files={
-                "preview.png": preview(model, datamanager, views),
+                "preview.jpg" if self.compact else "preview.png": shown,
                 **camera_files(datamanager, views, self.photographs),
             },
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
+            interchange=self.interchange,
         )
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
@@ -234,15 +239,15 @@ def world_of(datamanager: Any) -> World:
 
 
 @torch.no_grad()
-def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera]) -> bytes:
-    """A PNG of the first held-out view, or of the first training view where none is held out."""
+def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera], format: str = "PNG") -> bytes:
+    """A picture of the first held-out view, or of the first training view where none is held out."""
     camera = train_views[0]
     if len(datamanager.eval_dataset):
         camera = datamanager.eval_views[0].camera
     rgb = model.render(camera, model.background, maps=False).rgb
     pixels = (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
+    Image.fromarray(pixels).save(buffer, format=format)
     return buffer.getvalue()
 
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL
 from bitymi_ns.bake.statistics import FineTuning, Percentiles
-from bitymi_ns.bundle.manifest import SURFELS, Manifest
+from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.host.errors import say
 from bitymi_ns.ops import VIEW_COLORS
 
@@ -96,7 +96,7 @@ def print_savings(table: Table, info: Manifest) -> None:
 
 def print_view_color(table: Table, info: Manifest) -> None:
     """What the surfels keep of their view colours, and what that saves and costs."""
-    lean, stored = info.statistics.view_color, info.files[SURFELS].bytes
+    lean, stored = info.statistics.view_color, info.files[info.surfels.file].bytes
     if lean is None:
         table.add_row("View colour", "all of it is kept")
         table.add_row("Surfel bytes", f"{stored:,}")
@@ -105,8 +105,11 @@ def print_view_color(table: Table, info: Manifest) -> None:
     share = 100 * sites.after / sites.before
     table.add_row(VIEW_COLORS[lean.kind].kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
     table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
-    whole = stored + lean.bytes.before - lean.bytes.after
-    table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
+    if info.surfels.columns is None:
+        whole = stored + lean.bytes.before - lean.bytes.after
+        table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
+    else:
+        table.add_row("Surfel bytes", f"{stored:,} ({stored / max(1, count):.1f} per surfel)")
     table.add_row("Error of a view colour", percentiles_text(lean.error))
     table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
 

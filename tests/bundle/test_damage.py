@@ -59,7 +59,7 @@ def test_versions(surfels, tmp_path):
     make(surfels, target)
     amend(target, lambda info: info.update(version="1.7", holograms={"yes": True}))
     assert read_bundle(target).info.holograms == {"yes": True}
-    amend(target, lambda info: info.update(version="3.0"))
+    amend(target, lambda info: info.update(version="4.0"))
     with pytest.raises(BundleError, match="update bitymi-ns"):
         read_bundle(target)
     amend(target, lambda info: info.update(version="one"))
@@ -82,7 +82,10 @@ def test_versions(surfels, tmp_path):
         (lambda i: i["atlas"].update(offset=10**400), "atlas.offset must be a finite number"),
         (lambda i: i["atlas"].update(scale=0), "atlas.scale must be greater than 0, not 0"),
         (lambda i: i["atlas"].update(scale=1e30), r"atlas.scale must be less than or equal to 512, not 1e\+30"),
-        (lambda i: i["atlas"].update(file="../surfels.ply"), "atlas.file must be 'atlas.ktx2', not '../surfels.ply'"),
+        (
+            lambda i: i["atlas"].update(file="../surfels.ply"),
+            "atlas.file must be 'atlas.ktx2' or 'texels.bin', not '../surfels.ply'",
+        ),
         (lambda i: i["surfels"].update(file="atlas.ktx2"), "surfels.file must be 'surfels.ply'"),
         (lambda i: i.update(atlas=None), "disagree"),
         (lambda i: i["files"].pop("atlas.ktx2"), "disagree"),

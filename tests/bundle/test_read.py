@@ -226,7 +226,7 @@ def test_verify_says_what_was_edited_and_what_to_do(surfels, tmp_path, capsys):
         ('"near": 0.2', '"near": 5', "is altered: its digest"),
         ('"near": 0.2', '"near": -5', "render.near must be greater"),
         ('"statistics": {}', '"statistics": [1, 2]', "statistics must be an object, not [1, 2]"),
-        ('"file": "atlas.ktx2"', '"file": "../x"', "atlas.file must be 'atlas.ktx2', not '../x'"),
+        ('"file": "atlas.ktx2"', '"file": "../x"', "atlas.file must be 'atlas.ktx2' or 'texels.bin', not '../x'"),
     ):
         assert text in whole
         path.write_text(whole.replace(text, edited))

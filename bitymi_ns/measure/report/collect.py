@@ -26,7 +26,7 @@ MAX_DEPTH = 8
 """Folders are searched this many levels down."""
 MAX_ENTRIES = 50_000
 """A search stops after this many files."""
-RENDERED = re.compile(r"^eval_.+_\d{4,}\.png$|^preview.*\.png$", re.IGNORECASE)
+RENDERED = re.compile(r"^eval_.+_\d{4,}\.png$|^preview.*\.(png|jpg)$", re.IGNORECASE)
 """Images that a search picks up: those of `ns-eval --render-output-path` and the preview of a bundle."""
 
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}

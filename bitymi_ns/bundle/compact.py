@@ -1,0 +1,213 @@
+"""The two files of a compact bundle: surfels.bin and texels.bin, columns of integers that bundle.json describes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake import streams
+from bitymi_ns.bake.packing import Packing, pack
+from bitymi_ns.bake.streams import StreamError
+from bitymi_ns.bake.surfel_codes import PLACE_BITS, REFERENCE, Codes, Frame, SurfelCodes, term_numbers
+from bitymi_ns.bake.texel_codes import GRADES, TexelCodes, blocks_of
+from bitymi_ns.bundle.manifest import Atlas, Column, Surfels
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+
+__all__ = [
+    "check_surfels_size",
+    "check_texels_size",
+    "pack_surfels",
+    "pack_texels",
+    "packing_of",
+    "unpack_surfels",
+    "unpack_texels",
+]
+
+SURFELS_PER_BYTE, TEXELS_PER_BYTE = 256, 4096
+"""A file is refused that is said to hold more than so many for each of its bytes, and `SPARE` of them."""
+SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
+MOST_EXPONENT = 12  # of two, in the side of a tile
+_COEFFICIENT_PLANES = 3
+
+
+def pack_surfels(codes: SurfelCodes, residual: Codes, residual_step: float) -> tuple[dict[str, Any], bytes]:
+    """What bundle.json says of surfels.bin, and the file.
+
+    Args:
+        codes: of N surfels.
+        residual: [N, 3] mean residuals: green, red less green, blue less green.
+        residual_step: of these.
+    """
+    columns = {**codes.columns, "residual": residual}
+    steps = {**codes.steps, "residual": residual_step}
+    described, data = [], []
+    for name in _surfel_columns(codes.kind)[0]:
+        packed = streams.pack(columns[name])
+        described.append({"name": name, "step": steps.get(name), "low": packed.low, "planes": packed.planes})
+        data.append(packed.data)
+    frame = {"center": codes.frame.center, "scale": codes.frame.scale, "low": codes.frame.low}
+    return {"frame": frame, "columns": described}, b"".join(data)
+
+
+def unpack_surfels(info: Surfels, data: memoryview) -> tuple[SurfelCodes, Codes, float]:
+    """The codes, the residuals [N, 3] and their step, of what `pack_surfels` made.
+
+    Raises:
+        StreamError: the file is damaged, contradicts bundle.json, or holds a number that no surfel can have.
+    """
+    assert info.columns is not None and info.frame is not None
+    names, numbers = _surfel_columns(info.view_color)
+    steps = _check_columns(info.columns, names, numbers, (*REFERENCE, "residual"))
+    rows = dict.fromkeys(names, info.count) | dict.fromkeys(("term_shape", "term_color"), info.terms or 0)
+    codes: dict[str, Codes] = {}
+    for column, part in zip(info.columns, _parts(data, info.columns), strict=True):
+        if column.name == "extent":
+            rows["extent"] = int((codes["size"] > 0).sum())
+        codes[column.name] = streams.unpack(part, rows[column.name], column.low, column.planes)
+        _check_codes(column.name, codes[column.name], info)
+    codes["place"] = np.cumsum(codes["place"], axis=0)
+    f, residual = info.frame, codes.pop("residual")
+    frame = Frame(f.center, f.scale, f.low)
+    residual_step = steps.pop("residual")
+    return SurfelCodes(info.view_color, frame, steps, codes), residual, residual_step
+
+
+def pack_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
+    """What bundle.json says of texels.bin, and the file."""
+    described, data = [], []
+    for name, values in codes.columns.items():
+        packed = streams.pack(values)
+        described.append({"name": name, "low": packed.low, "planes": packed.planes})
+        data.append(packed.data)
+    count = int(codes.sizes.clamp(min=1).prod(dim=1)[codes.sizes[:, 0] > 0].sum())
+    return {"texels": count, "step": codes.step, "columns": described}, b"".join(data)
+
+
+def unpack_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview) -> TexelCodes:
+    """The codes of what `pack_texels` made.
+
+    Args:
+        info: of bundle.json.
+        sizes: [N, 2] sides of the tiles.
+        residual, residual_step: of surfels.bin.
+        data: of texels.bin.
+
+    Raises:
+        StreamError: the file is damaged, contradicts bundle.json or the sizes of the tiles.
+    """
+    assert info.columns is not None and info.step is not None and info.texels is not None
+    count = int(sizes.prod(dim=1).sum())
+    if count != info.texels:
+        raise StreamError(f"the tiles of the surfels have {count} texels, atlas.texels says {info.texels}")
+    blocks = blocks_of(sizes)
+    names = ["grade", *(each.name for each in blocks)]
+    _check_columns(info.columns, names, {name: 1 if name == "grade" else 3 for name in names}, ())
+    parts = _parts(data, info.columns)
+    column, tiles = info.columns[0], int((sizes[:, 0] > 0).sum())
+    grades = streams.unpack(next(parts), tiles, column.low, column.planes)[:, 0]
+    if tiles and not (GRADES[0] <= grades.min() and grades.max() <= GRADES[1]):
+        raise StreamError(f"a grade is not from {GRADES[0]} to {GRADES[1]}")
+    coefficients = []
+    for each, column, part in zip(blocks, info.columns[1:], parts, strict=True):
+        if any(len(planes) > _COEFFICIENT_PLANES for planes in column.planes):
+            raise StreamError(f"the coefficients {column.name} have more than {_COEFFICIENT_PLANES} bytes")
+        values = streams.unpack(part, each.texels.numel(), column.low, column.planes, np.int32)
+        coefficients.append(torch.from_numpy(values).view(-1, len(each.texels), 3))
+    return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), coefficients)
+
+
+def packing_of(info: Atlas, sizes: Tensor) -> Packing:
+    """Where the tiles lie, which follows from their sizes.
+
+    Raises:
+        StreamError: they do not lie in pages of the size that bundle.json states.
+    """
+    try:
+        packing = pack(sizes.numpy(), info.page_width, info.page_rows)
+    except ValueError as error:
+        raise StreamError(str(error)) from error
+    found = (packing.width, packing.height, packing.layers)
+    if found != (info.width, info.height, info.layers):
+        raise StreamError(f"the tiles make pages {found}, width, height and layers of the atlas are others")
+    return packing
+
+
+def check_surfels_size(info: Surfels, size: int) -> None:
+    """Refuses a surfels.bin of this many bytes that is not as bundle.json describes it, before it is read.
+
+    Raises:
+        StreamError: says why.
+    """
+    _check_size(info.columns or [], size)
+    if max(info.count, info.terms or 0) > SURFELS_PER_BYTE * size + SPARE_SURFELS:
+        raise StreamError(f"{info.count} surfels with {info.terms} terms cannot be in {size} bytes")
+
+
+def check_texels_size(info: Atlas, size: int) -> None:
+    """The same of texels.bin.
+
+    Raises:
+        StreamError: says why.
+    """
+    _check_size(info.columns or [], size)
+    if max(info.texels or 0, info.width * info.height * info.layers) > TEXELS_PER_BYTE * size + SPARE_TEXELS:
+        raise StreamError(f"{info.texels} texels cannot be in {size} bytes")
+
+
+def _surfel_columns(kind: str) -> tuple[list[str], dict[str, int]]:
+    """Names of the columns of surfels.bin in their order, and how many numbers each has."""
+    colors, shapes = term_numbers(kind)
+    numbers = {"place": 1, "largest": 1, "rotation": 3, "log_scales": 2, "opacity": 1, "beta": 1, "size": 1}
+    numbers |= {"residual": 3, "view_base": 3, "extent": 1, "view_count": 1}
+    numbers |= {"term_shape": len(shapes), "term_color": len(colors)}
+    return list(numbers), numbers
+
+
+def _check_columns(
+    columns: Sequence[Column], names: Sequence[str], numbers: dict[str, int], stepped: Sequence[str]
+) -> dict[str, float]:
+    found = [column.name for column in columns]
+    if found != list(names):
+        raise StreamError(f"the columns are {found}, not {list(names)}")
+    steps = {}
+    for column in columns:
+        if len(column.low) != numbers[column.name] or len(column.planes) != numbers[column.name]:
+            raise StreamError(f"the column {column.name} needs {numbers[column.name]} numbers, not {len(column.low)}")
+        if column.name in stepped:
+            if column.step is None:
+                raise StreamError(f"the column {column.name} has no step")
+            steps[column.name] = column.step
+    return steps
+
+
+def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
+    """Refuses numbers that no surfel can have; those that are only too large are brought to their limits."""
+    if codes.size == 0:
+        return
+    low, high = int(codes.min()), int(codes.max())
+    if name == "place" and (low < 0 or float(codes.astype(np.float64).sum()) >= 2.0 ** (3 * PLACE_BITS)):
+        raise StreamError("the places are not in ascending order, or beyond their grid")
+    if name == "largest" and (low < 0 or high > 3):
+        raise StreamError("a rotation's largest number is not one of four")
+    if name == "size":
+        sides = np.stack([codes >> 4, codes & 15])[:, codes > 0]
+        if low < 0 or (sides < 2).any() or (sides > MOST_EXPONENT).any():
+            raise StreamError("a tile has a side that is not a power of two from 4 to 4096")
+    if name == "view_count":
+        counts = VIEW_COLORS[info.view_color].lean_counts
+        if not np.isin(codes, list(counts)).all() or int(codes.sum()) != (info.terms or 0):
+            raise StreamError("the view colours do not have the terms that bundle.json counts")
+
+
+def _parts(data: memoryview, columns: Sequence[Column]) -> Iterator[memoryview]:
+    return streams.frames(data, [sum(map(sum, column.planes)) for column in columns])
+
+
+def _check_size(columns: Sequence[Column], size: int) -> None:
+    stated = sum(sum(map(sum, column.planes)) for column in columns)
+    if stated != size:
+        raise StreamError(f"truncated or too long: the columns need {stated} bytes, the file has {size}")

@@ -1,0 +1,58 @@
+"""A compact bundle of a few random surfels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from bitymi_ns.bake.codes import Codes
+from bitymi_ns.bake.limits import EXTENTS
+from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.bake.surfel_codes import REFERENCE, code_surfels
+from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, pages
+from bitymi_ns.bundle import write_bundle
+from bitymi_ns.measure.stability.scenes import random_scene
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.scene.baked import BakedScene
+from tests.ops.test_view_color import lean_parameters
+
+SIDES = ((8, 4), (0, 0), (4, 4), (16, 8))
+RANGE = Range(-0.5, 2.0, "test")
+
+
+def make_codes(kind: str = "sv", count: int = 12, textured: bool = True) -> Codes:
+    """Codes of random surfels, every fourth of which has no tile."""
+    params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
+    params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
+    params |= lean_parameters(kind, count, torch.float32)
+    sizes = torch.tensor([SIDES[i % len(SIDES)] if textured else (0, 0) for i in range(count)])
+    surfels, order = code_surfels(params, kind, sizes, torch.linspace(0.5, 3.0, count), REFERENCE)
+    sizes = sizes[order]
+    generator = torch.Generator().manual_seed(0)
+    texels = torch.rand(int(sizes.clamp(min=1).prod(1).sum()), 3, generator=generator) - 0.5
+    coded = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions()).code(texels)
+    return Codes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192)
+
+
+def scene_of(codes: Codes) -> BakedScene:
+    """The scene that the codes stand for, without its atlas."""
+    packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
+    assert EXTENTS[0] < 3.0 < EXTENTS[1]
+    return BakedScene(
+        codes.surfels.surfels(),
+        codes.surfels.kind,
+        torch.from_numpy(packing.tiles),
+        extent=codes.surfels.extent(3.0),
+        mean_residual=None,
+    )
+
+
+def write_compact(folder: Path, codes: Codes, **options) -> Path:
+    """Writes it as a bundle."""
+    atlas = None
+    if codes.texels is not None:
+        packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
+        atlas = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
+    return write_bundle(folder, scene_of(codes), atlas, codes, **options)

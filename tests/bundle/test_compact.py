@@ -1,0 +1,123 @@
+"""Compact bundles: what goes in comes out, what contradicts itself is refused before it takes memory."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.quantise import encode
+from bitymi_ns.bake.texel_codes import pages
+from bitymi_ns.bundle import BundleError, check_files, ply, read_bundle
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from tests.bundle.compact_scene import RANGE, make_codes, scene_of, write_compact
+from tests.bundle.damage import amend, signed
+
+
+@pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
+@pytest.mark.parametrize("textured", [True, False])
+def test_a_compact_bundle_holds_what_its_codes_stand_for(tmp_path: Path, kind: str, textured: bool) -> None:
+    codes = make_codes(kind, textured=textured)
+    folder = write_compact(tmp_path / "b", codes)
+    assert {path.name for path in folder.iterdir()} == {"bundle.json", "surfels.bin"} | (
+        {"texels.bin"} if textured else set()
+    )
+    bundle, checks = check_files(folder)
+    assert bundle is not None and all(check.ok for check in checks), checks
+    assert bundle.info.version == "3.0"
+    want, got = scene_of(codes), bundle.scene
+    for name, value in want.surfels.items():
+        torch.testing.assert_close(got.surfels[name], value, rtol=0, atol=0)
+    assert torch.equal(got.tiles, want.tiles)
+    tiled = want.tiles[:, 3] > 0
+    assert torch.equal(got.extent[tiled], want.extent[tiled])
+    if textured:
+        packing = pack(codes.surfels.sizes, 4096, 8192)
+        stored = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
+        assert got.atlas.numpy().tobytes() == b"".join(stored.payload)
+        torch.testing.assert_close(got.mean_residual, codes.texels.constants)
+
+
+def test_it_is_much_smaller_than_a_plain_one_and_can_carry_the_ply(tmp_path: Path) -> None:
+    folder = write_compact(tmp_path / "b", make_codes(count=400), interchange=True)
+    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
+    assert sizes["surfels.bin"] < sizes["surfels.ply"] / 4
+    columns = ply.parse_ply((folder / "surfels.ply").read_bytes())["vertex"]
+    bundle = read_bundle(folder)
+    np.testing.assert_array_equal(columns["x"], bundle.scene.surfels["means"][:, 0].numpy())
+    np.testing.assert_array_equal(columns["tile_ru"], bundle.scene.tiles[:, 3].numpy())
+
+
+def test_an_empty_bundle_is_whole(tmp_path: Path) -> None:
+    codes = make_codes(count=1, textured=False)
+    bundle = read_bundle(write_compact(tmp_path / "b", codes))
+    assert len(bundle) == 1 and bundle.scene.atlas is None
+
+
+def _column(info: dict, name: str) -> dict:
+    found = [*info["surfels"]["columns"], *info["atlas"]["columns"]]
+    return next(column for column in found if column["name"] == name)
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (lambda i: i["surfels"].update(count=13), "a frame declares 12 bytes, 13 are wanted"),
+        (lambda i: i["surfels"].update(count=2**30), "surfels with .* cannot be in"),
+        (lambda i: i["surfels"].update(terms=2**30), "surfels with .* cannot be in"),
+        (lambda i: i["surfels"].update(view_color="sh"), "term_shape needs 0 numbers, not 3"),
+        (lambda i: i["surfels"].update(columns=i["surfels"]["columns"][1:]), "truncated or too long"),
+        (lambda i: i["surfels"]["columns"].reverse(), "the columns are"),
+        (lambda i: i["surfels"].pop("frame"), "surfels.bin needs surfels.frame, columns and terms"),
+        (lambda i: i["surfels"].update(file="surfels.ply"), "files must list surfels.ply"),
+        (lambda i: i.update(version="2.2"), "surfels.file must be surfels.bin in version 3, and in no other"),
+        (lambda i: _column(i, "rotation").update(step=None), "rotation has no step"),
+        (lambda i: _column(i, "rotation").update(step=-1.0), "must be greater than or equal to"),
+        (lambda i: _column(i, "rotation")["low"].append(0), "rotation needs 3 numbers, not 4"),
+        (lambda i: _column(i, "largest").update(low=[3]), "a rotation's largest number is not one of four"),
+        (lambda i: _column(i, "size").update(low=[1]), "a tile has a side that is not a power of two"),
+        (lambda i: _column(i, "view_count").update(low=[40]), "do not have the terms that bundle.json counts"),
+        (lambda i: _column(i, "place").update(low=[2**40]), None),
+        (lambda i: _column(i, "place").update(low=[-(2**40)]), "not in ascending order"),
+        (lambda i: _column(i, "grade").update(low=[99]), "a grade is not from"),
+        (lambda i: i["atlas"].update(texels=5), "atlas.texels says 5"),
+        (lambda i: i["atlas"].update(width=1 << 20, height=1 << 20), "texels cannot be in"),
+        (lambda i: i["atlas"].update(height=i["atlas"]["height"] + 4), "width, height and layers of the atlas are oth"),
+        (lambda i: i["atlas"].update(page_width=4), "wide, more than the page width"),
+        (lambda i: i["atlas"].update(format="uint8"), "do not fit each other"),
+        (lambda i: i["atlas"].pop("step"), "do not fit each other"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(tmp_path: Path, change, reason: str | None) -> None:
+    folder = write_compact(tmp_path / "b", make_codes())
+    amend(folder, change)
+    if reason is None:  # places elsewhere: numbers like any others
+        assert len(read_bundle(folder)) == 12
+        return
+    with pytest.raises(BundleError, match=reason):
+        read_bundle(folder)
+
+
+@pytest.mark.parametrize("name", ["surfels.bin", "texels.bin"])
+def test_files_of_another_size_are_refused_before_they_are_read(tmp_path: Path, name: str) -> None:
+    folder = write_compact(tmp_path / "b", make_codes())
+    os.truncate(folder / name, 40 << 30)
+    info = json.loads((folder / "bundle.json").read_text())
+    info["files"][name]["bytes"] = 40 << 30
+    (folder / "bundle.json").write_bytes(signed(info))
+    with pytest.raises(BundleError, match=f"{name}: truncated or too long"):
+        read_bundle(folder, verify=False)
+
+
+def test_damage_is_found_by_the_hash(tmp_path: Path) -> None:
+    folder = write_compact(tmp_path / "b", make_codes())
+    data = bytearray((folder / "texels.bin").read_bytes())
+    data[-1] ^= 1
+    (folder / "texels.bin").write_bytes(data)
+    with pytest.raises(BundleError, match="texels.bin is altered"):
+        read_bundle(folder)

@@ -1,0 +1,59 @@
+"""A compact bundle from a trained scene, and back into nerfstudio's tools."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.bundle import check_files, read_bundle
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.verify import check_run
+from tests.e2e.exports import TOLERANCE, evaluate, run_export
+
+
+def test_it_is_smaller_and_shows_the_same(trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "b"
+    run_export(trained, folder, tolerance=TOLERANCE, finetune_steps=30, compact=True, interchange=True)
+    assert {path.name for path in folder.iterdir()} == {
+        "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg"
+    }  # fmt: skip
+    read, checks = check_files(folder)
+    assert read is not None and all(check.ok for check in checks), checks
+    assert (folder / "surfels.bin").stat().st_size < (bundle / "surfels.ply").stat().st_size / 3
+    info = json.loads((folder / "bundle.json").read_text())
+    held_out, rounding = info["statistics"]["held_out"], info["statistics"]["rounding"]
+    assert held_out["psnr_baked_against_photos"] > held_out["psnr_neural_against_photos"] - 0.2
+    assert rounding["mse"] >= 0 and set(rounding["steps"]) > {"place", "rotation", "view_base"}
+    assert info["statistics"]["atlas"]["bytes"] == (folder / "texels.bin").stat().st_size
+    stock = evaluate(folder / "config.yml", tmp_path / "baked.json")
+    assert stock["psnr"] == pytest.approx(held_out["psnr_baked_against_photos"], abs=0.05)
+    assert stock["atlas_bytes"] == (folder / "texels.bin").stat().st_size
+    results = check_run(read, trained.get_base_dir() / "config.yml", 2)
+    assert all(check.ok for check in results), results
+
+
+def test_it_can_be_as_small_as_is_asked_for(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=0, compact=True)
+    whole = sum(path.stat().st_size for path in (tmp_path / "b").iterdir())
+    texels = (tmp_path / "b" / "texels.bin").stat().st_size
+    target = (whole - texels / 2) / 1e6
+    run_export(trained, tmp_path / "c", tolerance=TOLERANCE, finetune_steps=30, compact=True, target_mb=target)
+    assert sum(path.stat().st_size for path in (tmp_path / "c").iterdir()) <= 1e6 * target
+    assert len(read_bundle(tmp_path / "c")) == len(read_bundle(tmp_path / "b"))
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"compact": True, "exact": True}, "needs a tolerance"),
+        ({"interchange": True}, "--interchange"),
+        ({"target_mb": 1.0}, "--target-mb"),
+        ({"compact": True, "texel_step": 0.0}, "--texel-step"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(trained: BitymiTrainerConfig, tmp_path: Path, options, said) -> None:
+    with pytest.raises(InputError, match=said):
+        run_export(trained, tmp_path / "b", **options)

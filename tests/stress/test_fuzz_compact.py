@@ -1,0 +1,143 @@
+"""Damaged compact bundles, past their hashes: an error that names the damage, or a scene of bounded numbers.
+
+BITYMI_FUZZ=500 makes 10^5 of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zstandard
+
+from bitymi_ns.bake.limits import beyond
+from bitymi_ns.bake.streams import StreamError
+from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, parse
+from bitymi_ns.bundle.read import _CHECKS, assemble
+from tests.bundle.compact_scene import make_codes, write_compact
+from tests.bundle.damage import signed
+
+MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
+EXAMPLES = 200 * MORE
+MEMORY = 48 << 20
+"""More than the largest scene that so few bytes may be said to hold."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """bundle.json and the other files of a small bundle."""
+    folder = write_compact(tmp_path_factory.mktemp("compact") / "b", make_codes(count=6))
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    return json.loads(files.pop("bundle.json")), files
+
+
+def opened(info: dict[str, Any], files: dict[str, bytes]) -> bool:
+    """Whether what is there can be opened; then its numbers are within what a bundle may hold."""
+    try:
+        manifest = parse(signed(info, files))
+        for name, data in files.items():
+            _CHECKS[name](manifest, data[:1024], len(data))
+        found = assemble(Path("b"), manifest, {name: bytearray(data) for name, data in files.items()}).scene
+    except (BundleError, StreamError) as error:
+        assert str(error) and "\n" not in str(error)
+        return False
+    for name, value in found.surfels.items():
+        assert value.isfinite().all() and (name == "view_span" or not beyond(name, found.view_color, value).any())
+    length = found.surfels["quats"].norm(dim=1)
+    assert ((length - 1).abs() < 1e-3).all() and found.extent.isfinite().all() and found.mean_residual.isfinite().all()
+    tiles = found.tiles.long()
+    assert found.atlas is not None or not tiles.any()
+    if found.atlas is not None:
+        layers, height, width = found.atlas.shape[:3]
+        inside = (tiles[:, 0] + tiles[:, 3] <= width) & (tiles[:, 1] + tiles[:, 4] <= height) & (tiles[:, 2] < layers)
+        assert inside.all() and (tiles >= 0).all()
+    span = found.surfels["view_span"].long()
+    assert (span >= 0).all() and (span.sum(1) <= len(found.surfels["view_terms"])).all()
+    return True
+
+
+def flipped(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
+    """Bits of a file."""
+    name = rng.choice(sorted(files))
+    data = bytearray(files[name])
+    for _ in range(rng.choice((1, 1, 3, 20))):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    files[name] = bytes(data)
+
+
+def columns_of(rng: random.Random, info: dict[str, Any]) -> tuple[str, list[dict[str, Any]]]:
+    return rng.choice([(COMPACT_SURFELS, info["surfels"]["columns"]), (TEXELS, info["atlas"]["columns"])])
+
+
+def replaced(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
+    """The bytes within a frame, which is whole again; or how many there are."""
+    name, columns = columns_of(rng, info)
+    places, at = [], 0
+    for column in columns:
+        for planes in column["planes"]:
+            for index, size in enumerate(planes):
+                places.append((planes, index, at, size))
+                at += size
+    planes, index, at, size = rng.choice(places)
+    held = min(1 << 16, zstandard.get_frame_parameters(files[name][at : at + size]).content_size)
+    count = rng.choice((held, held, held, 0, 1, held + 1, 1 << 21))
+    content = rng.randbytes(count) if count < 1 << 20 else bytes(count)
+    if rng.random() < 0.3:
+        content = bytes([rng.randrange(256)]) * count
+    frame = zstandard.ZstdCompressor(write_content_size=rng.random() < 0.9).compress(content)
+    files[name] = files[name][:at] + frame + files[name][at + size :]
+    planes[index] = len(frame)
+
+
+def misstated(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
+    """A number of bundle.json."""
+    places = [(info["surfels"], key) for key in ("count", "terms")]
+    places += [(info["surfels"]["frame"], "scale")] + [(info["surfels"]["frame"]["low"], i) for i in range(3)]
+    keys = ("texels", "step", "width", "height", "layers", "page_width", "page_rows", "offset", "scale")
+    places += [(info["atlas"], key) for key in keys]
+    _, columns = columns_of(rng, info)
+    for column in columns:
+        places += [(column, "step")] * 3 + [(column["low"], i) for i in range(len(column["low"]))] * 3
+    at, key = rng.choice(places)
+    values: list[Any] = [0, 1, -1, 2, 5, 255, 1 << 20, 1 << 31, -(1 << 40), 1 << 40, 1e-9, 1e6, 1e300, -99.0, None]
+    old = at[key] if isinstance(key, int) else at.get(key)
+    at[key] = rng.choice([*values, old * 2, old + 1] if isinstance(old, (int, float)) else values)
+
+
+def test_damage_past_the_hashes(whole: tuple[dict[str, Any], dict[str, bytes]]) -> None:
+    info, files = whole
+    assert opened(info, files)
+    rng, found = random.Random(0), 0
+    tracemalloc.start()
+    for _ in range(EXAMPLES):
+        changed, data = json.loads(json.dumps(info)), dict(files)
+        for _ in range(rng.choice((1, 1, 1, 2, 5))):
+            try:
+                rng.choice((flipped, replaced, replaced, misstated))(rng, changed, data)
+            except (zstandard.ZstdError, ValueError):
+                pass  # a frame that was damaged before
+        tracemalloc.reset_peak()
+        before = tracemalloc.get_traced_memory()[0]
+        found += opened(changed, data)
+        assert tracemalloc.get_traced_memory()[1] - before < MEMORY
+    tracemalloc.stop()
+    assert 0.05 * EXAMPLES < found < 0.95 * EXAMPLES
+
+
+def test_a_bomb_is_refused_by_its_size_alone(whole: tuple[dict[str, Any], dict[str, bytes]]) -> None:
+    info, files = json.loads(json.dumps(whole[0])), dict(whole[1])
+    frame = zstandard.compress(bytes(1 << 30))
+    column = info["surfels"]["columns"][0]
+    files[COMPACT_SURFELS] = frame + files[COMPACT_SURFELS][sum(map(sum, column["planes"])) :]
+    column["planes"] = [[len(frame)]]
+    info["surfels"]["count"] = 1 << 30
+    tracemalloc.start()
+    assert not opened(info, files)
+    assert tracemalloc.get_traced_memory()[1] < MEMORY
+    tracemalloc.stop()

@@ -29,7 +29,7 @@ SPARSE_ROUNDS = 8
 """Rounds in which coefficients that only texels nobody sees would need are shrunk."""
 SHRINK = 0.6
 """By how much of its step a coefficient is shrunk in a round, where all texels of its block are seen alike."""
-_ATTEMPTS = 8
+_ATTEMPTS = 16
 _FAST = 9
 _LARGEST_STEP = 50.0
 # Brightness, and two differences: an orthonormal basis, so that errors are as large as those of the channels.
@@ -196,7 +196,7 @@ class TexelCoder:
             found = codes.nbytes(_FAST if attempt == 0 else streams.LEVEL)
             if found <= most_bytes:
                 break
-            self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.03, found / most_bytes)))
+            self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.06, (found / most_bytes) ** 1.2)))
             codes = self.code(texels, rounds)
         return codes
 

@@ -28,7 +28,7 @@ def truth(scene) -> Baked:
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
     """Photographs of it, darker by a hundredth, so that there is an error to compare with."""
-    return [replace(view, image=(view.image - 0.01).clamp(0, 1)) for view in photographs(truth)]
+    return [View(view.camera, (view.image - 0.01).clamp(0, 1)) for view in photographs(truth)]
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,8 @@ def test_texels_learn_through_their_coding_and_are_what_is_stored(rounded: Baked
     torch.testing.assert_close(tuned.mean_residual, tuned.codes.texels.constants)
     export(tuned, tmp_path / "b")
     bundle, checks = check_files(tmp_path / "b")
-    assert bundle is not None and all(check.ok for check in checks), checks
+    wrong = [check for check in checks if not check.ok and check.name != "statistics"]  # a tile was taken out above
+    assert bundle is not None and not wrong
     for view in views[:2]:
         want = tuned.stored().render(view.camera, BACKGROUND).rgb
         torch.testing.assert_close(bundle.scene.render(view.camera, BACKGROUND).rgb, want, rtol=1e-4, atol=1e-4)

@@ -22,10 +22,14 @@ ROOTS: dict[str, Any] = {
 }
 ELSEWHERE = {
     "--max-num-iterations",
+    "ns-export ... --compact",
     "ns-export ... --exact",
     "ns-export ... --finetune-steps",
     "ns-export ... --photographs",
+    "ns-export ... --interchange",
     "ns-export ... --polish-steps",
+    "ns-export ... --surfel-error",
+    "ns-export ... --target-mb",
 }
 """Options that are declared with the commands, which need nerfstudio."""
 

@@ -39,7 +39,7 @@ class Settings:
     """The job: steps of training, of the polish and of the texel tuning, and how many seeds."""
 
     steps: int = 200
-    polish: int = 60
+    polish: int = 120
     tuning: int = 20
     seeds: int = 4
 

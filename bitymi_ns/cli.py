@@ -267,10 +267,10 @@ class View:
         address = view.address_of(server)
         if not view.is_loopback(self.host):
             print(f"Everyone who can reach this machine sees {self.bundle} now.", file=sys.stderr)
-        print(f"Showing {self.bundle} at {address} until Ctrl-C", flush=True)
-        if self.open_browser:
-            webbrowser.open(address)
         try:
+            print(f"Showing {self.bundle} at {address} until Ctrl-C", flush=True)
+            if self.open_browser:
+                webbrowser.open(address)
             server.serve_forever()
         except KeyboardInterrupt:
             return 0

@@ -18,7 +18,7 @@ def test_it_is_smaller_and_shows_the_same(trained: BitymiTrainerConfig, bundle: 
     folder = tmp_path / "b"
     run_export(trained, folder, tolerance=TOLERANCE, finetune_steps=30, compact=True, interchange=True)
     assert {path.name for path in folder.iterdir()} == {
-        "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg"
+        "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg", "cameras.json"
     }  # fmt: skip
     read, checks = check_files(folder)
     assert read is not None and all(check.ok for check in checks), checks

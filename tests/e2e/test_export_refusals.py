@@ -145,8 +145,8 @@ def test_damaged_bundles_are_refused(copied: Path, name: str) -> None:
 
 def test_a_bundle_of_a_newer_version_is_refused(copied: Path) -> None:
     info = json.loads((copied / "bundle.json").read_text())
-    (copied / "bundle.json").write_text(json.dumps({**info, "version": "3.0"}))
-    with pytest.raises(InputError, match="version 3.0.*update bitymi-ns"):
+    (copied / "bundle.json").write_text(json.dumps({**info, "version": "4.0"}))
+    with pytest.raises(InputError, match="version 4.0.*update bitymi-ns"):
         eval_setup(copied / "config.yml")
 
 

@@ -14,7 +14,10 @@ from ..constants import SUPPORT
 from ..view_color import LEAN, check_lean, check_view_color
 from ..view_kinds import VIEW_COLORS
 
-KINDS = {"sv": 0, "sv sites": 1, "sh": 2, "sb": 3, "sg": 4}
+WHOLE = " sites"
+"""What a form is called, behind its kind, that holds sites and no base."""
+FORMS = [kind + end for kind, entry in VIEW_COLORS.items() for end in (("", WHOLE) if entry.sites else ("",))]
+KINDS = {name: number for number, name in enumerate(FORMS)}
 """Forms of view colours, by their numbers in view_color.wgsl."""
 SURFEL = np.dtype(
     [
@@ -102,13 +105,14 @@ def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, 
         return kind, base, torch.stack([first * terms.shape[1], count], dim=1), terms
     check_view_color(kind, p, n)
     given = VIEW_COLORS[kind].of(p)
-    if kind == "sv":
+    whole = VIEW_COLORS[kind].sites is not None
+    if whole:
         base, terms = torch.zeros(n, 3), torch.cat([given[0], given[1][..., None], given[2]], dim=2)
     else:
         base, terms = given
     count = torch.full((n,), terms.shape[1])
     first = torch.arange(n) * (terms.shape[1] * terms.shape[2])
-    return {"sv": "sv sites"}.get(kind, kind), base, torch.stack([first, count], dim=1), terms.contiguous()
+    return kind + (WHOLE if whole else ""), base, torch.stack([first, count], dim=1), terms.contiguous()
 
 
 def _hide_broken(surfels: npt.NDArray, p: dict[str, Tensor]) -> None:

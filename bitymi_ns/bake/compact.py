@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.codes import Codes
+from bitymi_ns.bake.methods import Tiles
 from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.pages import moved_texels
+from bitymi_ns.bake.pages import listed_texels, moved_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.precision import MOST_SHARE, PrecisionOptions, choose_precision
 from bitymi_ns.bake.statistics import Rounding
-from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, places, residual_codes
+from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, residual_codes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.views import View
 
@@ -70,26 +71,11 @@ def with_rounded_surfels(
     if texels is not None:
         texels = moved_texels(texels, torch.from_numpy(baked.packing.tiles)[order], packing)
     residual = baked.mean_residual[order]
-    scene = replace(
-        baked.scene,
-        surfels=codes.surfels(),
-        tiles=torch.from_numpy(packing.tiles),
-        extent=codes.extent(baked.options.extent),
-        mean_residual=residual,
-    )
     pages = (baked.options.page_width, baked.options.page_rows)
     kept = Codes(codes, None, residual_codes(residual), RESIDUAL_STEP, *pages)
     statistics = baked.statistics.but(rounding=Rounding(mse=error, steps=dict(codes.steps)), error=None)
-    return replace(
-        baked,
-        scene=scene,
-        rows=baked.rows[order],
-        packing=packing,
-        texels=texels,
-        atlas=None,
-        codes=kept,
-        statistics=statistics,
-    )
+    rounded = replace(baked, rows=baked.rows[order], codes=kept, statistics=statistics).with_surfels(codes.surfels())
+    return rounded.with_tiles(Tiles(packing, texels, codes.extent(baked.options.extent), residual))
 
 
 def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> Baked:
@@ -97,11 +83,8 @@ def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> 
     assert baked.codes is not None
     if baked.texels is None:
         return baked
-    tiles = torch.from_numpy(baked.packing.tiles)
-    texels = baked.mean_residual.repeat_interleave(tiles[:, 3:].long().clamp(min=1).prod(dim=1), dim=0)
-    for listed, paged in places(tiles, baked.packing.width, baked.packing.height):
-        texels[listed] = baked.texels.reshape(-1, 3)[paged]
+    texels = listed_texels(baked.texels, baked.packing, baked.mean_residual)
     options = options or TexelCodeOptions()
-    coder = TexelCoder(tiles[:, 3:], torch.ones(len(texels)), options)
+    coder = TexelCoder(torch.from_numpy(baked.packing.tiles[:, 3:]), torch.ones(len(texels)), options)
     coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
     return baked.with_texel_codes(coded)

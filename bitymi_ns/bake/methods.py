@@ -4,7 +4,7 @@ views see, which a polish starts from."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -51,7 +51,13 @@ class Tiles:
 
 
 class BakeMethod(Protocol):
-    """How a scene is baked, step by step."""
+    """How a scene is baked, step by step.
+
+    Attributes:
+        final: what it gives is encoded and its error stated; else it is to learn yet.
+    """
+
+    final: ClassVar[bool]
 
     def field(self, field: Field, inputs: BakeInput) -> tuple[Field, FieldLevels | None]:
         """The field that the bake evaluates, and what was left out of it; None = nothing is looked for."""
@@ -70,6 +76,7 @@ class BakeMethod(Protocol):
 class PaperBake:
     """The paper's bake: sizes by the Nyquist rule, the field at the texel centres, all of the view colours."""
 
+    final: ClassVar[bool] = True
     options: BakeOptions
 
     def field(self, field: Field, inputs: BakeInput) -> tuple[Field, None]:
@@ -98,6 +105,7 @@ class PaperBake:
 class ToleranceBake:
     """The least that keeps the tolerance: levels of the field, extents and grids of tiles, sites of view colours."""
 
+    final: ClassVar[bool] = True
     options: BakeOptions
 
     def field(self, field: Field, inputs: BakeInput) -> tuple[Field, FieldLevels | None]:
@@ -148,6 +156,7 @@ class FineBake:
     the view colours. A tile has at most a texel for every `pixels_per_texel` pixels of the view that shows most of it.
     """
 
+    final: ClassVar[bool] = False
     options: BakeOptions
     pixels_per_texel: float
 

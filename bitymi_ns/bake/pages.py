@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -53,6 +55,38 @@ def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None,
             index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)
             means[part] = flat[index].mean(dim=(1, 2))
     return means
+
+
+def places(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows of the list of `ops.TexelTiles`, where a surfel without a tile has one texel, and rows of the flattened
+    pages that are the same texels: one pair per tile size."""
+    tiles = torch.from_numpy(packing.tiles)
+    area = tiles[:, 3:].long().clamp(min=1).prod(dim=1)
+    first = area.cumsum(0) - area
+    for r_u, r_v, rows in size_classes(tiles):
+        listed = first[rows, None] + torch.arange(r_u * r_v)
+        paged = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)
+        yield listed.reshape(-1), paged.reshape(-1)
+
+
+def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
+    """[T, 3] texels of pages [layers, height, width, 3] as the list of `ops.TexelTiles`; of a surfel without a tile
+    its constant, of [N, 3]."""
+    area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
+    texels = constants.repeat_interleave(area, dim=0)
+    for listed, paged in places(packing):
+        texels[listed] = pages.reshape(-1, 3)[paged]
+    return texels
+
+
+def paged_texels(texels: Tensor, packing: Packing, elsewhere: Tensor | None = None) -> Tensor:
+    """[layers, height, width, 3] the texels [T, 3] of such a list where their tiles lie; elsewhere 0, or what other
+    pages have there."""
+    size = (packing.layers, packing.height, packing.width, 3)
+    pages = torch.zeros(size) if elsewhere is None else elsewhere.clone()
+    for listed, paged in places(packing):
+        pages.view(-1, 3)[paged] = texels[listed]
+    return pages
 
 
 def moved_texels(texels: Tensor, tiles: Tensor, packing: Packing) -> Tensor:

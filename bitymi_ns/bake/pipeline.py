@@ -192,8 +192,7 @@ def bake(
     options, progress = options or BakeOptions(), progress or no_progress
     options.check()
     started = time.perf_counter()
-    learns = pixels_per_texel is not None
-    method = FineBake(options, pixels_per_texel) if pixels_per_texel is not None else bake_method(options)
+    method = bake_method(options) if pixels_per_texel is None else FineBake(options, pixels_per_texel)
     rows, left_out = drawable(scene.surfels)
     candidates = _inputs(scene, rows, cameras)
     inputs, seen = _looked_at(candidates, options, progress)
@@ -203,7 +202,7 @@ def bake(
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
     statistics = Statistics(surfels=KeptSurfels(trained=trained, kept=len(rows), left_out=left_out))
-    field = Blank() if learns and scene.field is None else scene.field
+    field = Blank() if scene.field is None and not method.final else scene.field
     if field is None:
         tiles, atlas = Tiles.none(len(rows), options.extent), None
     else:
@@ -306,14 +305,13 @@ def _textured(
     plan = method.plan(field, inputs)
     tiles = method.tiles(field, plan, inputs, progress)
     packing = tiles.packing
-    learns = isinstance(method, FineBake)
-    atlas = None if learns or tiles.texels is None else _encode(tiles.texels, packing, options, progress)
-    error = None
-    if not learns:  # what changes yet has none
+    atlas = error = None
+    counts = plan.texels if method.final else plan.texels.but(polished=packing.texels)
+    if method.final:
+        atlas = None if tiles.texels is None else _encode(tiles.texels, packing, options, progress)
         stored = None if atlas is None else atlas.decoded()
         errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
         error = errors.summary(options.tolerance)
-    counts = plan.texels.but(polished=packing.texels) if learns else plan.texels
     return (
         tiles,
         atlas,

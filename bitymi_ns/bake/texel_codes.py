@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from bitymi_ns.bake import streams
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.packing import Packing
-from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.bake.pages import paged_texels, size_classes
 
 BLOCK = 8
 """Tiles are transformed in blocks of at most so many texels along a side."""
@@ -240,21 +240,7 @@ class TexelCoder:
 
 def pages(codes: TexelCodes, packing: Packing) -> Tensor:
     """[layers, height, width, 3] float32 residual colours where the tiles lie; 0 elsewhere."""
-    texels, tiles = codes.texels(), torch.from_numpy(packing.tiles)
-    out = torch.zeros(packing.layers * packing.height * packing.width, 3)
-    for listed, paged in places(tiles, packing.width, packing.height):
-        out[paged] = texels[listed]
-    return out.view(packing.layers, packing.height, packing.width, 3)
-
-
-def places(tiles: Tensor, width: int, height: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows of the list of `TexelTiles`, where a surfel without a tile has one texel, and rows of the flattened pages
-    that are the same texels: one pair per tile size."""
-    area = tiles[:, 3:].long().clamp(min=1).prod(dim=1)
-    first = area.cumsum(0) - area
-    for r_u, r_v, rows in size_classes(tiles):
-        listed = first[rows, None] + torch.arange(r_u * r_v)
-        yield listed.reshape(-1), texel_index(tiles[rows], (r_u, r_v), width, height).reshape(-1)
+    return paged_texels(codes.texels(), packing)
 
 
 def _steps(step: float, grades: Tensor) -> Tensor:

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
+from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
-from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes, places
+from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
 from bitymi_ns.ops import (
     Fragments,
     TexelFragments,
@@ -133,28 +134,14 @@ class TexelScene:
         advice = "give it the bake as it was made, or move its scene there"
         require("the fine-tuning", "cpu", baked.scene.tiles.device, advice)
         self._baked, self._background = baked, background.cpu()
-        rectangles = torch.from_numpy(baked.packing.tiles)
-        self.sizes = rectangles[:, 3:]
-        self.tiles = TexelTiles.of_sizes(rectangles[:, 3:].clamp(min=1), baked.extent.float())
-        self.texels = torch.empty(self.tiles.count, 3)
-        pages = baked.texels.reshape(-1, 3)
-        for rows, texel in self._places():
-            self.texels[rows] = pages[texel]
-        bare = rectangles[:, 3] == 0
-        self.texels[self.tiles.first[bare]] = baked.mean_residual[bare]
-
-    def _places(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Rows of the list and rows of the flattened pages that are the same texels, one pair a tile size."""
-        packing = self._baked.packing
-        return places(torch.from_numpy(packing.tiles), packing.width, packing.height)
+        self.sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
+        self.tiles = TexelTiles.of_sizes(self.sizes.clamp(min=1), baked.extent.float())
+        self.texels = listed_texels(baked.texels, baked.packing, baked.mean_residual)
 
     def baked(self, texels: Tensor) -> Baked:
         """The bake with these texels [T, 3], to be `encoded`."""
-        assert self._baked.texels is not None
-        pages = self._baked.texels.clone()
-        for rows, texel in self._places():
-            pages.view(-1, 3)[texel] = texels[rows]
-        bare = torch.from_numpy(self._baked.packing.tiles)[:, 3] == 0
+        pages = paged_texels(texels, self._baked.packing, self._baked.texels)
+        bare = self.sizes[:, 0] == 0
         constants = torch.where(bare[:, None], texels[self.tiles.first], self._baked.mean_residual)
         return self._baked.with_mean_residual(constants).with_texels(pages)
 
@@ -294,17 +281,22 @@ def _descend(
     texels, gradient = scene.texels.clone(), torch.zeros_like(scene.texels)
     for step in range(options.steps):
         view = views[training_order(len(views), options.seed, step)]
-        rgb = scene.render(view, texels).requires_grad_()
-        photometric(scene.shown(view, rgb), view.target, options.ssim_weight, view.mask).backward()
-        gradient.zero_()
-        # the loss is a mean, the step wants a sum
-        scene.add_gradient(view, texels, rgb.grad * numbers(rgb, view.mask), gradient)
+        _gradient(scene, view, texels, options.ssim_weight, gradient)
         texels.addcmul_(gradient, inverse, value=-falling(options.rate, step, options.steps))
         progress("tuning texels", step + 1, options.steps)
         if looks.due(step + 1) and not looks.note(step + 1, held_in.psnr(texels), texels.clone):
             progress("tuning texels", step + 1, step + 1)  # no more is to come
             break
     return looks
+
+
+def _gradient(scene: TexelScene, view: TexelView, texels: Tensor, ssim_weight: float, out: Tensor) -> None:
+    """Writes the gradient [T, 3] of a view's loss, as a sum over its numbers."""
+    rgb = scene.render(view, texels).requires_grad_()
+    photometric(scene.shown(view, rgb), view.target, ssim_weight, view.mask).backward()
+    out.zero_()
+    # the loss is a mean, the step wants a sum
+    scene.add_gradient(view, texels, rgb.grad * numbers(rgb, view.mask), out)
 
 
 def _coded(
@@ -326,10 +318,7 @@ def _coded(
     shift, gradient = torch.zeros_like(texels), torch.zeros_like(texels)
     for step in range(options.coded_steps):
         view = views[training_order(len(views), options.seed, step)]
-        rgb = scene.render(view, texels + shift).requires_grad_()
-        photometric(scene.shown(view, rgb), view.target, options.ssim_weight, view.mask).backward()
-        gradient.zero_()
-        scene.add_gradient(view, texels + shift, rgb.grad * numbers(rgb, view.mask), gradient)
+        _gradient(scene, view, texels + shift, options.ssim_weight, gradient)
         texels.addcmul_(gradient, inverse, value=-falling(options.coded_rate, step, options.coded_steps))
         progress("tuning coded texels", step + 1, options.coded_steps)
         last = step + 1 == options.coded_steps

@@ -11,11 +11,11 @@ from torch import Tensor
 from bitymi_ns.bake.limits import within
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.statistics import LeftOut
-from bitymi_ns.bake.visibility import Visibility, visibility
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.visibility import Visibility, visibility
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.options import STEPS
-from bitymi_ns.bake.plan import kernel_parameters
 from bitymi_ns.bake.statistics import FieldLevels
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field import field as evaluate
 from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.rotations import tangents
 
 LEVEL_SHARE = 0.1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
@@ -100,11 +99,6 @@ def look(
 def gain(before: float, after: float) -> Gain:
     """Of two PSNRs, dB."""
     return Gain(before=round(before, 4), after=round(after, 4))
-
-
-def falling(rate: float, step: int, steps: int) -> float:
-    """A rate that falls to 0 as a cosine."""
-    return rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
 def set_aside(count: int, every: int) -> tuple[list[int], list[int]]:

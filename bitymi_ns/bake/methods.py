@@ -15,15 +15,15 @@ from bitymi_ns.bake.lean_field import lean_field
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import tile_means
-from bitymi_ns.bake.plan import Field, Plan, Shown, kernel_parameters, make_plan
+from bitymi_ns.bake.plan import Field, Plan, Shown, make_plan
 from bitymi_ns.bake.reduce import Reduced, reduce_tiles
 from bitymi_ns.bake.reference import held, references
-from bitymi_ns.bake.resolution import coarsened
 from bitymi_ns.bake.statistics import FieldLevels, ViewColorError
 from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.progress import Progress
 from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from bitymi_ns.bake.limits import EXTENTS
 from bitymi_ns.bake.packing import check_page
 from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Format, Profile, RangeRule, bc7_encoder
-from bitymi_ns.bake.resolution import check_sides
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.tile_sizes import check_sides
 
 STEPS = 255.0
 """8-bit steps in a colour of 1: the unit of errors and of the tolerance."""

@@ -10,15 +10,18 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.resolution import max_projected_extent, nyquist_resolution, voxel_along_axes
 from bitymi_ns.bake.statistics import KeptTexels
-from bitymi_ns.ops.constants import ALPHA_MAX, BETA_MAX, SUPPORT
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.tile_sizes import (
+    kernel_parameters,
+    max_projected_extent,
+    nyquist_resolution,
+    visible_extent,
+    voxel_along_axes,
+)
 from bitymi_ns.train.rotations import tangents
 
 PAPER_EXTENT = 4.0  # e of the paper's rule
-MARGIN = 1.5
-"""Held-out views may see more of a surfel than the training views do: its transmittance is taken this much larger."""
 
 
 class Field(Protocol):
@@ -73,28 +76,6 @@ class Plan(Shown):
 
     def __len__(self) -> int:
         return len(self.means)
-
-
-def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Largest blending weight at the centre, and exponent of the kernel, of every surfel: [N], [N].
-
-    Args:
-        surfels: opacity_logits [N], beta_raw [N].
-        transmittance: [N] of `Visibility`; None = nothing is in front of any surfel.
-    """
-    opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
-    if transmittance is not None:
-        opacity = opacity * (MARGIN * transmittance).clamp(max=1.0)
-    return opacity, BETA_MAX * surfels["beta_raw"].sigmoid()
-
-
-def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor:
-    """Radius in scale units at which opacity * (1 - r^2 / 9)^beta falls to the weight bound: [N], 0 where all is below.
-
-    What the low pass or the pixel spreads beyond it, about a pixel, reads the tile's edge.
-    """
-    rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
-    return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()
 
 
 def make_plan(

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
+from bitymi_ns.bake.looks import Looks, gain, look, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
 from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage, numbers
@@ -25,7 +25,7 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
-from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.schedules import Schedule, falling
 from bitymi_ns.train.views import View, training_order
 
 
@@ -62,7 +62,8 @@ class _Polish:
             prefilter=drawn.prefilter,  # type: ignore[arg-type]
             texture_moves_surfels=True,
         )
-        self.field = TexelField(self.texels.tiles, self.texels.texels)
+        tiles = self.texels.tiles
+        self.field = TexelField(tiles.size, tiles.extent, self.texels.texels)
         self.scene = Scene(config, drawn.surfels, self.field, near=drawn.near)
         self.options, self.background = options, background.cpu()
         centers = torch.stack([view.camera.center.cpu() for view in views])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.looks import Looks, falling, gain, look, set_aside
+from bitymi_ns.bake.looks import Looks, gain, look, set_aside
 from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
@@ -32,6 +32,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
+from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import View, shown, training_order
 
 TO_START = 0.93

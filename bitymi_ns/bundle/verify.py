@@ -15,13 +15,14 @@ from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bake.methods import bake_method
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.plan import Field, kernel_parameters
-from bitymi_ns.bake.visibility import visibility
+from bitymi_ns.bake.plan import Field
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
 from bitymi_ns.bundle.read import Bundle, assemble, enough_memory, read_file, read_manifest
 from bitymi_ns.bundle.write import World
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.tile_sizes import kernel_parameters
+from bitymi_ns.scene.visibility import visibility
 
 _SLACK = 1.02  # sums in another order, rotations that were written with length 1
 _SLACK_STEPS = 0.02

@@ -21,6 +21,7 @@ from bitymi_ns.host.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
@@ -105,7 +106,7 @@ class BitymiModel(SurfelModel):
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {name: [parameter] for name, parameter in self.scene.surfels.items()}
-        if self.scene.field is not None:
+        if isinstance(self.scene.field, HashField):
             named = dict(self.scene.field.named_parameters())
             groups["field_table"] = [p for n, p in named.items() if n.endswith("table")]
             groups["field_mlp"] = [p for n, p in named.items() if not n.endswith("table")]
@@ -159,7 +160,7 @@ class BitymiModel(SurfelModel):
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Load a checkpoint (`checkpoints.load` has checked that it belongs to this preset), whatever its number of
         surfels."""
-        self.scene.resize(len(state_dict[SURFELS + "means"]))
+        self.scene.make_room(state_dict, "scene.")
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
             if saved is not None and saved.shape != parameter.shape:

@@ -7,6 +7,9 @@ from typing import Literal
 
 from bitymi_ns.ops.view_kinds import Kind
 
+Texture = Literal["auto", "hash", "texels", "none"]
+"""What colours a surfel beside its view colour."""
+
 
 @dataclass
 class SceneConfig:
@@ -20,8 +23,9 @@ class SceneConfig:
     """Degree of the spherical harmonics, 0 to 3."""
     lobes: int = 2
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
-    texture: Literal["hash", "none"] = "hash"
-    """Residual colour field: hash = multiresolution hash grid and MLP, none = surfels alone."""
+    texture: Texture = "hash"
+    """Residual colours: hash = a field in space, multiresolution hash grid and MLP; texels = texels on every surfel,
+    which learn in the last part of the run; none = surfels alone; auto = texels on the CPU, hash on a GPU."""
     levels: int = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: int = 256
@@ -36,7 +40,7 @@ class SceneConfig:
     weight_bound: float = 0.02
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
     texture_moves_surfels: bool = False
-    """The gradient of the residual field with respect to position reaches the surfels."""
+    """The gradient of the residual field with respect to position reaches the surfels; that of texels always does."""
     prefilter: Literal["low_pass", "pixel"] = "low_pass"
     """How discs of a pixel or less are drawn: low_pass = never smaller than a fixed blob around their centre; pixel =
     as what they cover of each pixel, with the right moments (docs/numerics.md)."""
@@ -45,6 +49,12 @@ class SceneConfig:
     on a GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
+
+    @property
+    def residual_moves_surfels(self) -> bool:
+        """Whether the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
+        tell it where to go."""
+        return self.texture_moves_surfels or self.texture == "texels"
 
     @property
     def through_pixel(self) -> bool:

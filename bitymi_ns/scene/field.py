@@ -150,16 +150,47 @@ class TexelField(nn.Module):
     """Residual colours of N surfels in texels, as a bundle has them: each surfel carries its own, wherever it moves.
 
     Args:
-        tiles: where the texels of every surfel lie.
-        texels: [T, 3] residual colours to start from.
+        size: [N, 2] int32 sides of the tiles along u and v, texels.
+        extent: [N] their half sides in scale units.
+        texels: [T, 3] residual colours to start from, tile after tile as in `TexelTiles.of_sizes`.
+        share: [T] how far a texel moves in a step, see `TexelDescent`; None = they are not stepped.
     """
 
-    def __init__(self, tiles: TexelTiles, texels: Tensor) -> None:
+    def __init__(self, size: Tensor, extent: Tensor, texels: Tensor, share: Tensor | None = None) -> None:
         super().__init__()
-        self.tiles = tiles
         self.texels = nn.Parameter(texels.detach().clone())
+        # in the checkpoint, as the texels are
+        self.register_buffer("size", size.to(torch.int32).clone())
+        self.register_buffer("extent", extent.detach().to(texels).clone())
+        self.register_buffer("share", texels.new_zeros(len(texels)) if share is None else share.detach().clone())
         self.descent: TexelDescent | None = None
         """How a backward pass moves the texels; None = they get a gradient."""
+        self._tiles: tuple[Tensor, int, TexelTiles] | None = None
+
+    @classmethod
+    def blank(cls, surfels: int, texels: int, like: Tensor) -> TexelField:
+        """One of so many surfels and texels, for a state to be loaded into."""
+        size = torch.zeros(surfels, 2, dtype=torch.int32, device=like.device)
+        return cls(size, like.new_zeros(surfels), like.new_zeros(texels, 3))
+
+    @property
+    def tiles(self) -> TexelTiles:
+        """Where the texels of every surfel lie."""
+        now = self.size, -1 if self.size.is_inference() else self.size._version
+        if self._tiles is None or self._tiles[0] is not now[0] or self._tiles[1] != now[1]:
+            self._tiles = (*now, TexelTiles.of_sizes(self.size, self.extent))
+        return self._tiles[2]
+
+    @torch.no_grad()
+    def keep(self, rows: Tensor) -> None:
+        """Lets go of all surfels but `rows` [n] int64, which are in that order from now on."""
+        tiles = self.tiles
+        area = self.size[rows].long().prod(dim=1)
+        start = area.cumsum(0) - area
+        moved = torch.arange(int(area.sum()), device=area.device) - start.repeat_interleave(area)
+        old = tiles.first[rows].repeat_interleave(area) + moved
+        self.texels = nn.Parameter(self.texels.detach()[old])
+        self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
     def shade(
         self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool

@@ -31,7 +31,7 @@ from bitymi_ns.ops.constants import IMAGE_CHANNELS
 
 from .camera import Camera
 from .config import SceneConfig
-from .field import ResidualField
+from .field import ResidualField, TexelField
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 """Names of the per-surfel parameters that every scene has."""
@@ -99,10 +99,21 @@ class Scene(nn.Module):
     def __len__(self) -> int:
         return self.surfels["means"].shape[0]
 
-    def resize(self, n: int) -> None:
-        """Gives every per-surfel parameter n rows of zeros in place, for loading a checkpoint."""
+    def make_room(self, state: Mapping[str, Tensor], prefix: str = "") -> None:
+        """Gives the surfels' parameters the rows, and the field the texels, of a state that is loaded next.
+
+        Args:
+            state: of a scene of the same configuration.
+            prefix: of its names there.
+        """
+        n = len(state[f"{prefix}surfels.means"])
         for parameter in self.surfels.values():
             parameter.data = parameter.new_zeros(n, *parameter.shape[1:])
+        texels = state.get(f"{prefix}field.texels")
+        if texels is not None:
+            self.field = TexelField.blank(n, len(texels), self.surfels["means"].detach())
+        elif isinstance(self.field, TexelField):
+            self.field = None
 
     def parameters_per_surfel(self) -> int:
         """Numbers stored per surfel: 60 for sv, 59 for sh, 26 for sb."""
@@ -151,7 +162,7 @@ class Scene(nn.Module):
             if field is None:
                 colors = shade(fragments, base, part.frames)
             else:
-                moves = self.config.texture_moves_surfels and learns
+                moves = learns and self.config.residual_moves_surfels
                 colors = field.shade(fragments, base, part.frames, bound, learns, moves)
             image = composite_image(fragments, part, colors, maps)
             if beta_alone:

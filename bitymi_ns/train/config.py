@@ -141,6 +141,28 @@ class AdamConfig:
 
 
 @dataclass
+class TexelConfig:
+    """Texels that learn in the last part of a run, where the texture of the scene is `texels`."""
+
+    start: int = 24_000
+    """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
+    as the training views see it; 30,000 or more = there is no such part."""
+    rate: float = 0.05
+    """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
+    prior: float = 0.3
+    """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
+    of the rate, one never seen not at all."""
+    surfel_rates: float = 0.4
+    """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
+    pixels_per_texel: float = 2.0
+    """A tile has at most a texel for so many pixels of the view that shows most of it."""
+    largest: int = 64
+    """Largest side of a tile, texels, a power of two."""
+    views: float = 0.25
+    """Views that are looked through to find what the tiles need, as a share of the steps of that part; 32 at least."""
+
+
+@dataclass
 class GuardConfig:
     """What happens when training diverges."""
 
@@ -162,6 +184,7 @@ class TrainConfig:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     lr: LearningRates = field(default_factory=LearningRates)
     guard: GuardConfig = field(default_factory=GuardConfig)
+    texels: TexelConfig = field(default_factory=TexelConfig)
     freeze_after: int = 5000
     """From this step on the texture field learns on one step in `freeze_every` only."""
     freeze_every: int = 10

@@ -51,7 +51,7 @@ def build_scene(
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
     means = surfels["means"]
     near = NEAR * scene_extent(camera_centers, means)
-    if scene_config.texture == "none":
+    if scene_config.texture != "hash":  # texels come later, when the surfels have found their places
         return Scene(scene_config, surfels, None, near), report
     bounded = bounded or (declared is not None and box_is_small(declared, camera_centers))
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)

@@ -121,7 +121,7 @@ class Trainer:
         max_steps = self.training.schedule.max_steps
         if state["max_steps"] != max_steps:
             raise ValueError(f"the run had {state['max_steps']} steps, this one has {max_steps}")
-        self.scene.resize(len(state["scene"]["surfels.means"]))
+        self.scene.make_room(state["scene"])
         self.scene.load_state_dict(state["scene"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))

@@ -31,6 +31,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
@@ -138,6 +139,10 @@ class Guard:
         if math.isnan(self._limit):
             self._limit = max(self._loss_of(views, 1.0), self._loss_of(views, 1.0, blank=True))
         self._states = [(step, self._capture())]
+
+    def start_from_here(self) -> None:
+        """Forget the states to go back to: the scene is made of other parts from the next step on."""
+        self._states = []
 
     @torch.no_grad()
     def _loss_of(self, views: ReducedViews, factor: float, blank: bool = False) -> float:
@@ -278,6 +283,8 @@ class Guard:
         rows = {name: state["scene"][f"surfels.{name}"] for name in surfels.keys()}
         none = torch.zeros(0, dtype=torch.int64, device=surfels["means"].device)
         replace_rows(surfels, self.optimizers, none, rows, self.strategy.on_resize)
+        if isinstance(self.scene.field, TexelField):
+            self.scene.make_room(state["scene"])
         self.scene.load_state_dict(state["scene"])
         self.scene.zero_grad(set_to_none=True)
         for name, optimizer in self.optimizers.items():

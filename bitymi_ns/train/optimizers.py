@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.optim import Adam, Optimizer
 
+from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.config import AdamConfig
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
 def make_optimizers(scene: Scene) -> dict[str, Adam]:
     """Those of the surfels, and `field_table` and `field_mlp`."""
     optimizers = surfel_optimizers(scene)
-    if scene.field is not None:
+    if isinstance(scene.field, HashField):
         table, *mlp = scene.field.weights
         optimizers["field_table"] = adam([table], AdamConfig.field_betas)
         optimizers["field_mlp"] = adam(mlp, AdamConfig.field_betas)

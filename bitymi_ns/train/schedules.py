@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
@@ -22,12 +23,13 @@ class Schedule:
     `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
     """
 
-    def __init__(self, config: TrainConfig, max_steps: int, extent: float = 1.0) -> None:
+    def __init__(self, config: TrainConfig, max_steps: int, extent: float = 1.0, texels: bool = False) -> None:
         """
         Args:
             config: training options.
             max_steps: length of the run in steps.
             extent: scene extent in world units; the learning rate of the means is in multiples of it.
+            texels: whether texels learn in the last part of the run.
         """
         if max_steps < 1:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
@@ -41,10 +43,16 @@ class Schedule:
         # short runs leave events out, so that about the least number of steps lies between two
         reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
-        self.densify_steps = self._events(_multiples(interval, densify.start, densify.stop))
-        self.reset_steps = self._events(_multiples(reset, 0, densify.stop))
+        self.texels_start = min(max_steps, self.scaled(config.texels.start)) if texels else max_steps
+        stop = min(densify.stop, config.texels.start) if texels else densify.stop
+        self.densify_steps = self._events(_multiples(interval, densify.start, stop))
+        self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
+        self._last_part: Schedule | None = None
+        if self.texels_start < max_steps:
+            slower = replace(config, lr=config.lr.times(config.texels.surfel_rates))
+            self._last_part = Schedule(slower, max_steps - self.texels_start, extent)
 
     @property
     def short_run_gain(self) -> float:
@@ -127,6 +135,17 @@ class Schedule:
         left = self.max_steps - self.scaled(self.config.freeze_after)
         return max(1, min(self.config.freeze_every, left // max(1, self.config.freeze_min_updates)))
 
+    def texels_learn(self, step: int) -> bool:
+        """Whether every surfel has its own texels in this step, and they learn."""
+        return step >= self.texels_start
+
+    def texel_rate(self, step: int) -> float:
+        """Rate of the texels in a step in which they learn."""
+        return self.config.texels.rate * self._falling(step)
+
+    def _falling(self, step: int) -> float:
+        return falling(1.0, step - self.texels_start, self.max_steps - self.texels_start)
+
     def field_warmup(self, step: int) -> float:
         """Factor of the field's learning rate: rises linearly to 1 over the first `field_warmup` steps."""
         return min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
@@ -146,6 +165,8 @@ class Schedule:
                 exposure.
         """
         rates, gain = self.config.lr, self.short_run_gain
+        if self._last_part is not None and self.texels_learn(step) and not name.startswith(("field", "exposure")):
+            return self._last_part.lr(name, 0) * self._falling(step)
         if name == "means":
             return gain * self.extent * self._decay(rates.means, step)
         if name in ("quats", "log_scales", "opacity_logits", "beta_raw"):
@@ -168,6 +189,11 @@ class Schedule:
             raise ValueError(f"learning rates that decay must be positive, not {first} and {last}")
         t = min(max(step / max(1, self.max_steps - 1), 0.0), 1.0)
         return math.exp((1.0 - t) * math.log(first) + t * math.log(last))
+
+
+def falling(rate: float, step: int, steps: int) -> float:
+    """A rate that falls to 0 as a cosine."""
+    return rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
 def _multiples(interval: int, start: int, stop: int) -> list[int]:

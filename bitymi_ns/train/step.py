@@ -23,6 +23,7 @@ from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.resize import ResizeHook
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
+from bitymi_ns.train.texels import LearningTexels
 from bitymi_ns.train.views import ReducedViews, TrainingData, View, background_color
 from bitymi_ns.train.watch import LossWatch
 
@@ -53,7 +54,7 @@ def view_losses(
     output = scene.render(
         view.camera,
         background=background,
-        field_mode="train" if schedule.field_trains(step) else "frozen",
+        field_mode="train" if schedule.texels_learn(step) or schedule.field_trains(step) else "frozen",
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
         beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )
@@ -75,7 +76,7 @@ class Training:
 
     Attributes:
         step: index of the step that was begun last.
-        schedule, strategy, guard, watch: of the run.
+        schedule, strategy, guard, texels, watch: of the run.
         exposure: how the training photographs differ in their colours; decided when the first step begins.
         clock: time between `begin` and `finish`.
     """
@@ -104,7 +105,8 @@ class Training:
             ValueError: a training option is out of its range.
         """
         self.scene, self.optimizers, self.config = scene, optimizers, config
-        self.schedule = Schedule(config, max_steps, data.extent)
+        textured = scene.config.texture == "texels"
+        self.schedule = Schedule(config, max_steps, data.extent, textured)
         self.schedule.reset_opacity()
         for name in optimizers:
             self.schedule.lr(name, 0)
@@ -112,6 +114,7 @@ class Training:
         self.exposure = Exposure(config.exposure, data.exif_stops)
         self.schedule.lr("exposure", 0)
         self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure)
+        self.texels = LearningTexels(scene, self.schedule, config.texels)
         self.watch = LossWatch()
         self.clock = Stopwatch()
         self.step = 0
@@ -134,6 +137,8 @@ class Training:
         self.step = step
         if not self.exposure.decided:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
+        if self.texels.begin(step, self.views):
+            self.guard.start_from_here()
         self.guard.before(step, self.views)
         self._set_rates()
 
@@ -148,6 +153,7 @@ class Training:
             TrainingDiverged: nothing can be mended, or it has been tried too often.
         """
         while True:
+            self.texels.prepare(self.step, view, self.guard.factor)
             try:
                 terms, output = view_losses(self.scene, view, self.schedule, self.step, self.config, self.watch)
             except TrainingDiverged as error:

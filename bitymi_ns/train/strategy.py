@@ -22,6 +22,7 @@ from torch.optim import Optimizer
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.picture_cuda import note_centers
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
@@ -306,6 +307,8 @@ class Strategy:
             return
         keep = (~pruned).nonzero().flatten()
         replace_rows(scene.surfels, optimizers, keep, on_resize=self.on_resize)
+        if isinstance(scene.field, TexelField):
+            scene.field.keep(keep)
         if len(self.grad_sum) == len(pruned):
             for name in STATISTICS:
                 setattr(self, name, getattr(self, name)[keep.to(self.grad_sum.device)])

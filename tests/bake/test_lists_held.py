@@ -10,11 +10,11 @@ import torch
 
 from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.tune import TexelScene
-from bitymi_ns.bake.visibility import visibility
 from bitymi_ns.ops import Fragments, trace_cpu
 from bitymi_ns.ops import bands as bands_module
 from bitymi_ns.ops import trace as whole_trace
 from bitymi_ns.scene import scene as scene_module
+from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.score import multi_view_scores

@@ -10,8 +10,8 @@ import torch
 from bitymi_ns.bake import bake
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.photographed import POINTS, photographed
-from bitymi_ns.bake.visibility import Visibility
 from bitymi_ns.scene.sampling import size_of
+from bitymi_ns.scene.visibility import Visibility
 from tests.bake.conftest import make_camera, make_surfels
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Bands, TexelTiles
+from bitymi_ns.ops import Bands
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
@@ -23,7 +23,7 @@ def make(moves: bool = True, count: int = 40, most: int = 0, **options: float) -
     size, extent = torch.tensor([[8, 16]]).expand(count, -1), torch.rand(count, generator=g) * 2 + 1
     texels = atlas[0, :, :, :3].view(16, count, 8, 3).transpose(0, 1).reshape(-1, 3)
     config = SceneConfig(weight_bound=BOUND, near=0.2, texture_moves_surfels=moves, max_fragments=most)
-    field = TexelField(TexelTiles.of_sizes(size, extent.double()), texels.double())
+    field = TexelField(size, extent.double(), texels.double())
     scene = Scene(config, {name: value.double() for name, value in case.params.items()}, field)
     return scene, Camera(case.viewmat, case.K, case.width, case.height), atlas
 

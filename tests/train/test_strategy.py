@@ -364,7 +364,7 @@ def test_state_survives_a_round_trip_and_the_lots_are_the_same(bench):
 def test_a_view_of_another_scene_is_refused(bench):
     b = bench(4)
     b.see()
-    b.scene.resize(7)
+    b.scene.make_room({"surfels.means": torch.zeros(7, 3)})
     with pytest.raises(ValueError, match="4 surfels, but 7"):
         b.see()
 

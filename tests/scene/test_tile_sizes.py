@@ -3,14 +3,14 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake.resolution import (
+from bitymi_ns.bake.texels import texel_centres, tile_points
+from bitymi_ns.scene.tile_sizes import (
     coarsened,
     max_projected_extent,
     next_power_of_two,
     nyquist_resolution,
     voxel_along_axes,
 )
-from bitymi_ns.bake.texels import texel_centres, tile_points
 from bitymi_ns.train.rotations import tangents
 
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]])  # u along x, v along y

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bitymi_ns.bake.visibility import visibility
+from bitymi_ns.scene.visibility import visibility
 
 
 def test_what_stands_in_front_is_counted(surfels, camera):

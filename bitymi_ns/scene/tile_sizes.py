@@ -1,14 +1,18 @@
-"""How many texels a surfel's tile gets along each tangent axis."""
+"""How far a surfel's tile reaches, and how many texels it gets along each tangent axis."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.scene.camera import Camera
+from bitymi_ns.ops.constants import ALPHA_MAX, BETA_MAX, SUPPORT
+
+from .camera import Camera
+
+MARGIN = 1.5
+"""Held-out views may see more of a surfel than the training views do: its transmittance is taken this much larger."""
 
 # Forgives the rounding of a ratio that is meant to be a power of two, so that it does not double the tile.
 _ROUNDING = 1e-6
@@ -92,6 +96,20 @@ def nyquist_resolution(
     return resolution.clamp(r_min, r_max).to(torch.int32)
 
 
+def seen_sides(pixels: Tensor, r_min: int = 4, r_max: int = 64) -> Tensor:
+    """Tile resolutions by what the training views resolve alone.
+
+    Args:
+        pixels: [N, 2] largest projected extent of the tile over the training views.
+        r_min, r_max: smallest and largest resolution, powers of two >= 4.
+
+    Returns:
+        [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
+    """
+    check_sides(r_min, r_max)
+    return next_power_of_two(pixels).clamp(r_min, r_max).to(torch.int32)
+
+
 def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
     """Tiles of at most so many texels each: the longer side is halved until it fits, or both are the smallest.
 
@@ -153,3 +171,25 @@ def max_projected_extent(
         max_pixels = torch.maximum(max_pixels, pixels)
         views += seen.to(torch.int32)
     return max_pixels, views
+
+
+def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Largest blending weight at the centre, and exponent of the kernel, of every surfel: [N], [N].
+
+    Args:
+        surfels: opacity_logits [N], beta_raw [N].
+        transmittance: [N] of `Visibility`; None = nothing is in front of any surfel.
+    """
+    opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
+    if transmittance is not None:
+        opacity = opacity * (MARGIN * transmittance).clamp(max=1.0)
+    return opacity, BETA_MAX * surfels["beta_raw"].sigmoid()
+
+
+def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor:
+    """Radius in scale units at which opacity * (1 - r^2 / 9)^beta falls to the weight bound: [N], 0 where all is below.
+
+    What the low pass or the pixel spreads beyond it, about a pixel, reads the tile's edge.
+    """
+    rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
+    return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()

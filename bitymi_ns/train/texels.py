@@ -1,0 +1,144 @@
+"""Texels that learn in the last part of a run: every surfel gets a tile as fine as the training views see it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops import TexelDescent, TexelFragments, add_texel_gradient, fitting_lists, project
+from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
+from bitymi_ns.scene.visibility import Visibility, visibility
+from bitymi_ns.train.rotations import tangents
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import Scene
+    from bitymi_ns.train.config import TexelConfig
+    from bitymi_ns.train.schedules import Schedule
+    from bitymi_ns.train.views import ReducedViews, View
+
+FEWEST_VIEWS = 32
+"""That are looked through for the tiles, however short the run."""
+SMALLEST = 4
+"""Side of the smallest tile, texels: a block of BC7."""
+
+
+class LearningTexels:
+    """The part of a run in which texels learn."""
+
+    def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig) -> None:
+        """
+        Args:
+            scene: gets a `TexelField` when the part begins.
+            schedule: of the run.
+            options: see `TexelConfig`.
+        """
+        self.scene, self.schedule, self.options = scene, schedule, options
+
+    def begin(self, step: int, views: ReducedViews) -> bool:
+        """Gives the surfels their tiles where this step is the first that needs them; whether it was."""
+        if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
+            return False
+        most = max(FEWEST_VIEWS, round(self.options.views * (self.schedule.max_steps - self.schedule.texels_start)))
+        count = min(most, len(views))
+        self.scene.field = blank_texels(
+            self.scene, [views.at(i * len(views) // count, 1.0) for i in range(count)], len(views), self.options
+        )
+        return True
+
+    def prepare(self, step: int, view: View, factor: float) -> None:
+        """Says how the backward pass of a step on this view moves the texels.
+
+        Args:
+            factor: of all rates.
+        """
+        field = self.scene.field
+        if isinstance(field, TexelField):
+            # the loss is a mean, the step wants a sum
+            rate = factor * self.schedule.texel_rate(step) * numbers(view)
+            field.descent = TexelDescent(field.share, rate)
+
+
+def numbers(view: View) -> int:
+    """How many numbers of a view's picture the mean of its loss is taken over."""
+    return 3 * (view.camera.width * view.camera.height if view.mask is None else int(view.mask.sum()))
+
+
+@torch.no_grad()
+def blank_texels(scene: Scene, views: Sequence[View], count: int, options: TexelConfig) -> TexelField:
+    """A tile for every surfel, with residuals of 0.
+
+    A surfel of which no view shows a residual has one texel.
+
+    Args:
+        scene: its surfels; on the CPU.
+        views: those that are looked through.
+        count: of all training views, which these stand for.
+        options: see `TexelConfig`.
+    """
+    surfels = {name: value.detach() for name, value in scene.surfels.items()}
+    cameras = [view.camera for view in views]
+    bound = scene.config.weight_bound
+    seen = visibility(surfels, cameras, scene.near, bound, scene.config.through_pixel)
+    size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options)
+    field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
+    share = 1.0 / (coverage(scene, field, views) * (count / max(1, len(views))) + options.prior)
+    field.share.copy_(share)
+    return field
+
+
+def tiles_as_seen(
+    surfels: Mapping[str, Tensor],
+    cameras: Sequence[Camera],
+    seen: Visibility,
+    near: float,
+    weight_bound: float,
+    options: TexelConfig,
+) -> tuple[Tensor, Tensor]:
+    """Tiles that reach as far as fragments reach the weight bound, with at most a texel for so many pixels of the view
+    that shows most of the surfel.
+
+    Args:
+        surfels: of N rows.
+        cameras: the views.
+        seen: what they see.
+        near: nearest drawn depth.
+        weight_bound: fragments of smaller weight get no residual.
+        options: see `TexelConfig`.
+
+    Returns:
+        sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 where no fragment reaches the bound.
+    """
+    scales = surfels["log_scales"].exp()
+    extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
+    axes = tangents(surfels["quats"])
+    pixels = max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near)[0]
+    size = seen_sides(pixels * (extent / SUPPORT)[:, None], SMALLEST, options.largest)
+    size = coarsened(size, seen.pixels / options.pixels_per_texel, SMALLEST)
+    size[extent <= 0] = 1
+    return size, torch.where(extent > 0, extent, torch.full_like(extent, SUPPORT))
+
+
+@torch.no_grad()
+def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
+    """How much of the pictures every texel makes up, in pixels: [T] sum over views and fragments of the blending weight
+    times the bilinear weight, in pixels that count; 0 where no view sees it."""
+    tiles, texels = field.tiles, field.texels.detach()
+    bound, total = scene.config.weight_bound, torch.zeros_like(texels)
+    grey = texels.new_zeros(len(tiles.size), 3)  # of which no channel is cut off
+    for view in views:
+        camera = view.camera
+        geometry = (scene.surfels[name].detach() for name in GEOMETRY)
+        projection = project(*geometry, camera, scene.near, scene.config.through_pixel)
+        shown = TexelFragments.of_lists((each, each.weight >= bound) for each in fitting_lists(projection))
+        counts = texels.new_ones(camera.height * camera.width, 3)
+        if view.mask is not None:
+            counts *= view.mask.reshape(-1, 1)
+        add_texel_gradient(counts, shown, grey, torch.zeros_like(texels), tiles, 0.0, total)
+    return total[:, 0]

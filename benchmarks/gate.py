@@ -36,10 +36,9 @@ THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 
 @dataclass(frozen=True)
 class Settings:
-    """The job: steps of training, of the polish and of the texel tuning, and how many seeds."""
+    """The job: steps of training and of the texel tuning, and how many seeds."""
 
-    steps: int = 200
-    polish: int = 120
+    steps: int = 320
     tuning: int = 20
     seeds: int = 4
 
@@ -88,7 +87,7 @@ UNITS = {
     "fragments_per_pixel": "fragments per pixel",
     "peak_mb": "peak memory, MB",
     "train": "training, calibrations",
-    "bake": "bake, polish and tuning, calibrations",
+    "bake": "bake and tuning, calibrations",
     "frame": "a baked frame, calibrations",
 }
 
@@ -146,7 +145,7 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     """The figures of one scene and seed."""
     import torch
 
-    from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn
+    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn
     from bitymi_ns.bundle import export, read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
@@ -159,13 +158,15 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     cameras = [view.camera for view in capture.train]
     centers = torch.stack([camera.center for camera in cameras])
     pixels = sum(camera.width * camera.height for camera in cameras)
-    scene, _ = build_scene(capture.points, capture.colours, centers, SceneConfig(), config, False, pixels)
+    scene, _ = build_scene(
+        capture.points, capture.colours, centers, SceneConfig(texture="texels"), config, False, pixels
+    )
     aside = calibration.every(10)
     _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, settings.steps, callback=aside))
     neural, fragments, _ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
-        learning = Learning(PolishOptions(steps=settings.polish), TuneOptions(steps=settings.tuning), config)
+        learning = Learning(tune=TuneOptions(steps=settings.tuning), train=config)
         aside = calibration.every(10)
         return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(), learning, aside)
 
@@ -294,7 +295,7 @@ def main() -> None:
     parser.add_argument("--baseline", type=Path, default=BASELINE, help="the file to compare with, or to write")
     for field in fields(Settings):
         parser.add_argument(f"--{field.name}", type=int, default=field.default)
-    parser.add_argument("--job", nargs=6, help=argparse.SUPPRESS)
+    parser.add_argument("--job", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.job:
         data, downscale, *numbers = options.job
@@ -305,7 +306,7 @@ def main() -> None:
     from bitymi_ns.files import write_file
     from bitymi_ns.measure.bench.machine import processor
 
-    settings = Settings(options.steps, options.polish, options.tuning, options.seeds)
+    settings = Settings(options.steps, options.tuning, options.seeds)
     empty = {"settings": asdict(settings), "processor": processor(), "scenes": {}}
     baseline = json.loads(options.baseline.read_text("utf8")) if options.baseline.is_file() else empty
     if not options.accept and baseline["settings"] != asdict(settings):

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from bitymi_ns.bake.compact import Compact, with_coded_texels, with_rounded_surfels
+from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
 from bitymi_ns.bake.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
 
@@ -48,7 +50,7 @@ def bake_and_learn(
     """Bakes a scene, lets it learn, reduces and encodes it.
 
     With a polish the order is: fine tiles, polish, reduction of tiles and view colours, fine-tuning. Without: reduced
-    tiles and view colours, fine-tuning.
+    tiles and view colours, fine-tuning. A scene whose texels learned in training has its fine tiles already.
 
     Args:
         scene: a trained scene.
@@ -64,10 +66,14 @@ def bake_and_learn(
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
     polish, tune = learning.polish, learning.tune
-    baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
-    if polish is not None:
-        if baked.texels is not None:
-            baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
+    has_learned = isinstance(scene.field, TexelField)
+    if has_learned:
+        baked = learned(scene, options)
+    else:
+        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+    if polish is not None and baked.texels is not None:
+        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
+    if polish is not None or has_learned:
         baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
     coding = None
     if learning.compact is not None:

@@ -138,19 +138,6 @@ class ToleranceBake:
 
 
 @dataclass(frozen=True)
-class Blank:
-    """A field with no residual anywhere, for scenes that were trained without one."""
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """[M, 3] zeros."""
-        return torch.zeros_like(x)
-
-    def voxel_size(self, x: Tensor) -> Tensor:
-        """[M, 2]: it can hold any detail."""
-        return torch.full((len(x), 2), torch.finfo(torch.float32).tiny, device=x.device)
-
-
-@dataclass(frozen=True)
 class FineBake:
     """What a polish starts from: as many texels as the views can tell apart, whatever the field has learned, and all of
     the view colours. A tile has at most a texel for every `pixels_per_texel` pixels of the view that shows most of it.
@@ -170,7 +157,7 @@ class FineBake:
         if inputs.views is None:
             return plan
         limit = coarsened(plan.limit, inputs.views.pixels / self.pixels_per_texel, self.options.r_min)
-        return replace(plan, limit=limit, probes=limit if isinstance(field, Blank) else plan.probes)
+        return replace(plan, limit=limit)
 
     def tiles(self, field: Field, plan: Plan, inputs: BakeInput, progress: Progress) -> Tiles:
         """One for every surfel of which any view shows a residual."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from bitymi_ns.bake.codes import Codes
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.inputs import BakeInput, drawable
-from bitymi_ns.bake.methods import BakeMethod, Blank, FineBake, Tiles, bake_method, reduced_tiles
+from bitymi_ns.bake.methods import BakeMethod, FineBake, Tiles, bake_method, reduced_tiles
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import moved_texels, tile_means
@@ -174,8 +174,7 @@ def bake(
 
     Left out and counted are surfels that can never be drawn (opacity below 1/255), rows that are not finite or beyond
     what a bundle holds (`limits.LIMITS`), rotations of length zero, and surfels that no training view blends. A scene
-    without a field has no atlas, and its tiles are zeros. There is no atlas, either, where all tiles are constant
-    within the tolerance.
+    without a field has no atlas. There is none, either, where all tiles are constant within the tolerance.
 
     Args:
         scene: a trained scene.
@@ -183,8 +182,8 @@ def bake(
         options: see `BakeOptions`.
         progress: called after every chunk of work.
         pixels_per_texel: for a bake of which texels and surfels are going to learn: tiles get as many texels as the
-            views can tell apart (`methods.FineBake`), zeros where the scene has no field, and are not encoded; view
-            colours stay whole. `reduced` does then what the options say. None = as the options say at once.
+            views can tell apart (`methods.FineBake`), and are not encoded; view colours stay whole. `reduced` does then
+            what the options say. None = as the options say at once.
 
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
@@ -202,11 +201,11 @@ def bake(
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
     statistics = Statistics(surfels=KeptSurfels(trained=trained, kept=len(rows), left_out=left_out))
-    field = Blank() if scene.field is None and not method.final else scene.field
+    field = scene.field
     if field is None:
         tiles, atlas = Tiles.none(len(rows), options.extent), None
     else:
-        paper = None if isinstance(field, Blank) else paper_texels(candidates.surfels, field, options)
+        paper = paper_texels(candidates.surfels, field, options)
         tiles, atlas, statistics = _textured(method, field, inputs, paper, statistics, options, progress)
     surfels, view_color = method.view_color(inputs, progress)
     baked = BakedScene(
@@ -232,7 +231,7 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     The atlas is to be `encoded`.
 
     Args:
-        baked: made with `pixels_per_texel`.
+        baked: made with `pixels_per_texel`, or `learned`.
         cameras: training views.
 
     Raises:
@@ -249,12 +248,13 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
         gone = gone.but(unseen=int((~seen).sum()))
         kept[rows] = seen
     if not bool(kept.any()):
-        raise ValueError("no surfel is left to bake after the polish")
+        raise ValueError("no surfel is left to bake")
     lean, view_color = bake_method(options).view_color(inputs, progress)
     result = baked.only(kept)
     if options.tolerance > 0 and result.texels is not None:
         result = result.with_tiles(reduced_tiles(result.tiles, inputs, options, progress))
     result = result.with_surfels(lean)
+    result = replace(result, scene=replace(result.scene, photographed=photographed(inputs)))
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None
     left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
@@ -290,7 +290,7 @@ def _textured(
     method: BakeMethod,
     field: Field,
     inputs: BakeInput,
-    paper: int | None,
+    paper: int,
     statistics: Statistics,
     options: BakeOptions,
     progress: Progress,
@@ -298,7 +298,7 @@ def _textured(
     """The tiles of a scene with a field, their atlas where any surfel needs a tile, and what that saved and cost.
 
     Args:
-        paper: texels that the paper's rule gives; None = it has none.
+        paper: texels that the paper's rule gives.
         statistics: with the numbers of surfels.
     """
     field, levels = method.field(field, inputs)

@@ -97,6 +97,8 @@ class KeptTexels(Part):
     within_visible_part: Count | None = None
     polished: Count | None = None
     """Of the tiles that a polish started from."""
+    learned: Count | None = None
+    """Of the tiles that learned in training."""
     kept: Count | None = None
     not_finite: Count | None = None
     """Points at which the field was not finite."""

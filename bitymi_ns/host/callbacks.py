@@ -108,7 +108,9 @@ class TrainingRun:
         if background.device.type == "cpu":
             train = self.datamanager.train_dataset.cameras
             cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1]))
-            state_training(scene, cameras, self.training.strategy.most)
+            learns = scene.config.texture == "texels"
+            pixels = config.texels.pixels_per_texel if learns else 0.0
+            state_training(scene, cameras, self.training.strategy.most, pixels)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

@@ -23,7 +23,7 @@ EXTRA_STATE = "_extra_state"
 """torch's name for what a module saves beside its tensors."""
 SURFELS = "scene.surfels."
 """Prefix of the surfels' parameters in the model."""
-STATE_VERSION = 1
+STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
 """Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters
 mean, only how they are drawn or learned."""

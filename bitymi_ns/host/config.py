@@ -74,6 +74,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
+        self._settle_texture()
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
@@ -130,6 +131,17 @@ class BitymiTrainerConfig(TrainerConfig):
             why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"
             text += f", the short schedule ({why}); for the full one: --max-num-iterations {self.default_iterations}"
         return text
+
+    def _settle_texture(self) -> None:
+        """Choose by the device what is left to it."""
+        scene, cpu = self.pipeline.model.scene, self.machine.device_type == "cpu"
+        if scene.texture == "auto":
+            scene.texture = "texels" if cpu else "hash"
+        if scene.texture == "texels" and not cpu:
+            fail(
+                "texels learn on the CPU alone: leave --pipeline.model.scene.texture at auto, which takes the field on "
+                "a GPU, or add --machine.device-type cpu"
+            )
 
     def _make_paths_absolute(self) -> None:
         """So that the capture is found from any folder, also by the commands that read config.yml later."""

@@ -45,6 +45,7 @@ from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import cc_psnr, psnr
 
@@ -75,9 +76,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
     polish_steps: int | None = None
     """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
     without the network, before tiles and view colours are reduced; 0 = surfels stay as they were trained. Not given:
-    on the CPU 300, or 4 for each photograph where that is more; 0 on a GPU, for which there are no kernels."""
+    0 where texels learned in training already, and on a GPU, for which there are no kernels; else 300, or 4 for each
+    photograph where that is more."""
     finetune_steps: int | None = None
-    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 100 after a polish, else 400."""
+    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 where nothing but a field has learned
+    yet, else 100."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
     """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
     not."""
@@ -127,14 +130,15 @@ class ExportAtlas(BakeOptions, CompactOptions):
         """What learns from so many training photographs, and whether the bundle is compact."""
         if self.exact:
             return Learning()
+        has_learned, textured = isinstance(model.scene.field, TexelField), model.scene.field is not None
         steps = self.polish_steps
         if steps is None:
-            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if model.device.type == "cpu" else 0
-        polish = PolishOptions(steps=steps) if steps else None
-        textured = polish is not None or model.scene.field is not None
+            polishes = model.device.type == "cpu" and textured and not has_learned
+            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if polishes else 0
+        polish = PolishOptions(steps=steps) if steps and textured else None
         steps = self.finetune_steps
         if steps is None:
-            steps = TuneOptions.steps if polish is None else STEPS_AFTER_POLISH
+            steps = TuneOptions.steps if polish is None and not has_learned else STEPS_AFTER_POLISH
         tune = TuneOptions(steps=steps, cache_bytes=int(self.finetune_memory * 1e9)) if textured and steps else None
         return Learning(polish, tune, model.train_config, compact)
 
@@ -145,8 +149,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         shown = preview(model, datamanager, views, "JPEG" if self.compact else "PNG")
         learning = self._learning(model, len(views), self.compact_of(len(shown)))
-        polish, tune = learning.polish, learning.tune
-        for name, options_of in (("polish", polish), ("finetune", None if polish else tune)):
+        polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
+        for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
                 passes = options_of.steps / len(views)
                 say(

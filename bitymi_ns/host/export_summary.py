@@ -77,11 +77,14 @@ def print_savings(table: Table, info: Manifest) -> None:
         table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
         voxel = "local voxel" if options.local_voxel else "smallest voxel"
         table.add_row(f"... by the {voxel}, extent {options.extent:g}", f"{texels.nyquist:,}")
-    table.add_row("... no finer than a view sees", f"{texels.after_cap_by_views:,}")
-    table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
+    if texels.learned is not None:
+        table.add_row("Texels that learned", f"{texels.learned:,}")
+    else:
+        table.add_row("... no finer than a view sees", f"{texels.after_cap_by_views:,}")
+        table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
     if texels.polished is not None:
         table.add_row("... by the pixels that show them: polished", f"{texels.polished:,}")
-    first = texels.paper or texels.within_visible_part
+    first = texels.paper or texels.learned or texels.within_visible_part
     table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, first):.1f} %)")
     rule = first * BYTES_PER_TEXEL[options.format]
     stored = info.files[info.atlas.file].bytes if info.atlas else 0

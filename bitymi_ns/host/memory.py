@@ -32,6 +32,9 @@ PER_PIXEL = 400
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
+PER_TEXEL = 60
+"""Bytes in training: the texel, how far it moves, and the two states that a run could go back to."""
+
 
 @torch.no_grad()
 def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
@@ -50,19 +53,22 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     return min(int(MARGIN * most), bound or MOST)
 
 
-def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int) -> None:
+def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int, pixels_per_texel: float = 0.0) -> None:
     """Say what a training run will take.
 
     Args:
         scene: as the run finds it.
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
+        pixels_per_texel: of texels that will learn, each of which some view shows; 0 = none will.
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     needed = PROGRAM + kept + PER_PIXEL * pixels + PER_FRAGMENT * fragments
     needed += PER_SURFEL * max(len(scene), most_surfels)
+    if pixels_per_texel > 0:
+        needed += PER_TEXEL * fragments / pixels_per_texel
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
     _state("Training", needed, cameras, f"{advice} {max(1, fragments // 4)}")
 

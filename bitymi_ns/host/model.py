@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.host.callbacks import TrainingRun
-from bitymi_ns.host.checkpoints import STATE_VERSION, SURFELS
+from bitymi_ns.host.checkpoints import STATE_VERSION
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.scene_setup import new_scene
 from bitymi_ns.host.surfel_model import SurfelModel, SurfelModelConfig
@@ -76,6 +76,13 @@ class BitymiModel(SurfelModel):
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
         self._run: TrainingRun | None = None
+
+    def to(self, *args: Any, **kwargs: Any) -> BitymiModel:
+        """As `SurfelModel.to`; a scene of texels stays on the CPU, where their kernels are."""
+        if self.config.scene.texture == "texels":
+            return self
+        super().to(*args, **kwargs)
+        return self
 
     # rendering
 

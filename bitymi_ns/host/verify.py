@@ -11,6 +11,7 @@ from bitymi_ns.bundle import Bundle, Check, check_field, check_place, check_view
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.export import held_out_psnr, load_trained, world_of
+from bitymi_ns.scene.field import HashField
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -32,7 +33,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     cameras = datamanager.undistorted_train_cameras()
     train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     checks = [check_view_color(bundle, model.scene.surfels, train)]
-    if model.scene.field is not None:
+    if isinstance(model.scene.field, HashField):
         checks.append(check_field(bundle, model.scene.field.cpu(), train))
     if len(datamanager.eval_dataset):
         scene, background = bundle.scene, model.background.cpu()

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from bitymi_ns.bake import Baked, BakeOptions, bake, rich_progress
+from bitymi_ns.bake import Baked, BakeOptions, bake, reduced, rich_progress
+from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import STEPS
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say
@@ -24,6 +25,7 @@ from bitymi_ns.measure.bench.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.evaluate import evenly_spaced
 from bitymi_ns.train.losses import psnr
 
@@ -171,9 +173,10 @@ class Knobs:
         cameras = pipeline.datamanager.undistorted_train_cameras()
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
+        self.has_learned = isinstance(self.scene.field, TexelField)
 
     def neural(self, camera: Camera, bound: float | None = None) -> Tensor:
-        """The trained scene with its field."""
+        """The trained scene, not baked."""
         with torch.no_grad():
             return self.scene.render(
                 camera, self.background.to(camera.K), "frozen", weight_bound=self.bound if bound is None else bound
@@ -181,6 +184,9 @@ class Knobs:
 
     def _bake(self, **options: Any) -> Baked:
         with rich_progress() as progress:
+            if self.has_learned:
+                made = learned(self.scene, replace(self.options, **options))
+                return reduced(made, self.views, progress).encoded(progress)
             return bake(self.scene, self.views, replace(self.options, **options), progress)
 
     def _all_colors(self, baked: Baked, scene: BakedScene) -> BakedScene:
@@ -217,7 +223,7 @@ class Knobs:
             ]
         if {"weight_bound", "transmittance", "format", "resolution"} & set(wanted):
             yield from self._of_one_bake(wanted, textured)
-        if "r_max" in wanted and textured:
+        if "r_max" in wanted and textured and not self.has_learned:  # else the tiles have their sizes already
             yield self._of_the_bake("r_max", TILE_SIDES, self.options.r_max)
         if "tolerance" in wanted and textured:
             yield self._of_the_bake("tolerance", TOLERANCES, BakeOptions().tolerance)

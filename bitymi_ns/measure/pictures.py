@@ -20,6 +20,7 @@ from bitymi_ns.host.target import see_writable
 from bitymi_ns.measure.report.views import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.ops import composite
 from bitymi_ns.scene import RenderOutput, Scene
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.rotations import tangents
 
 RESIDUAL_GAIN = 4.0
@@ -54,7 +55,9 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     bands = []
     for fragments in output.fragments.lists():
         rho = fragments.weight.new_zeros(len(fragments), 3)
-        if scene.field is not None:
+        if isinstance(scene.field, TexelField):
+            rho = scene.field.residual(fragments, scene.config.weight_bound)
+        elif scene.field is not None:
             textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
             surfel = fragments.surfel[textured].long()
             u, v = fragments.uv[:, textured]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from bitymi_ns.ops import Fragments, TexelDescent, TexelTiles, shade, texel_colors
-from bitymi_ns.ops.constants import FEATURES, WIDTH
+from bitymi_ns.ops.constants import COLOR_BIAS, FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
@@ -199,3 +199,10 @@ class TexelField(nn.Module):
         descent = self.descent if learns else None
         texels = self.texels if learns and descent is None else self.texels.detach()
         return texel_colors(fragments, base, texels, self.tiles, bound, moves_surfels, descent)
+
+    @torch.no_grad()
+    def residual(self, fragments: Fragments, bound: float) -> Tensor:
+        """[F, 3] residual of every fragment, 0 below the weight `bound`."""
+        bright = 4.0  # so that no channel is cut off
+        base = self.texels.new_full((len(self.size), 3), bright - COLOR_BIAS)
+        return texel_colors(fragments, base, self.texels.detach(), self.tiles, bound, False) - bright

@@ -145,7 +145,7 @@ def test_the_texels_kept_are_those_of_the_best_look(
         return seen[-1][0]
 
     monkeypatch.setattr(TexelViews, "psnr", noted)
-    monkeypatch.setattr("bitymi_ns.bake.looks.math.cos", lambda angle: 20.0 * angle**6 - 0.9)
+    monkeypatch.setattr("math.cos", lambda angle: 20.0 * angle**6 - 0.9)
     tuned = tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, patience=99))
     best = max(range(len(seen)), key=lambda i: seen[i][0])
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5

@@ -73,6 +73,23 @@ def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactor
     return folder
 
 
+@pytest.fixture(scope="session")
+def field_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
+    """A finished run with a field that has kept all its checkpoints. Not to be changed."""
+    config = small_run(room, tmp_path_factory.mktemp("outputs"), method="bitymi-field")
+    config.save_only_latest_checkpoint = False
+    ns_train.main(config)
+    return config
+
+
+@pytest.fixture(scope="session")
+def field_bundle(field_run: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """That run as a bundle. Not to be changed."""
+    folder = tmp_path_factory.mktemp("bundles") / "field-bc7"
+    run_export(field_run, folder, tolerance=TOLERANCE, finetune_steps=0)
+    return folder
+
+
 @pytest.fixture
 def copied(bundle: Path, tmp_path: Path) -> Path:
     """The bundle in another place."""

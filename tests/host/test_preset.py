@@ -13,16 +13,25 @@ from bitymi_ns.presets import preset_names, preset_path
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import AdamConfig
 
-METHODS = ["bitymi", "bitymi-quality", "bitymi-fast", "bitymi-sb", "bitymi-sg", "bitymi-sh", "bitymi-notexture"]
+METHODS = [
+    "bitymi",
+    "bitymi-quality",
+    "bitymi-fast",
+    "bitymi-sb",
+    "bitymi-sg",
+    "bitymi-sh",
+    "bitymi-field",
+    "bitymi-notexture",
+]
 
 
 def test_the_presets_are_those_that_are_registered() -> None:
     assert sorted(METHODS) == preset_names()
 
 
-def test_the_default_preset_is_the_declared_defaults() -> None:
+def test_the_default_preset_is_the_declared_defaults_but_for_the_texture() -> None:
     preset = load_preset("bitymi")
-    assert preset == Preset("bitymi", preset.description)
+    assert preset == Preset("bitymi", preset.description, scene=SceneConfig(texture="auto"))
 
 
 def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
@@ -79,6 +88,7 @@ def test_the_variants_differ_where_they_should() -> None:
     assert fast.scene == base.scene and fast.train.densify == base.train.densify
     assert [load_preset(f"bitymi-{c}").scene.view_color for c in ("sh", "sb", "sg")] == ["sh", "sb", "sg"]
     assert load_preset("bitymi-notexture").scene.texture == "none"
+    assert load_preset("bitymi-field").scene.texture == "hash"
 
 
 def write(folder: Path, text: str, name: str = "mine") -> Path:

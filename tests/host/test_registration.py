@@ -17,7 +17,16 @@ import bitymi_ns.host.config as config
 from bitymi_ns.host import methods
 from bitymi_ns.host.errors import InputError
 
-NAMES = ["bitymi", "bitymi-quality", "bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"]
+NAMES = [
+    "bitymi",
+    "bitymi-quality",
+    "bitymi-fast",
+    "bitymi-sh",
+    "bitymi-sb",
+    "bitymi-sg",
+    "bitymi-field",
+    "bitymi-notexture",
+]
 
 
 @pytest.mark.parametrize("name", NAMES)

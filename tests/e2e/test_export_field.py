@@ -1,0 +1,115 @@
+"""Exports of runs whose texture is a field: baked, polished, fine-tuned, compared with the field."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bitymi_ns.bake import learn as bake_learn
+from bitymi_ns.bundle import check_files
+from bitymi_ns.cli import main
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.verify import check_run
+from tests.e2e.exports import TOLERANCE, evaluate, run_export
+
+
+def test_the_texels_are_fine_tuned(
+    field_run: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=30)
+    statistics = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]
+    tuned = statistics["finetune"]
+    assert tuned["steps"] <= 30 and tuned["views"] + tuned["held_in_views"] == 10 and tuned["cpu_seconds"] > 0
+    held_in, held_out = tuned["psnr_held_in"], tuned["psnr_held_out"]
+    assert held_in["after"] == max(psnr for _, psnr in tuned["curve"])
+    assert held_out["before"] == pytest.approx(statistics["held_out"]["psnr_neural_against_photos"], abs=0.2)
+    stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "tuned.json")["psnr"]
+    assert stored == pytest.approx(held_out["after"], abs=0.1)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "tuning texels" in out and "Fine-tuning" in out
+    assert "30 steps for 10 training photographs, 3.0 for each: more may gain" in out
+    assert "The export will take about" in out and "GB of memory for 10 training photographs of 48 x 36" in out
+
+
+def test_the_scene_is_polished(
+    field_run: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, polish_steps=30, finetune_steps=8)
+    statistics = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]
+    polished, tuned = statistics["polish"], statistics["finetune"]
+    assert polished["steps"] <= 30 and polished["views"] + polished["held_in_views"] == 10
+    assert polished["psnr_held_in"]["after"] == max(psnr for _, psnr in polished["curve"])
+    assert tuned["psnr_held_in"]["before"] == pytest.approx(polished["psnr_held_in"]["after"], abs=0.1)
+    assert "error_before" not in polished and "error_before" not in tuned and "error" not in statistics
+    texels = statistics["texels"]
+    assert 0 < texels["kept"] <= texels["polished"] <= texels["within_visible_part"]
+    stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "polished.json")["psnr"]
+    assert stored == pytest.approx(tuned["psnr_held_out"]["after"], abs=0.1)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "polishing" in out and "Polish" in out and "Fine-tuning" in out
+    bundle, checks = check_files(tmp_path / "b")
+    assert bundle is not None and all(check.ok for check in checks)
+    found = {check.name: check for check in check_run(bundle, field_run.get_base_dir() / "config.yml", views=1)}
+    assert all(check.ok for check in found.values())
+    assert "the surfels learned after the bake" in found["error of the view colours"].detail
+    assert "the texels were changed" in found["error against the field"].detail
+
+
+def test_fine_tuning_mends_an_atlas_that_is_too_dark(
+    field_run: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = bake_learn.bake
+
+    def too_dark(*arguments: Any) -> Any:
+        baked = make(*arguments)
+        dark = baked.with_mean_residual(baked.mean_residual - 0.3).with_texels(baked.texels - 0.3)
+        return replace(dark, statistics=dark.statistics.but(error=baked.statistics.error))
+
+    monkeypatch.setattr(bake_learn, "bake", too_dark)
+    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=100)
+    tuned = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]
+    held_in, held_out = tuned["psnr_held_in"], tuned["psnr_held_out"]
+    assert held_in["after"] > held_in["before"] + 0.5 and held_out["after"] > held_out["before"] + 0.5
+    stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "tuned.json")["psnr"]
+    assert stored == pytest.approx(held_out["after"], abs=0.1)
+
+
+def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(
+    field_run: BitymiTrainerConfig, field_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_export(field_run, tmp_path / "exact", exact=True)
+    printed = capsys.readouterr().out
+    exact, default = (
+        json.loads((f / "bundle.json").read_text())["statistics"] for f in (tmp_path / "exact", field_bundle)
+    )
+    assert exact["texels"]["kept"] == exact["texels"]["nyquist"] == default["texels"]["nyquist"]
+    assert 0 < default["texels"]["kept"] < 0.8 * exact["texels"]["kept"]
+    assert exact["surfels"]["left_out"].get("unseen", 0) == 0 and exact["options"]["tolerance"] == 0
+    assert "Atlas bytes" in printed and "no tolerance" in printed and "all of it is kept" in printed
+    assert "view_color" not in exact and default["view_color"]["tolerance"] == TOLERANCE
+    assert default["view_color"]["sites"]["after"] < default["view_color"]["sites"]["before"]
+    assert default["error"]["tolerance"] == TOLERANCE and 0 < default["error"]["rms"]["p90"] < 1
+
+
+def test_verify_compares_a_bundle_with_its_run(
+    field_run: BitymiTrainerConfig, field_bundle: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = field_run.get_base_dir()
+    assert main(["verify", str(field_bundle), "--run", str(run / "config.yml")]) == 0
+    assert "error against the field" in capsys.readouterr().out
+    bundle, _ = check_files(field_bundle)
+    assert bundle is not None
+    final = check_run(bundle, run, views=1)
+    assert [check.ok for check in final] == [True, True, True, True]
+    assert "stated" in final[0].detail and final[0].name == "error of the view colours"
+    first = min((run / "nerfstudio_models").glob("*.ckpt"))
+    earlier = check_run(bundle, first, views=1)
+    # what the bundle holds was not there yet, its place was
+    assert [check.ok for check in earlier] == [False, False, False, True]
+    with pytest.raises(InputError, match="no checkpoint"):
+        check_run(bundle, run / "step-7.ckpt", views=1)

@@ -1,0 +1,156 @@
+"""Texels that learn in the last part of a run."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.visibility import visibility
+from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer, fit
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.texels import blank_texels, coverage, tiles_as_seen
+
+OPTIONS = TexelConfig(start=18_000, pixels_per_texel=0.5)
+
+
+def config(**options) -> TrainConfig:
+    densify = DensifyConfig(max_surfels=250, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)
+    return TrainConfig(densify=densify, texels=OPTIONS, **options)
+
+
+@pytest.fixture
+def textured(make_scene):
+    """make(**options) -> a scene that is going to have texels."""
+
+    def make(**options):
+        scene = make_scene(texture=False, **options)
+        scene.config.texture = "texels"
+        return scene
+
+    return make
+
+
+def test_the_last_part_of_a_run() -> None:
+    with_texels, without = (Schedule(config(), 600, 2.0, texels) for texels in (True, False))
+    assert [with_texels.texels_learn(step) for step in (359, 360, 599)] == [False, True, True]
+    assert not without.texels_learn(599) and max(with_texels.densify_steps | with_texels.reset_steps) < 360
+    for name in ("means", "opacity_logits", "sv_rgb"):
+        assert with_texels.lr(name, 359) == without.lr(name, 359)
+        rates = [with_texels.lr(name, step) for step in range(360, 600)]
+        assert rates == sorted(rates, reverse=True) and rates[-1] < 1e-3 * rates[0] > 0
+    assert with_texels.lr("exposure", 400) == without.lr("exposure", 400)
+    assert with_texels.texel_rate(360) == OPTIONS.rate > with_texels.texel_rate(500) > 0
+    early = TrainConfig(texels=TexelConfig(start=6_000))
+    assert max(Schedule(early, 3000, texels=True).densify_steps) < 600 < max(Schedule(early, 3000).densify_steps)
+    never = Schedule(TrainConfig(texels=TexelConfig(start=30_000)), 600, texels=True)
+    assert not never.texels_learn(599) and never.lr("quats", 599) == without.lr("quats", 599)
+
+
+def test_every_surfel_gets_a_tile_as_fine_as_it_is_seen(textured, views) -> None:
+    scene = textured()
+    with torch.no_grad():
+        scene.surfels["means"][0] += 1e4  # no view sees it
+    surfels = {name: value.detach() for name, value in scene.surfels.items()}
+    cameras = [view.camera for view in views]
+    bound = scene.config.weight_bound
+    seen = visibility(surfels, cameras, scene.near, bound)
+    sizes = []
+    for pixels in (0.05, 0.5, 1e6):
+        options = TexelConfig(pixels_per_texel=pixels)
+        size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options)
+        assert ((extent > 0) & (extent <= SUPPORT)).all() and size.dtype == torch.int32
+        area = size.long().prod(1)
+        assert set(size.unique().tolist()) <= {1, 4, 8, 16, 32, 64}
+        assert ((area <= 16) | (area <= seen.pixels / pixels)).all()
+        sizes.append(area)
+    assert (sizes[0] >= sizes[1]).all() and (sizes[1] >= sizes[2]).all() and sizes[0].sum() > 2 * sizes[2].sum()
+    assert sizes[0][0] <= 16
+
+
+def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None:
+    scene = textured()
+    field = blank_texels(scene, views, len(views), OPTIONS)
+    found = coverage(scene, field, views)
+    assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
+    half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views stand for all
+    assert torch.allclose(half.share, 1 / (2 * found + OPTIONS.prior))
+    with torch.no_grad():
+        scene.surfels["sv_rgb"].fill_(0.2)  # no colour is cut off
+    scene.field, total = field, 0.0
+    for view in views:
+        image = scene.render(view.camera).rgb[..., 0]
+        total = total + (image if view.mask is None else image * view.mask.reshape(image.shape)).sum()
+    total.backward()
+    torch.testing.assert_close(found, field.texels.grad[:, 0], rtol=1e-4, atol=1e-4)
+    assert (found > 0).any()
+
+
+def test_a_run_with_texels_is_better_than_one_without(textured, make_scene, views) -> None:
+    quality = []
+    for scene in (textured(), make_scene(texture=False)):
+        fit(scene, views[1:], [], config(resolution_schedule=0), 300)
+        quality.append(evaluate(scene, views[1:], config())[0])
+        assert all(torch.isfinite(p).all() for p in scene.parameters())
+    assert quality[0] > quality[1] + 0.3
+
+
+def test_a_run_resumes_before_and_after_its_texels_came(textured, views) -> None:
+    straight, states = Trainer(textured(), views, config(), 60), []
+    for step in range(60):
+        if step in (30, 40):
+            states.append(copy.deepcopy(straight.state_dict()))
+        straight.advance()
+    assert isinstance(straight.scene.field, TexelField)
+    for state in states:
+        resumed = Trainer(textured(every=5), views, config(), 60)
+        resumed.load_state_dict(state)
+        assert isinstance(resumed.scene.field, TexelField) == (resumed.step == 40)
+        while resumed.step < 60:
+            resumed.advance()
+        theirs, ours = straight.scene.state_dict(), resumed.scene.state_dict()
+        assert theirs.keys() == ours.keys()
+        assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
+
+
+def test_surfels_that_are_pruned_take_their_texels_along(textured, views) -> None:
+    scene = textured()
+    trainer = Trainer(scene, views, config(), 60)
+    for _ in range(40):
+        trainer.advance()
+    field, n = scene.field, len(scene)
+    camera = views[0].camera
+    with torch.no_grad():
+        scene.surfels["opacity_logits"][3] = scene.surfels["opacity_logits"][n - 1] = -20.0
+        before = scene.render(camera).rgb
+    gone = torch.zeros(n, dtype=torch.bool)
+    gone[[3, n - 1]] = True
+    left = len(field.texels) - int(field.size[gone].prod(1).sum())
+    trainer.training.strategy._remove(gone, scene, trainer.optimizers)
+    assert len(scene) == len(field.size) == len(field.extent) == n - 2
+    assert len(field.texels) == len(field.share) == field.tiles.count == left
+    with torch.no_grad():
+        torch.testing.assert_close(scene.render(camera).rgb, before, rtol=0, atol=1e-6)
+    trainer.advance()
+
+
+def test_a_run_that_diverges_goes_back_to_its_texels(textured, views) -> None:
+    scene = textured()
+    trainer = Trainer(scene, views, config(), 60)
+    for _ in range(45):
+        trainer.advance()
+    gone = torch.arange(len(scene)) == 5
+    trainer.training.strategy._remove(gone, scene, trainer.optimizers)  # since the state that it goes back to
+    with torch.no_grad():
+        scene.field.texels[7] = float("nan")
+        scene.surfels["means"][:] = float("nan")
+    with pytest.warns(UserWarning, match="back to the state"):
+        trainer.advance()
+    assert all(torch.isfinite(p).all() for p in scene.parameters())
+    assert len(scene.field.size) == len(scene) and len(scene.field.texels) == scene.field.tiles.count
+    trainer.advance()

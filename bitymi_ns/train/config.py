@@ -144,7 +144,7 @@ class AdamConfig:
 class TexelConfig:
     """Texels that learn in the last part of a run, where the texture of the scene is `texels`."""
 
-    start: int = 24_000
+    start: int = 18_000
     """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
     as the training views see it; 30,000 or more = there is no such part."""
     rate: float = 0.05

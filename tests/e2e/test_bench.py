@@ -21,8 +21,8 @@ from bitymi_ns.measure.pictures import KINDS, decompose, draw_worst, residual_pa
 
 
 @pytest.fixture(scope="session")
-def config(trained: BitymiTrainerConfig) -> Path:
-    return trained.get_base_dir() / "config.yml"
+def config(field_run: BitymiTrainerConfig) -> Path:
+    return field_run.get_base_dir() / "config.yml"
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +36,7 @@ def points(config: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dict]
 def test_every_knob_is_measured_against_its_exact_setting(points: list[dict]) -> None:
     assert {p["knob"] for p in points} == set(host_knobs.KNOBS)
     for p in points:
-        assert p["scene"] == "room" and p["method"] == "bitymi" and p["views"] == 1 and p["made"]["machine"]
+        assert p["scene"] == "room" and p["method"] == "bitymi-field" and p["views"] == 1 and p["made"]["machine"]
         assert p["ms"] > 0 and 0 <= p["mean_steps"] <= p["max_steps"] < 256 and 5 < p["psnr"] < 60
         assert (p["max_steps"] == 0.0) or not p["exact"]
     groups = {(p["knob"], p["renderer"] if p["knob"] == "weight_bound" else "") for p in points}
@@ -59,6 +59,18 @@ def test_more_of_a_knob_is_more_error_and_fewer_bytes(points: list[dict]) -> Non
     assert [p["value"] for p in tolerances] == [0.0, 0.25, 0.5, 0.75, 1.0, 2.0, 4.0]
     assert tolerances[0]["mean_steps"] <= tolerances[-1]["mean_steps"]
     assert {p["value"] for p in points if p["default"]} >= {0.02, 1e-4, 64, "bc7", 1.0, 0.75}
+
+
+def test_texels_have_their_sizes_already(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    run = trained.get_base_dir() / "config.yml"
+    measure_to_file(load_config=run, output=tmp_path / "k.jsonl", knobs=("r_max", "tolerance"), views=1, repeats=1)
+    points = [json.loads(line) for line in (tmp_path / "k.jsonl").read_text().splitlines()]
+    assert {p["knob"] for p in points} == {"tolerance"}
+    errors = [p["mean_steps"] for p in points if not p["exact"]]
+    assert errors[0] < 1e-3 < errors[-1] and errors == sorted(errors)
+    draw_worst(run, tmp_path / "pictures", 1)
+    listed = json.loads((tmp_path / "pictures" / "pictures.json").read_text())["views"]
+    assert list(listed[0]["files"]) == list(KINDS)
 
 
 def test_some_knobs_by_the_command(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,12 +35,12 @@ def test_it_is_smaller_and_shows_the_same(trained: BitymiTrainerConfig, bundle: 
     assert all(check.ok for check in results), results
 
 
-def test_it_can_be_as_small_as_is_asked_for(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
-    run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=0, compact=True)
+def test_it_can_be_as_small_as_is_asked_for(field_run: BitymiTrainerConfig, tmp_path: Path) -> None:
+    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=0, compact=True)
     whole = sum(path.stat().st_size for path in (tmp_path / "b").iterdir())
     texels = (tmp_path / "b" / "texels.bin").stat().st_size
     target = (whole - texels / 2) / 1e6
-    run_export(trained, tmp_path / "c", tolerance=TOLERANCE, finetune_steps=30, compact=True, target_mb=target)
+    run_export(field_run, tmp_path / "c", tolerance=TOLERANCE, finetune_steps=30, compact=True, target_mb=target)
     assert sum(path.stat().st_size for path in (tmp_path / "c").iterdir()) <= 1e6 * target
     assert len(read_bundle(tmp_path / "c")) == len(read_bundle(tmp_path / "b"))
 

@@ -33,7 +33,7 @@ def test_ctrl_c_in_the_export_leaves_nothing(
     def interrupted(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bake_learn, "bake", interrupted)
+    monkeypatch.setattr(bake_learn, "learned", interrupted)
     with pytest.raises(SystemExit) as stop:
         run_export(trained, tmp_path / "b")
     assert stop.value.code == 130
@@ -47,7 +47,7 @@ def test_ctrl_c_before_a_bundle_is_replaced_says_which_one_is_there(
     def interrupted(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bake_learn, "bake", interrupted)
+    monkeypatch.setattr(bake_learn, "learned", interrupted)
     with pytest.raises(SystemExit):
         run_export(trained, copied, overwrite=True)
     assert "is the earlier one" in " ".join(capsys.readouterr().out.split())

@@ -42,7 +42,7 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     assert "The exposure of each photograph is learned" in said and "as asked for" in said
     state = checkpoint(whole, 59)["pipeline"]["_model._extra_state"]["run"]["exposure"]
     table = state["table"]
-    assert table.shape == (10, 3) and table.abs().max() > 0.05
+    assert table.shape == (10, 3) and table.abs().max() > 0.02
     torch.testing.assert_close(table.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
     last = json.loads((whole.get_base_dir() / FILE).read_text().splitlines()[-1])
     assert last["cc_psnr"] > last["psnr"]
@@ -60,7 +60,9 @@ def test_a_resumed_run_goes_on_with_its_corrections(
         return baked
 
     monkeypatch.setattr(learn, "tune_atlas", tune)
-    ExportAtlas(load_config=whole.get_base_dir() / "config.yml", output_dir=tmp_path / "bundle", polish_steps=0).main()
+    ExportAtlas(
+        load_config=whole.get_base_dir() / "config.yml", output_dir=tmp_path / "bundle", polish_steps=0, tolerance=0.02
+    ).main()
     torch.testing.assert_close(torch.stack(given), table.exp())
     bundle = json.loads((tmp_path / "bundle" / "bundle.json").read_text())
     held_out = bundle["statistics"]["held_out"]

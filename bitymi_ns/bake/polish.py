@@ -14,7 +14,7 @@ from torch import Tensor
 from bitymi_ns.bake.looks import Looks, gain, look, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
-from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage, numbers
+from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage
 from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.config import SceneConfig
@@ -22,7 +22,7 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling

@@ -19,6 +19,7 @@ from bitymi_ns.ops import (
     Fragments,
     TexelFragments,
     TexelTiles,
+    add_texel_coverage,
     add_texel_gradient,
     composite_image,
     fitting_lists,
@@ -30,7 +31,7 @@ from bitymi_ns.ops import (
 from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import View, shown, training_order
@@ -335,11 +336,6 @@ def _coded(
     return best
 
 
-def numbers(rgb: Tensor, mask: Tensor | None) -> int:
-    """How many numbers of a picture [H, W, 3] the mean of its loss is taken over."""
-    return rgb.numel() if mask is None else 3 * int(mask.sum())
-
-
 @torch.no_grad()
 def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progress, squared: bool = False) -> Tensor:
     """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
@@ -347,9 +343,6 @@ def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progr
     total = torch.zeros_like(scene.texels)
     for index in range(len(views)):
         view = views[index]
-        if squared:
-            view = replace(view, fragments=replace(view.fragments, weight=view.fragments.weight.square()))
-        shown = torch.ones_like(view.rest) if view.mask is None else view.mask.to(view.rest).expand_as(view.rest)
-        scene.add_gradient(view, scene.texels, shown.contiguous(), total)
+        add_texel_coverage(view.fragments, scene.tiles, view.mask, total, squared)
         progress("tracing the training views", index + 1, len(views))
-    return total.amax(dim=1, keepdim=True)  # a channel that the ReLU cuts off counts nothing
+    return total[:, :1]

@@ -13,7 +13,15 @@ from .field import FieldGeometry, field
 from .project import Projection, project
 from .shade import shade
 from .ssim import ssim
-from .texel import TexelDescent, TexelFragments, TexelTiles, add_texel_gradient, texel_colors, texel_image
+from .texel import (
+    TexelDescent,
+    TexelFragments,
+    TexelTiles,
+    add_texel_coverage,
+    add_texel_gradient,
+    texel_colors,
+    texel_image,
+)
 from .trace import Fragments, masked_counts, trace
 from .view_color import view_color
 from .view_kinds import VIEW_COLORS
@@ -28,6 +36,7 @@ __all__ = [
     "TexelFragments",
     "TexelTiles",
     "TooManyFragments",
+    "add_texel_coverage",
     "add_texel_gradient",
     "band",
     "beta_map",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -218,6 +218,28 @@ def add_texel_gradient(
     kernel("texel_image_backward", texels)(
         **fragments.arrays, **tiles.arrays, **runs, **inputs, dtexels=dtexels, dbase=dbase
     )
+
+
+def add_texel_coverage(
+    fragments: TexelFragments, tiles: TexelTiles, mask: Tensor | None, total: Tensor, squared: bool = False
+) -> None:
+    """Adds to every texel how much of a view's picture it makes up, in pixels: the sum over the fragments of the
+    blending weight, or its square, times the bilinear weight.
+
+    Args:
+        fragments: of an H x W view.
+        tiles: where the T texels lie.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        total: [T, 3], added to, alike in all columns.
+        squared: the weights' squares.
+    """
+    if squared:
+        fragments = replace(fragments, weight=fragments.weight.square())
+    counts = total.new_ones(fragments.width * fragments.height, 3)
+    if mask is not None:
+        counts *= mask.reshape(-1, 1)
+    grey = total.new_zeros(len(tiles.size), 3)  # a colour of which no channel is cut off
+    add_texel_gradient(counts, fragments, grey, torch.zeros_like(total), tiles, 0.0, total)
 
 
 class _TexelColors(torch.autograd.Function):

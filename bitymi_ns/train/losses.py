@@ -57,6 +57,11 @@ def objective(
     return terms
 
 
+def numbers(image: Tensor, mask: Tensor | None) -> int:
+    """How many numbers of a picture [H, W, C] the mean of its loss is taken over."""
+    return 3 * (image.shape[0] * image.shape[1] if mask is None else int(mask.sum()))
+
+
 def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None = None) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM).
 

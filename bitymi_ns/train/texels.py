@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import TexelDescent, TexelFragments, add_texel_gradient, fitting_lists, project
+from bitymi_ns.ops import TexelDescent, TexelFragments, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
+from bitymi_ns.train.losses import numbers
 from bitymi_ns.train.rotations import tangents
 
 if TYPE_CHECKING:
@@ -61,13 +62,8 @@ class LearningTexels:
         field = self.scene.field
         if isinstance(field, TexelField):
             # the loss is a mean, the step wants a sum
-            rate = factor * self.schedule.texel_rate(step) * numbers(view)
+            rate = factor * self.schedule.texel_rate(step) * numbers(view.image, view.mask)
             field.descent = TexelDescent(field.share, rate)
-
-
-def numbers(view: View) -> int:
-    """How many numbers of a view's picture the mean of its loss is taken over."""
-    return 3 * (view.camera.width * view.camera.height if view.mask is None else int(view.mask.sum()))
 
 
 @torch.no_grad()
@@ -129,16 +125,11 @@ def tiles_as_seen(
 def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     """How much of the pictures every texel makes up, in pixels: [T] sum over views and fragments of the blending weight
     times the bilinear weight, in pixels that count; 0 where no view sees it."""
-    tiles, texels = field.tiles, field.texels.detach()
-    bound, total = scene.config.weight_bound, torch.zeros_like(texels)
-    grey = texels.new_zeros(len(tiles.size), 3)  # of which no channel is cut off
+    total = torch.zeros_like(field.texels)
     for view in views:
-        camera = view.camera
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
-        projection = project(*geometry, camera, scene.near, scene.config.through_pixel)
+        projection = project(*geometry, view.camera, scene.near, scene.config.through_pixel)
+        bound = scene.config.weight_bound
         shown = TexelFragments.of_lists((each, each.weight >= bound) for each in fitting_lists(projection))
-        counts = texels.new_ones(camera.height * camera.width, 3)
-        if view.mask is not None:
-            counts *= view.mask.reshape(-1, 1)
-        add_texel_gradient(counts, shown, grey, torch.zeros_like(texels), tiles, 0.0, total)
+        add_texel_coverage(shown, field.tiles, view.mask, total)
     return total[:, 0]

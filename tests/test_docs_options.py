@@ -9,12 +9,12 @@ from typing import Any
 
 from bitymi_ns.bake import BakeOptions
 from bitymi_ns.capture.types import SfmOptions
-from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.host.preset import load_preset
 from bitymi_ns.train.config import TrainConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOTS: dict[str, Any] = {
-    "--pipeline.model.scene.": SceneConfig(),
+    "--pipeline.model.scene.": load_preset("bitymi").scene,
     "--pipeline.model.train.": TrainConfig(),
     "... bitymi-data --sfm.": SfmOptions(),
     "--sfm.": SfmOptions(),

@@ -19,6 +19,7 @@ from bitymi_ns.host.curve import FILE, TrainingCurve, points
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.exif import stops_of
 from bitymi_ns.host.memory import state_training
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import bounds
 from bitymi_ns.train.config import TrainConfig
@@ -147,8 +148,11 @@ class TrainingRun:
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
-        undecided = not self.training.exposure.decided
+        undecided, field = not self.training.exposure.decided, self.scene.field
         self.training.begin(step)
+        if self.scene.field is not field:
+            assert isinstance(self.scene.field, TexelField)
+            say(f"From step {step} on every surfel has its own texels, {len(self.scene.field.texels):,} in all.")
         if undecided:
             say(self.training.exposure.sentence)
 

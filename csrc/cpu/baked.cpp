@@ -100,6 +100,16 @@ const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
   return level ? a.coarser[level - 1] : a.patches;
 }
 
+// Asks for what a surfel that comes soon is drawn from: a tile's list names surfels from all over the memory.
+constexpr int kAhead = 3;
+template <class S>
+void prefetch(const BakedForward<S>& a, int64_t id) {
+  __builtin_prefetch(a.view.geom + id * kGeom);
+  __builtin_prefetch(a.view.radii + 2 * id);
+  __builtin_prefetch(a.base + 3 * id);
+  __builtin_prefetch(a.patches->sides.data() + 2 * id);
+}
+
 template <class Kernel, class S>
 void baked_forward(const BakedForward<S>& a) {
   using P = Pack<S>;
@@ -124,13 +134,12 @@ void baked_forward(const BakedForward<S>& a) {
     for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
+      if (k + kAhead < bins.start[tile + 1]) prefetch(a, bins.surfels[k + kAhead]);
       const S* g = geom + id * kGeom;
       const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
-      const Patches* level = a.patches;
-      bool tiled = level->sides[2 * id] != 0;
-      if (tiled && a.coarser[0]) level = level_of(a, id, extent), tiled = level != nullptr;
-      const Patches& patches = tiled ? *level : *a.patches;
-      const int32_t* sides = patches.sides.data() + 2 * id;
+      bool tiled = a.patches->sides[2 * id] != 0;
+      // found when a fragment asks for texels, which those below the weight bound do not
+      const Patches* level = a.coarser[0] ? nullptr : a.patches;
       const float* flat = atlas.mean_residual ? atlas.mean_residual + 3 * id : kNone;
       const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
       const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
@@ -151,10 +160,13 @@ void baked_forward(const BakedForward<S>& a) {
             if (overdraw) sums[kMapChannels][pack] += select(taken, P(S(1)), P(S(0)));
             const uint32_t rest = bits(textures);
             if (!rest) return;
+            if (tiled && !level) level = level_of(a, id, extent), tiled = level != nullptr;
             if (!tiled) {
               for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(shaded(view[c], S(flat[c])));
               return;
             }
+            const Patches& patches = *level;
+            const int32_t* sides = patches.sides.data() + 2 * id;
             const P x = texel_position(f.u, sides[0], extent), y = texel_position(f.v, sides[1], extent);
             const Quad<S> colour = {view[0] + S(atlas.offset), view[1] + S(atlas.offset), view[2] + S(atlas.offset),
                                     S(0)};

@@ -8,7 +8,7 @@ Columns of the first table, dB over the held-out views, against photographs redu
   averaged  drawn at the photographs' size, area average; larger views: the photographs' size enlarged bilinearly
   to avg    `now` against `averaged`
 CPU ms: of one thread, least of some repeats. Of the second: the mean absolute difference between frames that follow
-each other, in 8-bit steps, of all three; and how far the differences are from those of the averaged frames.
+each other, in 8-bit steps, of all three; how far the differences are from those of the averaged frames; and the step at which `now` exceeds `averaged` the most.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ from bitymi_ns.train.views import View, as_float, reduce_image
 
 Draw = Callable[[Camera], Tensor]
 SIZES = ("scene", "size", "before", "now", "averaged", "to avg", "before, ms", "now, ms", "samples", "blended, million")
-FLICKER = ("scene", "to size", "before", "now", "averaged", "before, off", "now, off")
+FLICKER = ("scene", "to size", "before", "now", "averaged", "before, off", "now, off", "worst step", "averaged there")
+MEASURED = FLICKER[2:7]
 FRAMES = 60
 
 
@@ -138,7 +139,7 @@ def flicker(bundle: Bundle, farthest: float, folder: Path | None) -> list[str]:
     assert points is not None
     z = (points[:, :3] @ start.viewmat[:3, :3].T + start.viewmat[:3, 3])[:, 2]
     depth = float(z[z > 0].median())
-    steps: dict[str, list[float]] = {name: [] for name in FLICKER[2:]}
+    steps: dict[str, list[float]] = {name: [] for name in MEASURED}
     last: list[Tensor] | None = None
     for frame in range(FRAMES):
         viewmat = start.viewmat.clone()
@@ -154,12 +155,14 @@ def flicker(bundle: Bundle, farthest: float, folder: Path | None) -> list[str]:
             change = [255 * (now - then) for now, then in zip(frames, last, strict=True)]
             values = [float(c.abs().mean()) for c in change]
             values += [float((c - change[2]).abs().mean()) for c in change[:2]]
-            for name, value in zip(FLICKER[2:], values, strict=True):
+            for name, value in zip(MEASURED, values, strict=True):
                 steps[name].append(value)
         last = frames
-    line = [bundle.name, number(size, 2), *(number(fmean(steps[name]), 2) for name in FLICKER[2:])]
+    line = [bundle.name, number(size, 2), *(number(fmean(steps[name]), 2) for name in MEASURED)]
+    # where a change of the samples would show: the largest step of the path beside the averaged frames' own there
+    jump, there = max(zip(steps["now"], steps["averaged"], strict=True), key=lambda pair: pair[0] - pair[1])
+    line += [number(jump, 2), number(there, 2)]
     say(" ".join(line))
-    say("largest of `now, off`: " + number(max(steps["now, off"]), 2))
     return line
 
 

@@ -8,7 +8,8 @@ Columns of the first table, dB over the held-out views, against photographs redu
   averaged  drawn at the photographs' size, area average; larger views: the photographs' size enlarged bilinearly
   to avg    `now` against `averaged`
 CPU ms: of one thread, least of some repeats. Of the second: the mean absolute difference between frames that follow
-each other, in 8-bit steps, of all three; how far the differences are from those of the averaged frames; and the step at which `now` exceeds `averaged` the most.
+each other, in 8-bit steps, of all three; how far the differences are from those of the averaged frames; and the step at
+which `now` exceeds `averaged` the most.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ ROOTS: dict[str, Any] = {
 }
 ELSEWHERE = {
     "--max-num-iterations",
+    "--pipeline.model.train.first-surfels",
     "ns-export ... --compact",
     "ns-export ... --exact",
     "ns-export ... --finetune-steps",

@@ -98,7 +98,9 @@ class TrainingRun:
             "method_name": trainer.config.method_name,
         }
         self._held_back = False  # whether it was said that densification meets its bound
-        for sentence in bounds.short_run(self.training.schedule, len(self.datamanager.train_dataset)):
+        for sentence in bounds.short_run(
+            self.training.schedule, len(self.datamanager.train_dataset), scene.config.texture == "hash"
+        ):
             say(sentence)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time
         if self.curve_steps:

@@ -56,9 +56,7 @@ def new_scene(
             )
     except ValueError as error:
         fail(str(error), error)
-    for sentence in bounds.start(
-        report, train.densify.max_surfels, metadata.get("train_pixels", 0), config.log2_table_size
-    ):
+    for sentence in bounds.start(report, train, metadata.get("train_pixels", 0), config):
         say(sentence)
     if report.random:
         say(f"The capture has no points: training starts from {report.random:,} random ones.")

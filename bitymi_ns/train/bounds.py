@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.domain import default_table_size, table_size_of
 from bitymi_ns.train.init import PointReport
 from bitymi_ns.train.schedules import Schedule
 
 
-def short_run(schedule: Schedule, views: int) -> list[str]:
+def short_run(schedule: Schedule, views: int, field: bool = True) -> list[str]:
     """The rules for short runs that are in force, and whether the run sees all of its photographs.
 
     Args:
         schedule: of the run.
         views: number of training views.
+        field: whether the texture is a field.
     """
     found = []
     if schedule.short_run_gain > 1.0:
@@ -21,7 +23,7 @@ def short_run(schedule: Schedule, views: int) -> list[str]:
         densify, resets = sorted(schedule.densify_steps), len(schedule.reset_steps)
         apart = f", {densify[1] - densify[0]} steps apart" if len(densify) > 1 else ""
         parts.append(f"{_count(len(densify), 'densification')}{apart}, {_count(resets, 'opacity reset')}")
-        if schedule.freeze_every < schedule.config.freeze_every:
+        if field and schedule.freeze_every < schedule.config.freeze_every:
             rare = f"learns on 1 of {schedule.freeze_every} steps once it is frozen"
             parts.append(f"the texture field {rare if schedule.freeze_every > 1 else 'is never frozen'}")
         found.append(f"Rules for runs of fewer than {REFERENCE_STEPS:,} steps: {'; '.join(parts)}.")
@@ -33,23 +35,26 @@ def short_run(schedule: Schedule, views: int) -> list[str]:
     return found
 
 
-def start(points: PointReport, max_surfels: int, image_pixels: int, log2_table_size: int | None) -> list[str]:
+def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
     """Bounds that the first scene meets.
 
     Args:
         points: what became of the sparse points.
-        max_surfels: `densify.max_surfels`.
+        config: training options.
         image_pixels: of all training images together.
-        log2_table_size: `scene.log2_table_size`; None = by the photographs.
+        scene: the representation.
     """
     found = []
     if points.over_cap:
+        most, first = config.densify.max_surfels, config.first_surfels
+        by_steps = first is not None and (most <= 0 or first < most)
+        option, most = ("first-surfels", first) if by_steps else ("densify.max-surfels", most)
         found.append(
-            f"{points.over_cap:,} of {points.given:,} points of the capture are left out: densify.max_surfels is "
-            f"{max_surfels:,}."
+            f"Training starts from {most:,} surfels: {points.over_cap:,} of {points.given:,} points of the capture are "
+            f"left out by lot (--pipeline.model.train.{option})."
         )
     size = default_table_size(image_pixels)
-    if log2_table_size is None and table_size_of(image_pixels) > size:
+    if scene.texture == "hash" and scene.log2_table_size is None and table_size_of(image_pixels) > size:
         found.append(
             f"The texture field gets 2^{size} entries per level, the most that is chosen by itself; the photographs "
             f"could fill 2^{table_size_of(image_pixels)} (--pipeline.model.scene.log2-table-size)."

@@ -7,6 +7,8 @@ from typing import Literal
 
 REFERENCE_STEPS = 30_000
 """The run length for which every step count below is given."""
+FIRST_SURFELS_PER_STEP = 40
+"""`first_surfels` where it is not given."""
 ExposureKind = Literal["auto", "off", "gain", "affine"]
 """Colour corrections of the photographs."""
 
@@ -199,6 +201,9 @@ class TrainConfig:
     """How many times the image size is halved at the start."""
     init_opacity: float = 0.1
     """Opacity of the first surfels."""
+    first_surfels: int | None = None
+    """Most surfels that training starts with; more points are thinned by lot. Not given: 40 for each step of the run,
+    because every one costs time in every step, and short runs cannot place more."""
     random_points: int = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
     exposure: ExposureKind = "off"

@@ -72,7 +72,8 @@ def surfels_from_points(
     A point gives one surfel: scale = root mean square distance to its 3 nearest neighbours, the disc faces the nearest
     camera with a random turn in its plane, the colour is the point's from every direction. Points that are not finite
     and repeated positions are dropped and counted. With no usable point, `config.random_points` surfels are placed at
-    random in `box`. `config.densify.max_surfels` holds from the start: more points than that are thinned at random.
+    random in `box`. `config.densify.max_surfels` and `config.first_surfels` hold from the start: more points than that
+    are thinned at random.
 
     Args:
         xyz: [M, 3] world positions; M may be 0.
@@ -87,6 +88,8 @@ def surfels_from_points(
     """
     if not 0.0 < config.init_opacity < 1.0:
         raise ValueError(f"the training option init_opacity must lie between 0 and 1, not {config.init_opacity}")
+    if config.first_surfels is not None and config.first_surfels < 1:
+        raise ValueError(f"the training option first_surfels must be at least 1, not {config.first_surfels}")
     generator = torch.Generator().manual_seed(config.seed)
     centers = camera_centers.detach().reshape(-1, 3).float().cpu()
     centers = centers[centers.isfinite().all(-1)]
@@ -98,7 +101,7 @@ def surfels_from_points(
     if len(xyz) == 0:
         xyz, rgb = _random_points(config.random_points, centers, box, generator)
         report.random = len(xyz)
-    cap = config.densify.max_surfels
+    cap = min((most for most in (config.densify.max_surfels, config.first_surfels or 0) if most > 0), default=0)
     if 0 < cap < len(xyz):
         report.over_cap = len(xyz) - cap
         keep = torch.randperm(len(xyz), generator=generator)[:cap].sort().values

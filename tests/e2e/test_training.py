@@ -13,6 +13,7 @@ import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
+from bitymi_ns.host import config as host_config
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.errors import InputError
@@ -29,6 +30,18 @@ def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTra
     assert {"seconds", "cpu_seconds", "surfels", "fragments", "psnr"} <= points[-1].keys()
     assert points[-1]["seconds"] > points[0]["seconds"] > 0
     assert points[-1]["psnr"] > 8
+
+
+def test_a_run_starts_with_as_many_surfels_as_its_steps_can_place(
+    room: Path, start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host_config, "FIRST_SURFELS_PER_STEP", 2)
+    config = start()
+    config.max_num_iterations = 5
+    ns_train.main(config)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "starts from 10 surfels: 190 of 200 points" in said and "train.first-surfels" in said
+    assert config.pipeline.model.train.first_surfels == 10
 
 
 def test_the_number_of_surfels_changes_in_the_run(trained: BitymiTrainerConfig) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train import bounds
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.init import PointReport
@@ -12,7 +13,7 @@ from bitymi_ns.train.schedules import Schedule
 
 def test_a_full_run_meets_no_bound() -> None:
     assert bounds.short_run(Schedule(TrainConfig(), 30_000), views=300) == []
-    assert bounds.start(PointReport(given=100), 0, 44 * 270 * 480, None) == []
+    assert bounds.start(PointReport(given=100), TrainConfig(), 44 * 270 * 480, SceneConfig()) == []
 
 
 def test_a_short_run_says_which_rules_are_in_force() -> None:
@@ -30,13 +31,23 @@ def test_a_run_that_does_not_see_every_photograph_says_so() -> None:
 
 @pytest.mark.parametrize(("table", "said"), [(None, True), (19, False)])
 def test_a_table_smaller_than_the_photographs_could_fill_is_announced(table, said) -> None:
-    sentences = bounds.start(PointReport(given=9), 0, 10**12, table)
+    sentences = bounds.start(PointReport(given=9), TrainConfig(), 10**12, SceneConfig(log2_table_size=table))
     assert [("log2-table-size" in s and "2^35" in s) for s in sentences] == [True] * said
 
 
 def test_points_that_do_not_fit_are_announced() -> None:
-    (sentence,) = bounds.start(PointReport(given=12_000, over_cap=2_000), 10_000, 0, None)
-    assert sentence.startswith("2,000 of 12,000 points") and "densify.max_surfels is 10,000" in sentence
+    config, points = TrainConfig(densify=DensifyConfig(max_surfels=10_000)), PointReport(given=12_000, over_cap=2_000)
+    for first, option in ((None, "densify.max-surfels"), (20_000, "densify.max-surfels"), (9_000, "first-surfels")):
+        config.first_surfels = first
+        (sentence,) = bounds.start(points, config, 0, SceneConfig())
+        assert f"from {min(10_000, first or 10_000):,} surfels: 2,000 of 12,000 points" in sentence
+        assert f"train.{option})" in sentence
+
+
+def test_nothing_is_said_of_a_field_where_there_is_none() -> None:
+    (sentence,) = bounds.short_run(Schedule(TrainConfig(), 1200), views=43, field=False)
+    assert "field" not in sentence
+    assert bounds.start(PointReport(given=9), TrainConfig(), 10**12, SceneConfig(texture="texels")) == []
 
 
 def test_a_bound_that_densification_meets_is_named() -> None:

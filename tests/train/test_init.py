@@ -109,6 +109,14 @@ def test_point_at_a_camera_and_far_outliers():
 def test_the_cap_holds_from_the_start(cloud):
     surfels, report = start(*cloud, config=TrainConfig(densify=DensifyConfig(max_surfels=37)))
     assert len(surfels["means"]) == 37 and report.over_cap == 163
+    for first, most in ((20, 20), (60, 37), (None, 37)):
+        config = TrainConfig(densify=DensifyConfig(max_surfels=37), first_surfels=first)
+        assert len(start(*cloud, config=config)[0]["means"]) == most
+    thinned, _ = start(*cloud, config=TrainConfig(first_surfels=50))
+    whole, _ = start(*cloud, config=TrainConfig(first_surfels=1000))
+    assert len(whole["means"]) == 200 and thinned["log_scales"].mean() > whole["log_scales"].mean() + 0.3
+    with pytest.raises(ValueError, match="first_surfels must be at least 1"):
+        start(*cloud, config=TrainConfig(first_surfels=0))
 
 
 def test_extent():

@@ -28,7 +28,7 @@ from bitymi_ns.host.pipeline import BitymiPipelineConfig
 from bitymi_ns.host.preset import Preset, load_preset
 from bitymi_ns.host.trainer import BitymiTrainer
 from bitymi_ns.host.viewer import LOOPBACK, adopt_viewer
-from bitymi_ns.train.config import FIRST_SURFELS_PER_STEP, AdamConfig
+from bitymi_ns.train.config import AdamConfig
 
 SEEDS = 1 << 32
 """End of the range of seeds that numpy takes."""
@@ -120,9 +120,7 @@ class BitymiTrainerConfig(TrainerConfig):
             self.max_num_iterations = trained_for or default
         if self.max_num_iterations < 1:
             fail(f"--max-num-iterations must be at least 1, not {self.max_num_iterations}")
-        train = self.pipeline.model.train
-        if train.first_surfels is None:
-            train.first_surfels = FIRST_SURFELS_PER_STEP * self.max_num_iterations
+        self.pipeline.model.steps = self.max_num_iterations
         if self.steps_per_save is None:
             self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
 

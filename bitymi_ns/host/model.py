@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from torch import Tensor
 from torch.nn import Parameter
@@ -41,6 +42,8 @@ class BitymiModelConfig(SurfelModelConfig):
     """What the scene is made of."""
     train: TrainConfig = field(default_factory=TrainConfig)
     """How it is trained."""
+    steps: tyro.conf.Suppress[int | None] = None
+    """Length of the run, where one is going to be made."""
     curve_points: int = 20
     """Evaluations over a run, for the curve of quality against time (training_curve.jsonl); 0 = none."""
     curve_views: int = 8
@@ -71,7 +74,9 @@ class BitymiModel(SurfelModel):
         self.metadata: dict[str, Any] = self.kwargs.get("metadata") or {}
         self.train_config = train_config_for(self.config.train, self.metadata.get("alpha_color"))
         points = self.kwargs.pop("seed_points", None)
-        self.scene = new_scene(points, self.scene_box, self.config.scene, self.train_config, self.metadata)
+        self.scene = new_scene(
+            points, self.scene_box, self.config.scene, self.train_config, self.metadata, self.config.steps
+        )
         self.metadata["first_surfels"] = len(self.scene)  # a checkpoint that is loaded may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
@@ -150,7 +155,7 @@ class BitymiModel(SurfelModel):
     def get_extra_state(self) -> dict[str, Any]:
         """Tensors, numbers and text only, so that torch loads it in its safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
-        state["near"] = self.scene.near
+        state["near"], state["first_surfels"] = self.scene.near, self.metadata["first_surfels"]
         if self._run is not None:
             state["trained_for"] = self._run.total
             state["run"] = self._run.state()
@@ -161,6 +166,7 @@ class BitymiModel(SurfelModel):
     def set_extra_state(self, state: Any) -> None:
         self.trained_for = state.get("trained_for")
         self.resume_state = state.get("run", {})
+        self.metadata["first_surfels"] = state.get("first_surfels", self.metadata["first_surfels"])
         if self.config.scene.near is None:
             self.scene.near = state.get("near", 0.2)  # older checkpoints: what all scenes had
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import bounds
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene
+from bitymi_ns.train.init import first_surfels_for
 
 FEW_POINTS = 50
 """Number of points below which much of a scene may have none near it."""
@@ -26,6 +28,7 @@ def new_scene(
     config: SceneConfig,
     train: TrainConfig,
     metadata: dict[str, Any],
+    steps: int | None = None,
 ) -> Scene:
     """Surfels at the capture's points, or at random in its box, and an empty texture field around them.
 
@@ -35,7 +38,11 @@ def new_scene(
         config: the representation.
         train: training options.
         metadata: what the data manager says about the capture.
+        steps: length of the run that is going to be made.
     """
+    centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
+    if train.first_surfels is None and steps is not None and len(centers):
+        train = replace(train, first_surfels=first_surfels_for(steps, pixels / len(centers)))
     xyz, rgb = _points(points)
     declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
@@ -46,17 +53,17 @@ def new_scene(
             scene, report = build_scene(
                 xyz,
                 rgb,
-                metadata.get("camera_centers", torch.zeros(0, 3)),
+                centers,
                 config,
                 train,
                 bounded=metadata.get("has_alpha", False),
-                image_pixels=metadata.get("train_pixels", 0),
+                image_pixels=pixels,
                 box=box,
                 declared=declared,
             )
     except ValueError as error:
         fail(str(error), error)
-    for sentence in bounds.start(report, train, metadata.get("train_pixels", 0), config):
+    for sentence in bounds.start(report, train, pixels, config):
         say(sentence)
     if report.random:
         say(f"The capture has no points: training starts from {report.random:,} random ones.")

@@ -7,8 +7,6 @@ from typing import Literal
 
 REFERENCE_STEPS = 30_000
 """The run length for which every step count below is given."""
-FIRST_SURFELS_PER_STEP = 40
-"""`first_surfels` where it is not given."""
 ExposureKind = Literal["auto", "off", "gain", "affine"]
 """Colour corrections of the photographs."""
 
@@ -202,8 +200,9 @@ class TrainConfig:
     init_opacity: float = 0.1
     """Opacity of the first surfels."""
     first_surfels: int | None = None
-    """Most surfels that training starts with; more points are thinned by lot. Not given: 40 for each step of the run,
-    because every one costs time in every step, and short runs cannot place more."""
+    """Most surfels that training starts with; more points are thinned by lot. Not given: in ns-train one for every
+    1,000 pixels that the run looks at, because a surfel costs time in every step, and short runs on small pictures
+    cannot place more; else all points."""
     random_points: int = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
     exposure: ExposureKind = "off"

@@ -19,6 +19,10 @@ BETA_RAW = 2.0
 """Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
 MAX_SCALE = 0.25
 """Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
+LOOKS_PER_SURFEL = 1000
+"""Pixels that a run looks at for each of its first surfels, at least."""
+FEWEST_FIRST = 5000
+"""Points that are never thinned, however short the run."""
 MIN_SCALE = 1e-6
 """Smallest first scale, as a share of the scene extent."""
 
@@ -33,6 +37,16 @@ class PointReport:
     over_cap: int = 0
     random: int = 0
     """Surfels placed at random because no point was usable."""
+
+
+def first_surfels_for(steps: int, pixels: float) -> int:
+    """The most surfels that a run starts with, where `TrainConfig.first_surfels` is not given.
+
+    Args:
+        steps: length of the run.
+        pixels: of a training view at full size.
+    """
+    return max(FEWEST_FIRST, int(steps * pixels / LOOKS_PER_SURFEL))
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:

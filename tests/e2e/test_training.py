@@ -13,10 +13,10 @@ import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.host import config as host_config
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.errors import InputError
+from bitymi_ns.train import init
 from tests.e2e.runs import Start, checkpoint
 
 
@@ -35,13 +35,18 @@ def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTra
 def test_a_run_starts_with_as_many_surfels_as_its_steps_can_place(
     room: Path, start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(host_config, "FIRST_SURFELS_PER_STEP", 2)
+    monkeypatch.setattr(init, "FEWEST_FIRST", 10)
     config = start()
     config.max_num_iterations = 5
     ns_train.main(config)
     said = " ".join(capsys.readouterr().out.split())
     assert "starts from 10 surfels: 190 of 200 points" in said and "train.first-surfels" in said
-    assert config.pipeline.model.train.first_surfels == 10
+    resumed = start(name="resumed")
+    resumed.max_num_iterations, resumed.load_dir = 8, config.get_checkpoint_dir()
+    ns_train.main(resumed)  # which densification may double as before, however many points there are
+    assert [
+        checkpoint(*of)["pipeline"]["_model._extra_state"]["first_surfels"] for of in ((config, 4), (resumed, 7))
+    ] == [10, 10]
 
 
 def test_the_number_of_surfels_changes_in_the_run(trained: BitymiTrainerConfig) -> None:

@@ -11,7 +11,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.init import neighbour_distance, scene_extent, surfels_from_points
+from bitymi_ns.train.init import first_surfels_for, neighbour_distance, scene_extent, surfels_from_points
 from bitymi_ns.train.rotations import facing, tangents
 
 CENTERS = torch.tensor([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 1.0]])
@@ -117,6 +117,10 @@ def test_the_cap_holds_from_the_start(cloud):
     assert len(whole["means"]) == 200 and thinned["log_scales"].mean() > whole["log_scales"].mean() + 0.3
     with pytest.raises(ValueError, match="first_surfels must be at least 1"):
         start(*cloud, config=TrainConfig(first_surfels=0))
+
+
+def test_points_that_a_run_can_place():
+    assert first_surfels_for(900, 244 * 135) == 29_646 and first_surfels_for(60, 48 * 36) == 5_000
 
 
 def test_extent():

@@ -75,7 +75,13 @@ def new_scene(capture: Capture, preset: Preset) -> Scene:
     pixels = sum(view.camera.width * view.camera.height for view in capture.train)
     bounded = capture.train[0].image.shape[-1] == 4
     scene, _ = build_scene(
-        capture.points, capture.colours, centers, preset.scene, preset.train, bounded, image_pixels=pixels
+        capture.points,
+        capture.colours,
+        centers,
+        preset.scene.settled("cuda"),
+        preset.train,
+        bounded,
+        image_pixels=pixels,
     )
     return scene
 

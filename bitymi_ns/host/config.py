@@ -135,10 +135,9 @@ class BitymiTrainerConfig(TrainerConfig):
 
     def _settle_texture(self) -> None:
         """Choose by the device what is left to it."""
-        scene, cpu = self.pipeline.model.scene, self.machine.device_type == "cpu"
-        if scene.texture == "auto":
-            scene.texture = "texels" if cpu else "hash"
-        if scene.texture == "texels" and not cpu:
+        model, device = self.pipeline.model, self.machine.device_type
+        model.scene = model.scene.settled(device)
+        if model.scene.texture == "texels" and device != "cpu":
             fail(
                 "texels learn on the CPU alone: leave --pipeline.model.scene.texture at auto, which takes the field on "
                 "a GPU, or add --machine.device-type cpu"

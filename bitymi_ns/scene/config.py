@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from bitymi_ns.ops.view_kinds import Kind
@@ -49,6 +49,12 @@ class SceneConfig:
     on a GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
+
+    def settled(self, device_type: str) -> SceneConfig:
+        """With a texture that is trained on such a device in the place of `auto`."""
+        if self.texture != "auto":
+            return self
+        return replace(self, texture="texels" if device_type == "cpu" else "hash")
 
     @property
     def residual_moves_surfels(self) -> bool:

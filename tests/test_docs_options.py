@@ -29,7 +29,7 @@ ELSEWHERE = {
     "ns-export ... --photographs",
     "ns-export ... --interchange",
     "ns-export ... --polish-steps",
-    "ns-export ... --surfel-error",
+    "ns-export ... --compact-error",
     "ns-export ... --target-mb",
 }
 """Options that are declared with the commands, which need nerfstudio."""

@@ -1,81 +1,233 @@
-"""From a bake to what a compact bundle keeps of it: rounded surfels in the order of a Morton curve."""
+"""From a bake to what a compact bundle keeps of it: one price of a bit decides how precise everything is."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.bake.codes import Codes
+from bitymi_ns.bake.looks import set_aside
 from bitymi_ns.bake.methods import Tiles
 from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.pages import listed_texels, moved_texels
+from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked
-from bitymi_ns.bake.precision import MOST_SHARE, PrecisionOptions, choose_precision
+from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.statistics import Rounding
-from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, residual_codes
+from bitymi_ns.bake.surfel_codes import code_surfels
+from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
+from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, coverage
+from bitymi_ns.bake.worthwhile_color import color_choices
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View
+
+START = 8.0 / 255**2
+"""Price that is looked at first: squared error that a bit is worth, colours from 0 to 1."""
+TEXEL_SHARE = 0.5
+"""Of the error that a bit is worth elsewhere, what it is worth in texels, which are tuned after it."""
+LEAST_ERROR = 1e-7
+"""Mean square error that is always allowed, of colours from 0 to 1: 70 dB."""
+_SEARCH = 7
+_FAST = 9
 
 
 @dataclass(frozen=True)
 class Compact:
-    """How a bake is made compact.
+    """How small and how exact a compact bundle is.
 
     Attributes:
-        precision: of the surfels.
-        coding: of the texels.
-        left: bytes that texels may take, once the surfels are rounded; None = as many as they need.
+        share: how much it may add to the mean square error of the pictures against the training photographs, as a share
+            of it, before the texels are tuned.
+        most_bytes: as small as it takes for surfels and texels to be no more than this; None = `share` decides.
+        psnr: as small as it may be for the training photographs to be shown at so many dB, before the texels are tuned;
+            None = `share` decides.
+        views: training views that are drawn, spread over all.
+        held_in_every: as in `tune.TuneOptions`: views that are set aside do not weigh texels.
     """
 
-    precision: PrecisionOptions = field(default_factory=PrecisionOptions)
-    coding: TexelCodeOptions = field(default_factory=TexelCodeOptions)
-    left: Callable[[Codes], int | None] = lambda codes: None
+    share: float = 0.06
+    most_bytes: int | None = None
+    psnr: float | None = None
+    views: int = 8
+    held_in_every: int = 8
 
-    def coding_of(self, baked: Baked) -> TexelCodeOptions:
-        """How the texels of a bake with rounded surfels are coded."""
-        if baked.codes is None or baked.texels is None:
-            return self.coding
-        return replace(self.coding, most_bytes=self.left(baked.codes))
+    def check(self) -> None:
+        """Refuses values that make no sense."""
+        if not 0 < self.share < 1 or self.views < 1:
+            raise ValueError(f"the share of the error must lie between 0 and 1, not at {self.share}")
+        if self.most_bytes is not None and self.psnr is not None:
+            raise ValueError("bytes and PSNR cannot be asked for together")
 
 
-@torch.no_grad()
-def with_rounded_surfels(
+@dataclass(frozen=True)
+class Priced:
+    """What a price gives.
+
+    Attributes:
+        baked: with the surfels that are kept, and their codes; its texels are as they were.
+        coding: of the texels.
+        bytes: of surfels and texels, about.
+        error: mean square error against the training photographs.
+        psnr: of them, dB.
+    """
+
+    baked: Baked
+    coding: TexelCodeOptions
+    bytes: int
+    error: float
+    psnr: float
+
+
+class Coder:
+    """Everything that is measured once."""
+
+    def __init__(
+        self,
+        baked: Baked,
+        views: Sequence[View],
+        background: Tensor,
+        options: Compact,
+        progress: Progress = no_progress,
+    ) -> None:
+        """
+        Args:
+            baked: with lean view colours, on the CPU.
+            views: training views; without any the reference steps are taken.
+            background: [3] colour behind the scene.
+            options: see `Compact`.
+            progress: called on the way.
+        """
+        options.check()
+        self._baked, self._pictures = baked, Pictures(views, background, options.views)
+        scene = baked.unquantised()
+        self._sizes = torch.from_numpy(baked.packing.tiles[:, 3:]).long()
+        drawn = self._pictures.of(scene)
+        self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
+        rows = set_aside(len(views), options.held_in_every)[1] if len(views) >= FEWEST_VIEWS else range(len(views))
+        learned = [views[row] for row in rows]
+        self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(learned)
+        cameras = [view.camera.to("cpu") for view in learned]
+        self._colors = color_choices(scene, cameras, progress)
+        reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
+        self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
+        self._texels = self._weights = None
+        if baked.texels is not None:
+            texels = TexelScene(baked, background)
+            self._texels = texels.texels
+            traced = TexelViews(texels, learned, MemoryBudget(0))
+            self._weights = coverage(texels, traced, progress, squared=True)[:, 0]
+
+    @property
+    def measured(self) -> bool:
+        """Whether there are views to measure with."""
+        return self._pictures.views > 0
+
+    @torch.no_grad()
+    def at(self, price: float) -> Priced:
+        """What is kept where a bit is worth `price`: squared error, colours from 0 to 1, summed over the pixels and
+        channels of all views."""
+        baked = self._baked
+        surfels = dict(baked.scene.surfels)
+        if self.measured:
+            surfels |= self._colors.at(price)
+        steps = self._noise.steps(price / self._numbers if self.measured else 0.0)
+        codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
+        packing = pack(codes.sizes, baked.options.page_width, baked.options.page_rows)
+        residual = baked.mean_residual[order]
+        texels = pages = None
+        if self._texels is not None:
+            moved = _rows_of(self._sizes, order)
+            texels, weights = self._texels[moved], self._weights[moved]
+            pages = paged_texels(texels, packing)
+        kept = Codes(
+            codes, None, residual_codes(residual), RESIDUAL_STEP, baked.options.page_width, baked.options.page_rows
+        )
+        rounded = replace(baked, rows=baked.rows[order], codes=kept).with_surfels(codes.surfels())
+        rounded = rounded.with_tiles(Tiles(packing, pages, codes.extent(baked.options.extent), residual))
+        coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * price / PER_BIT))))
+        size, shown = kept.surfels.nbytes(), rounded
+        if texels is not None:
+            coded = TexelCoder(self._sizes[order], weights, coding).code(texels)
+            size, shown = size + coded.nbytes(_FAST), _with_texels(rounded, coded)
+        pictures = self._pictures.of(shown.unquantised())
+        return Priced(rounded, coding, size, self._pictures.square(pictures), self._pictures.psnr(pictures))
+
+
+def compacted(
     baked: Baked,
     views: Sequence[View],
     background: Tensor,
-    options: PrecisionOptions | None = None,
+    options: Compact | None = None,
     progress: Progress = no_progress,
-) -> Baked:
-    """A bake whose surfels have the values that a compact bundle keeps, in its order. Texels are as they are and are to
-    be coded by `tune.tune_atlas` or `with_coded_texels`.
+) -> tuple[Baked, TexelCodeOptions]:
+    """A bake whose surfels have the values that a compact bundle keeps, in its order, and how its texels are to be
+    coded: by `tune.tune_atlas` or `with_coded_texels`.
 
     Args:
         baked: with lean view colours, on the CPU.
-        views: training views.
+        views: training views; without any the reference steps are taken.
         background: [3] colour behind the scene.
-        options: see `PrecisionOptions`.
+        options: see `Compact`.
         progress: called on the way.
+
+    Raises:
+        ValueError: an option is out of range, or what is asked for cannot be had.
     """
-    sizes = torch.from_numpy(baked.packing.tiles[:, 3:]).long()
-    options = options or PrecisionOptions()
-    while True:
-        codes, order, error = choose_precision(baked.unquantised(), sizes, views, background, options, progress)
-        if options.most_bytes is None or options.share >= MOST_SHARE or codes.nbytes() <= options.most_bytes:
-            break
-        options = replace(options, share=min(MOST_SHARE, 2 * options.share))
-    packing = pack(codes.sizes, baked.options.page_width, baked.options.page_rows)
-    texels = baked.texels
-    if texels is not None:
-        texels = moved_texels(texels, torch.from_numpy(baked.packing.tiles)[order], packing)
-    residual = baked.mean_residual[order]
-    pages = (baked.options.page_width, baked.options.page_rows)
-    kept = Codes(codes, None, residual_codes(residual), RESIDUAL_STEP, *pages)
-    statistics = baked.statistics.but(rounding=Rounding(mse=error, steps=dict(codes.steps)), error=None)
-    rounded = replace(baked, rows=baked.rows[order], codes=kept, statistics=statistics).with_surfels(codes.surfels())
-    return rounded.with_tiles(Tiles(packing, texels, codes.extent(baked.options.extent), residual))
+    options = options or Compact()
+    coder = Coder(baked, views, background, options, progress)
+    if options.most_bytes is not None:
+        found = _search(coder, lambda priced: priced.bytes > 0.97 * options.most_bytes, progress, upper=True)
+        if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:
+            raise ValueError(
+                f"{options.most_bytes:,} bytes are too few for {len(baked.rows):,} surfels, which take "
+                f"{found.baked.codes.surfels.nbytes():,}: ask for more, or train with fewer surfels"
+            )
+    elif not coder.measured:
+        found = coder.at(START)
+    elif options.psnr is not None:
+        if coder.psnr < options.psnr:
+            raise ValueError(
+                f"the bake shows the training photographs at {coder.psnr:.2f} dB, so {options.psnr:g} dB cannot be "
+                "had: ask for less, or train for longer"
+            )
+        found = _search(coder, lambda priced: priced.psnr >= options.psnr, progress)
+    else:
+        allowed = coder.error + max(LEAST_ERROR, options.share * coder.error)
+        found = _search(coder, lambda priced: priced.error <= allowed, progress)
+    rounded, coding = found.baked, found.coding
+    assert rounded.codes is not None
+    if options.most_bytes is not None:
+        coding = replace(coding, most_bytes=options.most_bytes - rounded.codes.surfels.nbytes())
+    mse = found.error - coder.error if coder.measured else None
+    rounding = Rounding(mse=mse if mse is None else max(0.0, mse), steps=dict(rounded.codes.surfels.steps))
+    return replace(rounded, statistics=rounded.statistics.but(rounding=rounding, error=None)), coding
+
+
+LEAST_TEXEL_BYTES = 1000
+
+
+def _search(coder: Coder, more: Callable[[Priced], bool], progress: Progress, upper: bool = False) -> Priced:
+    """The largest price of which `more` holds, or with `upper` the smallest of which it does not, within a tenth."""
+    low, high, found = None, None, {}
+    price = START
+    for step in range(_SEARCH):
+        found[price] = coder.at(price)
+        progress("choosing the precision", step + 1, _SEARCH)
+        if more(found[price]):
+            low = price
+        else:
+            high = price
+        if low is None or high is None:
+            price = price * 8 if high is None else price / 8
+        else:
+            price = math.sqrt(low * high)
+    progress("choosing the precision", _SEARCH, _SEARCH)
+    best = high if upper else low
+    return found[best if best is not None else (max(found) if upper else min(found))]
 
 
 def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> Baked:
@@ -88,3 +240,15 @@ def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> 
     coder = TexelCoder(torch.from_numpy(baked.packing.tiles[:, 3:]), torch.ones(len(texels)), options)
     coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
     return baked.with_texel_codes(coded)
+
+
+def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
+    """The bake as it is drawn with coded texels."""
+    return replace(baked, texels=paged_texels(coded.texels(), baked.packing)).with_mean_residual(coded.constants)
+
+
+def _rows_of(sizes: Tensor, order: Tensor) -> Tensor:
+    """Rows of the list of texels of tiles [N, 2], tile after tile in another order [N]."""
+    area = sizes.clamp(min=1).prod(dim=1)
+    first, count = (area.cumsum(0) - area)[order], area[order]
+    return (first - (count.cumsum(0) - count)).repeat_interleave(count) + torch.arange(int(count.sum()))

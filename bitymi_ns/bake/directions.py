@@ -28,12 +28,14 @@ class Directions:
         unit: [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first.
         valid: [n, D] bool; the rest of a row is filling.
         views: how many of the D places are for views.
+        view: [n, views] int64, which view each of these places is for.
     """
 
     rows: Tensor
     unit: Tensor
     valid: Tensor
     views: int
+    view: Tensor
 
 
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
@@ -52,7 +54,8 @@ def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Di
     unseen = int((count == 0).sum())
     for rows in order[:unseen].split(_CHUNK // SPHERE):
         unit = fibonacci_sphere(SPHERE).to(means).expand(len(rows), -1, -1)
-        yield Directions(rows, unit, torch.ones(unit.shape[:2], dtype=torch.bool, device=means.device), 0)
+        valid = torch.ones(unit.shape[:2], dtype=torch.bool, device=means.device)
+        yield Directions(rows, unit, valid, 0, rows.new_zeros(len(rows), 0))
     g = torch.Generator().manual_seed(0)
     lot = torch.rand(BETWEEN, 3, generator=g).to(means)
     share = -torch.rand(BETWEEN, 3, generator=g).clamp(min=1e-6).log()  # normalised: even over the triangle
@@ -71,4 +74,4 @@ def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Di
         between = F.normalize((corners * share[..., None]).sum(2), dim=2)
         there = torch.ones(len(rows), BETWEEN, dtype=torch.bool, device=means.device)
         valid = torch.cat([by_view.gather(1, index), there], dim=1)
-        yield Directions(rows, torch.cat([unit, between], dim=1), valid, most)
+        yield Directions(rows, torch.cat([unit, between], dim=1), valid, most, index)

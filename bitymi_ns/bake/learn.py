@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from bitymi_ns.bake.compact import Compact, with_coded_texels, with_rounded_surfels
+from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
@@ -66,6 +66,8 @@ def bake_and_learn(
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
     polish, tune = learning.polish, learning.tune
+    if learning.compact is not None:  # its texels are decoded to 8 bits: nothing has to be encoded to state their error
+        options = replace(options, format="uint8")
     has_learned = isinstance(scene.field, TexelField)
     if has_learned:
         baked = learned(scene, options)
@@ -77,8 +79,7 @@ def bake_and_learn(
         baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
     coding = None
     if learning.compact is not None:
-        baked = with_rounded_surfels(baked, photographs, background, learning.compact.precision, progress)
-        coding = learning.compact.coding_of(baked)
+        baked, coding = compacted(baked, photographs, background, learning.compact, progress)
     if tune is not None and baked.texels is not None:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
     if baked.codes is not None and baked.codes.texels is None:

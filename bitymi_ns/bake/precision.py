@@ -1,4 +1,4 @@
-"""How precisely the numbers of surfels are kept: as the picture needs it, measured by drawing it."""
+"""How precisely the numbers of surfels are kept: what an error of each costs in the pictures, measured by drawing."""
 
 from __future__ import annotations
 
@@ -13,103 +13,109 @@ from torch import Tensor
 from bitymi_ns.bake.surfel_codes import PARAMETERS, REFERENCE, SurfelCodes, code_surfels, reordered, term_numbers
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View
 
-LEAST_ERROR = 1e-7
-"""Mean square error that is always allowed, of colours from 0 to 1: 70 dB."""
-MOST_SHARE = 0.1
-"""Of the error that rounding makes so that surfels fit into a number of bytes."""
 WIDEST, NARROWEST = 4.0, 1.0 / 64
 """Steps are chosen between these, in reference steps; beyond, errors are not proportional to them."""
+PER_BIT = 2.0 * math.log(2.0)
+"""An error that is proportional to the square of a step falls by this share of it for each bit that is spent."""
 
 
-@dataclass
-class PrecisionOptions:
-    """How precise surfels are kept."""
+class Pictures:
+    """Some of the training views, as what they look like is compared with the photographs.
 
-    share: float = 0.006
-    """How much their rounding may add to the mean square error of the pictures against the photographs, as a share of
-    it: 0.006 are 0.026 dB before the texels are tuned."""
-    views: int = 8
-    """Training views that are drawn, spread over all."""
-    rounds: int = 3
-    """How often the steps are corrected by the error of all of them together."""
+    Attributes:
+        views: how many there are.
+        numbers: of all their pixels that count, three each.
+    """
 
-    most_bytes: int | None = None
-    """Surfels take no more than this, less their residuals: the share grows until they fit, up to `MOST_SHARE`. None =
-    it stays."""
+    def __init__(self, views: Sequence[View], background: Tensor, most: int) -> None:
+        """
+        Args:
+            views: training views, of which `most` are taken, spread over all.
+            background: [3] colour behind the scene.
+            most: how many.
+        """
+        chosen = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
+        self._background = background.cpu()
+        self._targets = [view.target(self._background, "cpu") for view in chosen]
+        self._masks = [None if view.mask is None else view.mask.cpu() for view in chosen]
+        self._cameras = [view.camera.to("cpu") for view in chosen]
+        self._shown = [view.shown for view in chosen]
+        self.views = len(chosen)
+        counts = (t.numel() if m is None else 3 * int(m.sum()) for t, m in zip(self._targets, self._masks, strict=True))
+        self.numbers = sum(counts)
 
-    def check(self) -> None:
-        """Refuses values that make no sense."""
-        if not 0 < self.share < 1 or self.views < 1 or self.rounds < 1:
-            raise ValueError("share must lie between 0 and 1, views and rounds must be at least 1")
+    def of(self, scene: BakedScene) -> list[Tensor]:
+        """[H, W, 3] each, as the photographs show them."""
+        drawn = (scene.render(camera, self._background) for camera in self._cameras)
+        return [
+            shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for shown, d in zip(self._shown, drawn, strict=True)
+        ]
+
+    def square(self, pictures: Sequence[Tensor], than: Sequence[Tensor] | None = None) -> float:
+        """Mean square difference from other pictures; None = from the photographs."""
+        pairs = zip(pictures, self._targets if than is None else than, self._masks, strict=True)
+        squares = [_square(*pair) for pair in pairs]
+        return sum(squares) / max(1, len(squares))
+
+    def psnr(self, pictures: Sequence[Tensor]) -> float:
+        """Mean dB of the views of which any pixel counts, against the photographs."""
+        pairs = zip(pictures, self._targets, self._masks, strict=True)
+        found = [psnr(a, b, m) for a, b, m in pairs if m is None or bool(m.any())]
+        return sum(found) / max(1, len(found))
+
+
+@dataclass(frozen=True)
+class ColumnNoise:
+    """What rounding does to the pictures, by column of `REFERENCE`.
+
+    Attributes:
+        noise: mean square error of the pictures by the square of the step; 0 = it is not seen.
+        counts: numbers of the column.
+    """
+
+    noise: Mapping[str, float]
+    counts: Mapping[str, int]
+
+    def steps(self, price: float) -> dict[str, float]:
+        """Steps at which a further bit for each number of a column saves as much error as it is worth.
+
+        A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number.
+
+        Args:
+            price: mean square error of the pictures that a bit is worth; 0 = not known: the reference steps.
+        """
+        if price == 0:
+            return dict(REFERENCE)
+        return {name: _step(name, price * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
 
 
 @torch.no_grad()
-def choose_precision(
-    scene: BakedScene,
-    sizes: npt.ArrayLike,
-    views: Sequence[View],
-    background: Tensor,
-    options: PrecisionOptions | None = None,
-    progress: Progress = no_progress,
-) -> tuple[SurfelCodes, Tensor, float]:
-    """Codes of the surfels with the fewest bits whose rounding changes the pictures by no more than the options say.
-
-    A column whose step is s adds D s^2 to the mean square error of the pictures, and halving s takes a bit per number.
-    So the error is spread over the columns in proportion to their numbers. D is measured for each by drawing the
-    training views with that column rounded alone.
+def column_noise(
+    scene: BakedScene, sizes: npt.ArrayLike, pictures: Pictures, progress: Progress = no_progress
+) -> ColumnNoise:
+    """Draws the views with each column rounded alone, at its reference step.
 
     Args:
         scene: with lean view colours, on the CPU, of N surfels.
         sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
-        views: training views; without any the reference steps are taken.
-        background: [3] colour behind the scene.
-        options: see `PrecisionOptions`.
+        pictures: the views.
         progress: called after every column.
-
-    Returns:
-        the codes, the row that each surfel was [N] int64, and the mean square error that the rounding makes.
     """
-    options = options or PrecisionOptions()
-    options.check()
     assert scene.extent is not None
-    every = max(1, math.ceil(len(views) / options.views))
-    chosen = [views[i] for i in range(0, len(views), every)]
-    targets = [view.target(background.cpu(), "cpu") for view in chosen]
-    masks = [None if view.mask is None else view.mask.cpu() for view in chosen]
-    drawn = [scene.render(view.camera.to("cpu"), background.cpu()).rgb for view in chosen]
-
-    def error(other: BakedScene, than: Sequence[Tensor]) -> float:
-        pictures = (other.render(view.camera.to("cpu"), background.cpu()).rgb for view in chosen)
-        return _mean([_square(picture, each, mask) for picture, each, mask in zip(pictures, than, masks, strict=True)])
-
-    def coded(steps: Mapping[str, float]) -> tuple[SurfelCodes, Tensor]:
-        return code_surfels(scene.surfels, scene.view_color, sizes, scene.extent, steps)
-
-    codes, order = coded(REFERENCE)
-    if not chosen:
-        return codes, order, math.nan
-    from_photographs = _mean([_square(*each) for each in zip(drawn, targets, masks, strict=True)])
-    allowed = max(LEAST_ERROR, options.share * from_photographs)
-    plain = _permuted(scene, order)
-    noise, numbers = {}, {}
+    codes, order = code_surfels(scene.surfels, scene.view_color, sizes, scene.extent, REFERENCE)
+    plain, drawn = permuted(scene, order), pictures.of(scene)
+    noise, counts = {}, {}
     for done, name in enumerate(REFERENCE):
         column = codes.codes[name]
-        numbers[name] = len(column) * (3 if name == "place" else column.shape[1])
-        noise[name] = error(_with_column(plain, codes, name), drawn) / codes.steps[name] ** 2 if len(column) else 0.0
-        progress("rounding the surfels", done + 1, len(REFERENCE) + options.rounds)
-    spread = allowed / max(1, sum(count for name, count in numbers.items() if noise[name] > 0))
-    found = math.nan
-    for step in range(options.rounds):
-        steps = {name: _step(name, spread * numbers[name], noise[name]) for name in REFERENCE}
-        codes, order = coded(steps)
-        found = error(rounded_scene(_permuted(scene, order), codes), drawn)
-        progress("rounding the surfels", len(REFERENCE) + step + 1, len(REFERENCE) + options.rounds)
-        if 0.8 * allowed <= found <= allowed or found == 0:
-            break
-        spread *= min(8.0, max(1 / 8, 0.9 * allowed / found))
-    return codes, order, found
+        counts[name] = len(column) * (3 if name == "place" else column.shape[1])
+        rounded = _with_column(plain, codes, name)
+        error = pictures.square(pictures.of(rounded), drawn) if len(column) and pictures.views else 0.0
+        noise[name] = error / codes.steps[name] ** 2
+        progress("rounding the surfels", done + 1, len(REFERENCE))
+    return ColumnNoise(noise, counts)
 
 
 def rounded_scene(scene: BakedScene, codes: SurfelCodes) -> BakedScene:
@@ -120,7 +126,8 @@ def rounded_scene(scene: BakedScene, codes: SurfelCodes) -> BakedScene:
     return replace(scene, surfels=codes.surfels(), extent=extent)
 
 
-def _permuted(scene: BakedScene, order: Tensor) -> BakedScene:
+def permuted(scene: BakedScene, order: Tensor) -> BakedScene:
+    """The scene with its surfels in another order [N]."""
     moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual")}
     moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
     return replace(scene, surfels=reordered(scene.surfels, order), **moved)
@@ -152,7 +159,3 @@ def _square(rgb: Tensor, target: Tensor, mask: Tensor | None) -> float:
     if mask is None:
         return float(difference.mean())
     return float(difference[mask.reshape(mask.shape[:2])].mean()) if bool(mask.any()) else 0.0
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)

@@ -17,7 +17,7 @@ from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.quantise import Range, decode_pages
 from bitymi_ns.bake.streams import StreamError
 from bitymi_ns.bake.texel_codes import constants, pages
-from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns.bundle import archive, compact, ktx2, ply
 from bitymi_ns.bundle.manifest import (
     ATLAS,
     COMPACT_SURFELS,
@@ -36,7 +36,8 @@ from bitymi_ns.scene.baked import BakedScene
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """What to do about a damaged bundle."""
-_MANIFEST_LIMIT = 64 << 20
+MANIFEST_LIMIT = 64 << 20
+"""Bytes that a bundle.json may have."""
 _HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
 _CHUNK = 1 << 22
 
@@ -61,7 +62,7 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
     """Loads a bundle.
 
     Args:
-        folder: the bundle's folder.
+        folder: the bundle's folder, or its one file (`single.write_single`).
         verify: compare every file with its sha256 (sizes are always compared).
         decode: also decode a BC7 atlas, four bytes per texel; a CUDA device draws from the blocks alone.
 
@@ -81,16 +82,20 @@ def verify_bundle(folder: str | Path) -> Manifest:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """bundle.json of a bundle, checked as far as it can be without the other files.
+    """bundle.json of a bundle, a folder or one file, checked as far as it can be without the other files.
 
     Raises:
         BundleError: it is missing, malformed or altered, or a value is out of range.
     """
     path = folder / MANIFEST
+    if folder.is_file():
+        with archive.opened(folder, str(folder)) as parts:
+            data = parts.part(MANIFEST, MANIFEST_LIMIT)
+        return parse(data, str(path))
     if not path.is_file():
         raise BundleError(f"{folder} is not a bundle: it has no {MANIFEST}")
     try:
-        if path.stat().st_size > _MANIFEST_LIMIT:
+        if path.stat().st_size > MANIFEST_LIMIT:
             raise BundleError(f"{path} is too large for a bundle.json")
         return parse(path.read_bytes(), str(path))
     except OSError as error:
@@ -101,7 +106,7 @@ def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> b
     """The bytes of a file that bundle.json lists: all of those with surfels and texels, none of others.
 
     Args:
-        folder: the bundle's folder.
+        folder: the bundle's folder, or its one file.
         info: bundle.json.
         name: one of `info.files`.
         verify: compare the file with its sha256, while it is read.
@@ -112,6 +117,11 @@ def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> b
     """
     path = folder / name
     check = _CHECKS.get(name)
+    if folder.is_file():
+        with archive.opened(folder, str(folder)) as parts:
+            data = parts.part(name, info.files[name].bytes)
+        check_bytes(path, info, name, data, verify)
+        return bytearray(data if check is not None else b"")
     try:
         return _read(path, info.files[name], verify, None if check is None else lambda *head: check(info, *head))
     except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
@@ -174,7 +184,7 @@ def assemble(
         near=info.render.near,
         weight_bound=info.render.weight_bound,
         prefilter=info.render.prefilter,
-        photographed=None if info.render.photographed is None else points_of(info.render.photographed),
+        photographed=_photographed(info),
     )
     if info.atlas is None:
         return Bundle(scene, info)
@@ -214,10 +224,16 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
         near=info.render.near,
         weight_bound=info.render.weight_bound,
         prefilter=info.render.prefilter,
+        photographed=_photographed(info),
     )
     if atlas is not None:
         scene.offset, scene.scale = atlas.offset, atlas.scale
     return Bundle(scene, info)
+
+
+def _photographed(info: Manifest) -> Tensor | None:
+    points = info.render.photographed
+    return None if points is None else points_of(points)
 
 
 def _rounded(pages: np.ndarray, value_range: Range) -> Tensor:

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+from bitymi_ns.bundle.archive import opened
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, parse
-from bitymi_ns.bundle.read import Bundle, assemble, check_bytes, enough_memory, read_manifest
+from bitymi_ns.bundle.read import MANIFEST_LIMIT, Bundle, assemble, check_bytes, enough_memory, read_manifest
 from bitymi_ns.files import write_file
 
 _ORDER = (MANIFEST, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 _DATE = (1980, 1, 1, 0, 0, 0)
-_MANIFEST_LIMIT = 64 << 20
 
 
 def write_single(folder: str | Path, path: str | Path) -> None:
@@ -50,22 +50,19 @@ def read_single(file: BinaryIO, textured: bool = True, verify: bool = True, sour
     Raises:
         BundleError: the file is damaged, or what is in it.
     """
-    try:
-        with zipfile.ZipFile(file) as archive:
-            info = parse(_part(archive, MANIFEST, _MANIFEST_LIMIT, source), f"{source}: {MANIFEST}")
-            if not textured and info.surfels.file != COMPACT_SURFELS:
-                raise BundleError(f"{source}: only a compact bundle can be opened without its texels")
-            wanted = {info.surfels.file} | ({info.atlas.file} if info.atlas is not None and textured else set())
-            where = Path(source)
-            with enough_memory(where, info):
-                files = {}
-                for name in sorted(wanted):
-                    data = _part(archive, name, info.files[name].bytes, source)
-                    check_bytes(where / name, info, name, data, verify)
-                    files[name] = bytearray(data)
-                return assemble(where, info, files, textured=textured)
-    except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError) as error:
-        raise BundleError(f"{source} is not a bundle in one file: {error}") from error
+    where = Path(source)
+    with opened(file, source) as archive:
+        info = parse(archive.part(MANIFEST, MANIFEST_LIMIT), f"{source}: {MANIFEST}")
+        if not textured and info.surfels.file != COMPACT_SURFELS:
+            raise BundleError(f"{source}: only a compact bundle can be opened without its texels")
+        wanted = {info.surfels.file} | ({info.atlas.file} if info.atlas is not None and textured else set())
+        with enough_memory(where, info):
+            files = {}
+            for name in sorted(wanted):
+                data = archive.part(name, info.files[name].bytes)
+                check_bytes(where / name, info, name, data, verify)
+                files[name] = bytearray(data)
+            return assemble(where, info, files, textured=textured)
 
 
 class Ranges(io.RawIOBase):
@@ -99,13 +96,3 @@ class Ranges(io.RawIOBase):
         data = self._fetch(self._at, count) if count else b""
         self._at += len(data)
         return data
-
-
-def _part(archive: zipfile.ZipFile, name: str, most: int, source: str) -> bytes:
-    try:
-        entry = archive.getinfo(name)
-    except KeyError as error:
-        raise BundleError(f"{source} has no {name}") from error
-    if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > most or entry.compress_size != entry.file_size:
-        raise BundleError(f"{source}: {name} is not stored as it is, or is larger than stated")
-    return archive.read(entry)

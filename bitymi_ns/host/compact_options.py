@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bitymi_ns.bake.codes import Codes
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.precision import PrecisionOptions
-from bitymi_ns.bake.texel_codes import TexelCodeOptions
-from bitymi_ns.bundle.compact import pack_surfels
 from bitymi_ns.host.errors import fail
 
-SURFEL_SHARE = 0.45
-"""Of the bytes that were asked for, that surfels may take."""
 MANIFEST_BYTES = 20_000
 """Of bundle.json and config.yml, at most about."""
-LEAST_TEXEL_BYTES = 1000
 
 
 @dataclass(kw_only=True)
@@ -23,18 +16,19 @@ class CompactOptions:
     """What a compact bundle is like."""
 
     compact: bool = False
-    """Write a compact bundle (version 3): surfels rounded as far as the pictures allow, texels by cosine transform.
-    `format` and `bc7_profile` then decide nothing."""
+    """Write a compact bundle (version 3): surfels and view colours as far as the pictures need them, texels by cosine
+    transform. `format` and `bc7_profile` then decide nothing."""
     interchange: bool = False
     """Write surfels.ply into a compact bundle, too, for other programs."""
-    surfel_error: float = PrecisionOptions.share
-    """How much the rounding of the surfels of a compact bundle may add to the mean square error against the training
-    photographs, as a share of it, before the texels are tuned."""
-    texel_step: float = TexelCodeOptions.step
-    """How coarse the texels of a compact bundle are: the step of a coefficient, in 8-bit steps, of texels that make up
-    one pixel of the training views each."""
+    compact_error: float = Compact.share
+    """How much making it compact may add to the mean square error against the training photographs, as a share of it,
+    before the texels are tuned. The bytes go where they save most of it: to surfels, view colours or texels."""
     target_mb: float | None = None
-    """Bytes of a compact bundle, in MB (10^6): surfels and texels become as coarse as it takes."""
+    """Bytes of a compact bundle, in MB (10^6), in the place of compact_error: everything becomes as coarse as it
+    takes."""
+    target_psnr: float | None = None
+    """PSNR in dB against the training photographs, before the texels are tuned, in the place of compact_error:
+    everything becomes as coarse as it may. Held-out views are shown less well than these."""
 
     def check_compact(self, tolerance: float) -> None:
         """Stops where an option is out of its range, or does not fit the tolerance of the bake."""
@@ -44,11 +38,12 @@ class CompactOptions:
             fail("--interchange adds surfels.ply to a compact bundle; another one has it (--compact)")
         if self.target_mb is not None and (not self.compact or not 0.01 <= self.target_mb <= 1e5):
             fail(f"--target-mb is for a compact bundle (--compact) and from 0.01 to 100,000 MB, not {self.target_mb}")
-        try:
-            self._precision().check()
-            TexelCodeOptions(step=self.texel_step).check()
-        except ValueError as error:
-            fail(f"the bundle cannot be made compact: {error} (--surfel-error, --texel-step)", error)
+        if self.target_psnr is not None and (not self.compact or not 1 <= self.target_psnr <= 100):
+            fail(f"--target-psnr is for a compact bundle (--compact) and from 1 to 100 dB, not {self.target_psnr}")
+        if self.target_mb is not None and self.target_psnr is not None:
+            fail("--target-mb and --target-psnr cannot be asked for together: leave one out")
+        if not 0 < self.compact_error < 1:
+            fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
 
     def compact_of(self, beside: int) -> Compact | None:
         """How the bake is made compact; None = it is not.
@@ -58,23 +53,12 @@ class CompactOptions:
         """
         if not self.compact:
             return None
-
-        def left(codes: Codes) -> int | None:
-            """Bytes of the target that are left for the texels."""
-            if self.target_mb is None:
-                return None
-            _, surfels = pack_surfels(codes.surfels, codes.residual, codes.residual_step)
-            bytes_left = int(1e6 * self.target_mb) - len(surfels) - beside - MANIFEST_BYTES
-            if bytes_left < LEAST_TEXEL_BYTES:
+        most = None
+        if self.target_mb is not None:
+            most = int(1e6 * self.target_mb) - beside - MANIFEST_BYTES
+            if most < 1:
                 fail(
-                    f"a bundle of {self.target_mb} MB leaves no bytes for the texels, as the surfels take "
-                    f"{len(surfels):,} and other files {beside + MANIFEST_BYTES:,}: ask for more (--target-mb), or "
-                    "train with fewer surfels"
+                    f"a bundle of {self.target_mb} MB leaves no bytes for the scene, as other files take "
+                    f"{beside + MANIFEST_BYTES:,}: ask for more (--target-mb)"
                 )
-            return bytes_left
-
-        return Compact(self._precision(), TexelCodeOptions(step=self.texel_step), left)
-
-    def _precision(self) -> PrecisionOptions:
-        most = None if self.target_mb is None else int(SURFEL_SHARE * 1e6 * self.target_mb)
-        return PrecisionOptions(share=self.surfel_error, most_bytes=most)
+        return Compact(self.compact_error, most, self.target_psnr)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from bitymi_ns.bake import Baked, TuneOptions, tune_atlas
-from bitymi_ns.bake.compact import Compact, with_coded_texels, with_rounded_surfels
-from bitymi_ns.bake.precision import PrecisionOptions
+from bitymi_ns.bake.compact import Coder, Compact, compacted, with_coded_texels
 from bitymi_ns.bake.texel_codes import TexelCodeOptions
 from bitymi_ns.bundle import check_files, export
 from bitymi_ns.train.views import View
@@ -34,7 +32,7 @@ def views(truth: Baked) -> list[View]:
 @pytest.fixture(scope="module")
 def rounded(truth: Baked, views: list[View]) -> Baked:
     """The same with rounded surfels."""
-    return with_rounded_surfels(truth, views, BACKGROUND, PrecisionOptions(share=0.05))
+    return compacted(truth, views, BACKGROUND, Compact(share=0.05))[0]
 
 
 def error(a: Baked, b: Baked, views: list[View]) -> float:
@@ -43,24 +41,51 @@ def error(a: Baked, b: Baked, views: list[View]) -> float:
     return sum(float((x.clamp(0, 1) - y.clamp(0, 1)).square().mean()) for x, y in pictures) / len(pictures)
 
 
-def test_rounding_changes_the_pictures_by_what_it_may(truth: Baked, rounded: Baked, views: list[View]) -> None:
-    stated, allowed = rounded.statistics.rounding.mse, 0.05 * 1e-4
-    assert stated <= allowed * 1.05 and error(truth, rounded, views) < 2 * allowed
-    assert sorted(rounded.rows.tolist()) == sorted(truth.rows.tolist())
-    finer = with_rounded_surfels(truth, views, BACKGROUND, PrecisionOptions(share=0.005))
-    assert finer.statistics.rounding.mse < stated and finer.codes.surfels.nbytes() > rounded.codes.surfels.nbytes()
+def from_photographs(baked: Baked, views: list[View]) -> float:
+    """Mean square difference of its pictures from the photographs."""
+    pictures = [(render(baked, view.camera).clamp(0, 1), view.image) for view in views]
+    return sum(float((x - y).square().mean()) for x, y in pictures) / len(pictures)
 
 
-def test_surfels_fit_into_the_bytes_there_are(truth: Baked, rounded: Baked, views: list[View]) -> None:
-    most = rounded.codes.surfels.nbytes() * 9 // 10
-    fitted = with_rounded_surfels(truth, views, BACKGROUND, PrecisionOptions(share=0.05, most_bytes=most))
-    assert fitted.codes.surfels.nbytes() < rounded.codes.surfels.nbytes()
+def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(truth: Baked, views: list[View]) -> None:
+    sizes = []
+    for share in (0.02, 0.4):
+        rounded, coding = compacted(truth, views, BACKGROUND, Compact(share=share, views=len(views)))
+        allowed = share * from_photographs(truth, views)
+        assert 0 < rounded.statistics.rounding.mse <= 1.001 * allowed
+        assert error(truth, rounded, views) < 4 * allowed
+        assert sorted(rounded.rows.tolist()) == sorted(truth.rows.tolist())
+        sizes.append(rounded.codes.surfels.nbytes() + with_coded_texels(rounded, coding).codes.texels.nbytes())
+    assert sizes[1] < 0.9 * sizes[0]
+
+
+def test_the_pictures_are_as_good_as_is_asked_for(truth: Baked, views: list[View]) -> None:
+    coder = Coder(truth, views, BACKGROUND, Compact())
+    sizes = []
+    for loss in (0.1, 1.0):
+        rounded, _ = compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr - loss))
+        assert rounded.statistics.rounding.mse <= coder.error * (10 ** (loss / 10) - 1) * 1.1
+        sizes.append(rounded.codes.surfels.nbytes())
+    assert sizes[1] < sizes[0]
+    with pytest.raises(ValueError, match="cannot be had: ask for less"):
+        compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr + 1))
+
+
+def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: list[View]) -> None:
+    free, coding = compacted(truth, views, BACKGROUND, Compact(share=0.02))
+    most = (free.codes.surfels.nbytes() + with_coded_texels(free, coding).codes.texels.nbytes()) * 7 // 10
+    fitted, coding = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
+    tuned = tune_atlas(fitted, views, BACKGROUND, TuneOptions(steps=4, coded_steps=10, held_in_every=4), coding=coding)
+    assert fitted.codes.surfels.nbytes() < free.codes.surfels.nbytes()
+    assert most / 2 < tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes() <= most
+    with pytest.raises(ValueError, match="are too few for 60 surfels"):
+        compacted(truth, views, BACKGROUND, Compact(most_bytes=300))
 
 
 def test_without_views_the_reference_steps_are_taken(truth: Baked) -> None:
-    plain = with_rounded_surfels(truth, [], BACKGROUND)
-    assert plain.statistics.rounding.mse is None or math.isnan(plain.statistics.rounding.mse)
-    assert len(plain.rows) == len(truth.rows)
+    plain, _ = compacted(truth, [], BACKGROUND)
+    assert plain.statistics.rounding.mse is None
+    assert len(plain.rows) == len(truth.rows) and len(plain.scene.surfels["view_terms"]) > 0
 
 
 def test_texels_learn_through_their_coding_and_are_what_is_stored(rounded: Baked, views: list[View], tmp_path) -> None:
@@ -90,8 +115,3 @@ def test_texels_fit_into_the_bytes_there_are(rounded: Baked, views: list[View]) 
     options = TuneOptions(steps=4, coded_steps=10, held_in_every=4)
     tuned = tune_atlas(rounded, views, BACKGROUND, options, coding=replace(SHARP, most_bytes=most))
     assert tuned.codes.texels.nbytes() <= most
-
-
-def test_what_is_left_is_asked_of_the_rounded_surfels(rounded: Baked, truth: Baked) -> None:
-    assert Compact(left=lambda codes: len(codes.surfels)).coding_of(rounded).most_bytes == len(rounded.rows)
-    assert Compact(left=lambda codes: 5).coding_of(truth).most_bytes is None

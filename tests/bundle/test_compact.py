@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.quantise import encode
 from bitymi_ns.bake.texel_codes import pages
-from bitymi_ns.bundle import BundleError, check_files, ply, read_bundle
+from bitymi_ns.bundle import BundleError, check_files, ply, read_bundle, write_bundle
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import RANGE, make_codes, scene_of, write_compact
 from tests.bundle.damage import amend, signed
@@ -41,6 +42,14 @@ def test_a_compact_bundle_holds_what_its_codes_stand_for(tmp_path: Path, kind: s
         stored = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
         assert got.atlas.numpy().tobytes() == b"".join(stored.payload)
         torch.testing.assert_close(got.mean_residual, codes.texels.constants)
+
+
+def test_it_says_how_large_the_scene_was_photographed(tmp_path: Path) -> None:
+    codes, points = make_codes(), torch.tensor([[0.0, 1.0, -2.5, 30.0]])
+    packing = pack(codes.surfels.sizes, 4096, 8192)
+    atlas = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
+    write_bundle(tmp_path / "b", replace(scene_of(codes), photographed=points), atlas, codes)
+    assert torch.equal(read_bundle(tmp_path / "b").scene.photographed, points)
 
 
 def test_it_is_much_smaller_than_a_plain_one_and_can_carry_the_ply(tmp_path: Path) -> None:

@@ -51,7 +51,9 @@ def test_it_can_be_as_small_as_is_asked_for(field_run: BitymiTrainerConfig, tmp_
         ({"compact": True, "exact": True}, "needs a tolerance"),
         ({"interchange": True}, "--interchange"),
         ({"target_mb": 1.0}, "--target-mb"),
-        ({"compact": True, "texel_step": 0.0}, "--texel-step"),
+        ({"compact": True, "compact_error": 0.0}, "--compact-error"),
+        ({"target_psnr": 30.0}, "--target-psnr"),
+        ({"compact": True, "target_psnr": 30.0, "target_mb": 1.0}, "together"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(trained: BitymiTrainerConfig, tmp_path: Path, options, said) -> None:

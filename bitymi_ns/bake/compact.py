@@ -49,7 +49,7 @@ class Compact:
         held_in_every: as in `tune.TuneOptions`: views that are set aside do not weigh texels.
     """
 
-    share: float = 0.06
+    share: float = 0.05
     most_bytes: int | None = None
     psnr: float | None = None
     views: int = 8

@@ -145,8 +145,10 @@ class TexelCodes:
         texels = every.repeat_interleave(self.sizes.clamp(min=1).prod(dim=1), dim=0)
         of_tile, steps = every[tiled], _steps(self.step, self.grades)
         for blocks, coefficients in zip(blocks_of(self.sizes), self.coefficients, strict=True):
-            values = _unordered(blocks, coefficients) * steps[blocks.tile, None, None, None]
-            rgb = _inverse(values) + of_tile[blocks.tile, None, None, :]
+            count, texels_of = coefficients.shape[1], len(blocks.order)
+            channels = coefficients.view(texels_of, -1).T.float() @ _waves(blocks)  # [B 3, texels]: one product
+            channels = channels.view(count, 3, -1).transpose(1, 2) * steps[blocks.tile, None, None]
+            rgb = channels @ _OPPONENT + of_tile[blocks.tile, None, :]
             texels[blocks.texels.reshape(-1)] = rgb.reshape(-1, 3)
         return texels
 
@@ -275,9 +277,9 @@ def _ordered(blocks: Blocks, values: Tensor) -> Tensor:
     return values[:, list(rows), list(columns)].transpose(0, 1).to(torch.int32).contiguous()
 
 
-def _unordered(blocks: Blocks, coefficients: Tensor) -> Tensor:
+def _waves(blocks: Blocks) -> Tensor:
+    """[coefficients, texels] what each coefficient adds to a block's texels, in the order in which they are kept."""
     b_u, b_v = blocks.size
-    rows, columns = zip(*blocks.order, strict=True)
-    values = torch.zeros(coefficients.shape[1], b_v, b_u, 3)
-    values[:, list(rows), list(columns)] = coefficients.transpose(0, 1).float()
-    return values
+    v, u = _cosines(b_v), _cosines(b_u)
+    rows, columns = (list(each) for each in zip(*blocks.order, strict=True))
+    return (v[rows][:, :, None] * u[columns][:, None, :]).reshape(len(rows), b_v * b_u)

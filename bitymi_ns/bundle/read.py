@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
+from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.pages import paged_texels
 from bitymi_ns.bake.quantise import Range, decode_pages
 from bitymi_ns.bake.streams import StreamError
-from bitymi_ns.bake.texel_codes import constants, pages
+from bitymi_ns.bake.texel_codes import constants
 from bitymi_ns.bundle import archive, compact, ktx2, ply
 from bitymi_ns.bundle.manifest import (
     ATLAS,
@@ -209,7 +211,7 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
             found = compact.unpack_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]))
             value_range = Range(atlas.offset, atlas.scale, "")
-            texels = _rounded(pages(found, packing).numpy(), value_range)
+            texels = _rounded(found.texels(), packing, value_range)
         elif atlas is None and bool((sizes > 0).any()):
             raise StreamError("a surfel has a tile, and there is no atlas")
     except StreamError as error:
@@ -236,12 +238,17 @@ def _photographed(info: Manifest) -> Tensor | None:
     return None if points is None else points_of(points)
 
 
-def _rounded(pages: np.ndarray, value_range: Range) -> Tensor:
-    """[layers, height, width, 4] uint8 of residual colours [layers, height, width, 3]."""
-    rgba = np.full((*pages.shape[:3], 4), 255, dtype=np.uint8)
-    for page, values in zip(rgba, pages, strict=True):
-        page[..., :3] = value_range.to_unorm8(values)
-    return torch.from_numpy(rgba)
+def _rounded(texels: Tensor, packing: Packing, value_range: Range) -> Tensor:
+    """[layers, height, width, 4] uint8 of a list of residual colours [T, 3]: rounded, then moved, a texel at once."""
+
+    def whole(values: np.ndarray) -> np.ndarray:
+        rgba = np.full((len(values), 4), 255, dtype=np.uint8)
+        rgba[:, :3] = value_range.to_unorm8(values)
+        return rgba.view(np.int32)[:, 0]
+
+    nothing = int(whole(np.zeros((1, 3), dtype=np.float32))[0])
+    listed = torch.from_numpy(whole(texels.numpy()))
+    return paged_texels(listed, packing, nothing)[..., None].view(torch.uint8)
 
 
 @contextmanager

@@ -202,7 +202,7 @@ class Verify:
     """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is given."""
 
     bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle."""
+    """Folder of the bundle, or its one file (bitymi pack)."""
     run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """config.yml, folder or checkpoint of the run: also checks the error against its field, and renders of both."""
     views: int = 4
@@ -231,6 +231,32 @@ class Verify:
         if failed:
             print(REMEDY)
         return 1 if failed else 0
+
+
+@dataclass
+class Pack:
+    """Write a bundle as one file, its parts in the order of their use; verify and the loaders take it as they take the
+    folder."""
+
+    bundle: tyro.conf.Positional[Path]
+    """Folder of the bundle."""
+    output: Path | None = None
+    """File to write; not given: beside the folder, with its name and .bitymi."""
+    overwrite: Flag = False
+    """Replace a file that is there already."""
+
+    def run(self) -> int:
+        from bitymi_ns.bundle.single import SUFFIX, write_single
+        from bitymi_ns.files import size_text
+
+        folder = self.bundle.resolve()
+        output = self.output or folder.with_name(folder.name + SUFFIX)
+        if output.exists() and not self.overwrite:
+            raise ValueError(f"{output} is there already: choose another place (--output), or add --overwrite")
+        with explained(output, ValueError):
+            first, size = write_single(folder, output)
+        print(f"Wrote {output}, {size_text(size)}; the surfels are in its first {size_text(first)}.")
+        return 0
 
 
 @dataclass
@@ -286,6 +312,7 @@ Command = (
     | Annotated[Stability, tyro.conf.subcommand(name="stability")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Verify, tyro.conf.subcommand(name="verify")]
+    | Annotated[Pack, tyro.conf.subcommand(name="pack")]
     | Annotated[View, tyro.conf.subcommand(name="view")]
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,5 +43,7 @@ def opened(file: str | Path | BinaryIO, source: str) -> Iterator[Archive]:
     try:
         with zipfile.ZipFile(file) as archive:
             yield Archive(archive, source)
-    except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError) as error:
+    except BundleError:
+        raise
+    except (zipfile.BadZipFile, OSError, EOFError, RuntimeError, ValueError, struct.error) as error:
         raise BundleError(f"{source} is not a bundle in one file: {error}") from error

@@ -14,28 +14,40 @@ from bitymi_ns.bundle.read import MANIFEST_LIMIT, Bundle, assemble, check_bytes,
 from bitymi_ns.files import write_file
 
 _ORDER = (MANIFEST, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
+SUFFIX = ".bitymi"
+"""Of the name of such a file."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_single(folder: str | Path, path: str | Path) -> None:
+def write_single(folder: str | Path, path: str | Path) -> tuple[int, int]:
     """Writes the files of a bundle that bundle.json vouches for into one, whole or not at all.
 
     Nothing is deflated, sizes stand before the parts, and bundle.json comes first: a reader of the beginning knows
     where everything lies, and any part is one range of the file.
 
+    Returns:
+        bytes from the start to the end of the surfels, and of the file.
+
     Raises:
-        BundleError: the folder is not a bundle, or a file is missing.
+        BundleError: the folder is not a bundle, or a file is missing or altered.
     """
     folder = Path(folder)
-    names = [MANIFEST, *read_manifest(folder).files]
+    info = read_manifest(folder)
+    names, first = [MANIFEST, *info.files], 0
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name in sorted(names, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
             try:
-                archive.writestr(zipfile.ZipInfo(name, _DATE), (folder / name).read_bytes())
+                data = (folder / name).read_bytes()
             except OSError as error:
                 raise BundleError(f"{folder / name} cannot be read: {error}") from error
+            if name != MANIFEST:
+                check_bytes(folder / name, info, name, data)
+            archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+            if name == info.surfels.file:
+                first = buffer.tell()
     write_file(Path(path), buffer.getvalue())
+    return first, len(buffer.getvalue())
 
 
 def read_single(file: BinaryIO, textured: bool = True, verify: bool = True, source: str = "the bundle") -> Bundle:

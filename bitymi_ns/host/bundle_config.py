@@ -24,7 +24,7 @@ def find_bundle(recorded: Path) -> Path:
     """The folder of the bundle whose config.yml is being loaded."""
     candidates = [*_loaded_from(), recorded]
     for folder in candidates:
-        if (folder / MANIFEST).is_file():
+        if (folder / MANIFEST).is_file() or folder.is_file():
             return folder.absolute()
     places = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
     fail(f"no bundle found (looked for {MANIFEST} in {places}). Keep config.yml in the bundle's folder.")

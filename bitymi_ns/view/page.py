@@ -81,6 +81,8 @@ def site_of(bundle: Path) -> Site:
     """
     info = read_manifest(bundle)
     folder = bundle.resolve()
+    if folder.is_file():
+        raise PageError(f"{bundle} is a bundle in one file, which the viewer does not open yet: give it the folder")
     files = dict(page_files())
     for name in (MANIFEST, *info.files):
         path = folder / name

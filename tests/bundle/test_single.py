@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+import random
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, read_bundle
+from bitymi_ns import cli
+from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.single import Ranges, read_single, write_single
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.made import make
@@ -64,6 +66,54 @@ def test_damage_is_refused(single: bytes, name: str) -> None:
         read_single(io.BytesIO(bytes(data)))
     with pytest.raises(BundleError):
         read_single(io.BytesIO(single[:at]))
+
+
+def test_it_is_read_and_checked_by_its_path_as_a_folder_is(single: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "b.bitymi.zip"
+    bundle, checks = check_files(path)
+    assert bundle is not None and all(check.ok for check in checks), checks
+    assert {check.name for check in checks} >= {"bundle.json", "surfels.bin", "texels.bin", "preview.jpg", "contents"}
+    assert torch.equal(read_bundle(path).scene.atlas, bundle.scene.atlas)
+    path.write_bytes(bytes(byte ^ (at == middle_of(single, "preview.jpg")) for at, byte in enumerate(single)))
+    assert [check.name for check in check_files(path)[1] if not check.ok] == ["preview.jpg"]
+    path.write_bytes(b"no bundle")
+    with pytest.raises(BundleError, match="is not a bundle in one file"):
+        read_bundle(path)
+
+
+def test_damage_anywhere_is_refused_or_changes_nothing(single: bytes, tmp_path: Path) -> None:
+    rng, path = random.Random(0), tmp_path / "damaged.bitymi"
+    want = read_single(io.BytesIO(single)).scene
+    start = single.rindex(b"PK\x05\x06")  # the list of parts lies before it
+    places = [*range(60), *range(start - 260, len(single))]
+    for _ in range(300):
+        data = bytearray(single)
+        data[rng.choice(places)] ^= 1 << rng.randrange(8)
+        path.write_bytes(data[: rng.choice((len(data), len(data), len(data) - rng.randrange(300)))])
+        try:
+            found = read_bundle(path).scene
+        except BundleError as error:
+            assert "\n" not in str(error)
+        else:
+            assert torch.equal(found.atlas, want.atlas) and torch.equal(found.surfels["means"], want.surfels["means"])
+
+
+def test_an_altered_file_is_not_packed(single: bytes, tmp_path: Path) -> None:
+    (tmp_path / "b" / "preview.jpg").write_bytes(bytes(99_999) + b"x")
+    with pytest.raises(BundleError, match="preview.jpg is altered"):
+        write_single(tmp_path / "b", tmp_path / "c.bitymi")
+    assert not (tmp_path / "c.bitymi").exists()
+
+
+def test_the_command_packs_and_verifies(single: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["pack", str(tmp_path / "b")]) == 0
+    assert "b.bitymi" in capsys.readouterr().out and (tmp_path / "b.bitymi").read_bytes() == single
+    assert cli.main(["verify", str(tmp_path / "b.bitymi")]) == 0
+    assert cli.main(["pack", str(tmp_path / "b")]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert cli.main(["pack", str(tmp_path / "b"), "--overwrite"]) == 0
+    assert cli.main(["view", str(tmp_path / "b.bitymi"), "--no-open-browser"]) == 1
+    assert "give it the folder" in capsys.readouterr().err
 
 
 def test_deflated_parts_are_refused(single: bytes) -> None:

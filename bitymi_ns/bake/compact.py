@@ -22,6 +22,7 @@ from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCod
 from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, coverage
 from bitymi_ns.bake.worthwhile_color import color_choices
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View
 
@@ -70,6 +71,7 @@ class Priced:
     Attributes:
         baked: with the surfels that are kept, and their codes; its texels are as they were.
         coding: of the texels.
+        shown: the scene as it is drawn then, its texels coded.
         bytes: of surfels and texels, about.
         error: mean square error against the training photographs.
         psnr: of them, dB.
@@ -77,6 +79,7 @@ class Priced:
 
     baked: Baked
     coding: TexelCodeOptions
+    shown: BakedScene
     bytes: int
     error: float
     psnr: float
@@ -153,8 +156,9 @@ class Coder:
         if texels is not None:
             coded = TexelCoder(self._sizes[order], weights, coding).code(texels)
             size, shown = size + coded.nbytes(_FAST), _with_texels(rounded, coded)
-        pictures = self._pictures.of(shown.unquantised())
-        return Priced(rounded, coding, size, self._pictures.square(pictures), self._pictures.psnr(pictures))
+        scene = shown.unquantised()
+        pictures = self._pictures.of(scene)
+        return Priced(rounded, coding, scene, size, self._pictures.square(pictures), self._pictures.psnr(pictures))
 
 
 def compacted(

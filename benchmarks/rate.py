@@ -1,0 +1,123 @@
+#!/usr/bin/env python
+"""What a compact bundle shows for its bytes: held-out PSNR at several prices of a bit, as a table and a plot.
+
+A run is baked, polished and reduced once, as `ns-export bitymi-atlas --compact True` does; `--keep` keeps that in a
+file, from which the command goes on the next time. Then, for every price:
+  price       squared error, in 8-bit steps, summed over pixels, channels and training views, that a bit is worth
+  surfels     bytes of surfels.bin; per surfel
+  texels      bytes of texels.bin
+  MB          of both
+  training    dB of eight training views; held-out: dB of the held-out views; before the texels are tuned
+  tuned       dB of the held-out views after it (--tune)
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")
+
+import torch
+from common import number, page, publish, say, table
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bitymi_ns.bake import Baked, BakeOptions, PolishOptions, TuneOptions, bake, polish_scene, reduced, tune_atlas
+from bitymi_ns.bake.compact import Coder, Compact
+from bitymi_ns.host.cameras import to_camera
+from bitymi_ns.host.export import STEPS_AFTER_POLISH, load_trained
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.train.exposure import corrected
+from bitymi_ns.train.losses import psnr
+from bitymi_ns.train.views import View
+
+COLUMNS = ("price", "surfels", "per surfel", "terms", "texels", "MB", "training", "held-out", "tuned")
+
+
+def polished(load_config: Path, steps: int) -> dict[str, Any]:
+    """The reduced bake of a run, its training views, its held-out views, and the background."""
+    _, pipeline = load_trained(load_config)
+    model, data = pipeline.model, pipeline.datamanager
+    cameras = data.undistorted_train_cameras()
+    views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
+    photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
+    background, options = model.background.cpu(), PolishOptions(steps=steps)
+    baked = bake(model.scene, views, BakeOptions(format="uint8"), None, options.pixels_per_texel)
+    baked = reduced(polish_scene(baked, photographs, background, options, model.train_config), views)
+    return {"baked": baked, "views": photographs, "held": list(data.eval_views), "background": background}
+
+
+def held_out(scene: BakedScene, views: list[View], background: torch.Tensor) -> float:
+    """Mean dB."""
+    drawn = (scene.render(view.camera.to("cpu"), background=background).rgb.clamp(0.0, 1.0) for view in views)
+    pairs = zip(drawn, views, strict=True)
+    return fmean(psnr(rgb, v.target(background, "cpu"), None if v.mask is None else v.mask.cpu()) for rgb, v in pairs)
+
+
+def plot(points: list[tuple[float, float]], name: str, path: Path) -> None:
+    """Held-out PSNR against bytes."""
+    figure = Figure(figsize=(5.5, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(*zip(*sorted(points), strict=True), marker="o")
+    axes.set(xscale="log", xlabel="surfels and texels, MB", ylabel="held-out PSNR, dB", title=name)
+    axes.grid(True, which="both", alpha=0.3)
+    ticks = sorted({round(megabytes, 2) for megabytes, _ in points})
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    FigureCanvasAgg(figure).print_figure(str(path), dpi=120)
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--load-config", type=Path, help="config.yml of a run")
+    parser.add_argument("--keep", type=Path, help="file of the polished bake; read where it is there, else written")
+    parser.add_argument("--prices", nargs="+", type=float, default=[2.0, 6.0, 18.0, 54.0], help="(%(default)s)")
+    parser.add_argument("--polish-steps", type=int, default=PolishOptions.steps, help="(%(default)s)")
+    parser.add_argument("--tune", action="store_true", help="tune the texels, too; a minute for each price")
+    parser.add_argument("--plot", type=Path, default=Path("rate.png"), help="picture to write (%(default)s)")
+    parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
+    options = parser.parse_args()
+    if options.keep is not None and options.keep.is_file():
+        found = torch.load(options.keep, weights_only=False)
+    elif options.load_config is not None:
+        found = polished(options.load_config, options.polish_steps)
+        if options.keep is not None:
+            torch.save(found, options.keep)
+    else:
+        parser.error("give the config.yml of a run (--load-config), or the file of an earlier one (--keep)")
+    baked: Baked = found["baked"]
+    views, held, background = found["views"], found["held"], found["background"]
+    say(f"{len(baked.rows):,} surfels, {baked.packing.texels:,} texels")
+    whole = held_out(baked.unquantised(), held, background)
+    coder, rows, points = Coder(baked, views, background, Compact()), [], []
+    for price in options.prices:
+        priced = coder.at(price / 255**2)
+        surfels = priced.baked.codes.surfels
+        shown, tuned = held_out(priced.shown, held, background), None
+        if options.tune:
+            steps = TuneOptions(steps=STEPS_AFTER_POLISH)
+            tuned = held_out(
+                tune_atlas(priced.baked, views, background, steps, coding=priced.coding).stored(), held, background
+            )
+        size, terms = surfels.nbytes(), len(surfels.codes["term_color"])
+        row = [number(price), f"{size:,}", number(size / len(surfels), 1), f"{terms:,}", f"{priced.bytes - size:,}"]
+        row += [number(priced.bytes / 1e6, 2), number(priced.psnr, 2), number(shown, 2)]
+        rows.append([*row, "" if tuned is None else number(tuned, 2)])
+        points.append((priced.bytes / 1e6, shown if tuned is None else tuned))
+        say(" ".join(rows[-1]))
+    name = options.load_config.parent.name if options.load_config is not None else options.keep.stem
+    plot(points, f"{name}: {whole:.2f} dB before it is made compact", options.plot)
+    publish(page(f"Rate of {name}, {whole:.2f} dB before", table(COLUMNS, rows)), options.output)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """What a compact bundle shows for its bytes: held-out PSNR at several prices of a bit, as a table and a plot.
 
-A run is baked, polished and reduced once, as `ns-export bitymi-atlas --compact True` does; `--keep` keeps that in a
-file, from which the command goes on the next time. Then, for every price:
+A run is baked, polished where its texels have not learned in training, and reduced once, as `ns-export bitymi-atlas
+--compact True` does; `--keep` keeps that in a file, from which the command goes on the next time. For every price:
   price       squared error, in 8-bit steps, summed over pixels, channels and training views, that a bit is worth
   surfels     bytes of surfels.bin; per surfel
   texels      bytes of texels.bin
@@ -29,9 +29,11 @@ from matplotlib.figure import Figure
 
 from bitymi_ns.bake import Baked, BakeOptions, PolishOptions, TuneOptions, bake, polish_scene, reduced, tune_atlas
 from bitymi_ns.bake.compact import Coder, Compact
+from bitymi_ns.bake.learned import learned
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.export import STEPS_AFTER_POLISH, load_trained
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View
@@ -47,8 +49,12 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
     views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
     background, options = model.background.cpu(), PolishOptions(steps=steps)
-    baked = bake(model.scene, views, BakeOptions(format="uint8"), None, options.pixels_per_texel)
-    baked = reduced(polish_scene(baked, photographs, background, options, model.train_config), views)
+    if isinstance(model.scene.field, TexelField):
+        baked = learned(model.scene, BakeOptions())
+    else:
+        baked = bake(model.scene, views, BakeOptions(), None, options.pixels_per_texel)
+        baked = polish_scene(baked, photographs, background, options, model.train_config)
+    baked = reduced(baked, views)
     return {"baked": baked, "views": photographs, "held": list(data.eval_views), "background": background}
 
 

@@ -16,7 +16,7 @@ from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.statistics import Rounding
+from bitymi_ns.bake.statistics import Rounding, ViewColorError
 from bitymi_ns.bake.surfel_codes import code_surfels
 from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, coverage
@@ -208,7 +208,8 @@ def compacted(
         coding = replace(coding, most_bytes=options.most_bytes - rounded.codes.surfels.nbytes())
     mse = found.error - coder.error if coder.measured else None
     rounding = Rounding(mse=mse if mse is None else max(0.0, mse), steps=dict(rounded.codes.surfels.steps))
-    return replace(rounded, statistics=rounded.statistics.but(rounding=rounding, error=None)), coding
+    statistics = rounded.statistics.but(rounding=rounding, error=None, view_color=_thinned(rounded))
+    return replace(rounded, statistics=statistics), coding
 
 
 LEAST_TEXEL_BYTES = 1000
@@ -244,6 +245,19 @@ def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> 
     coder = TexelCoder(torch.from_numpy(baked.packing.tiles[:, 3:]), torch.ones(len(texels)), options)
     coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
     return baked.with_texel_codes(coded)
+
+
+def _thinned(baked: Baked) -> ViewColorError | None:
+    """What is stated of the view colours, with the terms that are left; its error stays that of their reduction."""
+    stated, surfels = baked.statistics.view_color, baked.scene.surfels
+    if stated is None:
+        return None
+    terms = surfels["view_terms"]
+    return stated.but(
+        sites=stated.sites.but(after=len(baked.rows) + len(terms)),
+        one_color=int((surfels["view_span"][:, 1] == 0).sum()),
+        bytes=stated.bytes and stated.bytes.but(after=4 * (4 * len(baked.rows) + terms.numel())),
+    )
 
 
 def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:

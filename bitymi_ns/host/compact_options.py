@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.host.errors import fail
 
-MANIFEST_BYTES = 20_000
+MANIFEST_BYTES = 28_000
 """Of bundle.json and config.yml, at most about."""
 
 

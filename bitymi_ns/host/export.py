@@ -148,7 +148,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         shown = preview(model, datamanager, views, "JPEG" if self.compact else "PNG")
-        learning = self._learning(model, len(views), self.compact_of(len(shown)))
+        cameras_of = camera_files(datamanager, views, self.photographs)
+        learning = self._learning(model, len(views), self.compact_of(len(shown) + sum(map(len, cameras_of.values()))))
         polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
@@ -182,7 +183,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             statistics={"options": asdict(options), "method": config.method_name},
             extra_files={
                 "preview.jpg" if self.compact else "preview.png": shown,
-                **camera_files(datamanager, views, self.photographs),
+                **cameras_of,
             },
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,

@@ -28,6 +28,9 @@ from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2
 """Price that is looked at first: squared error that a bit is worth, colours from 0 to 1."""
+MOST_PRICE = 13.0 / 255**2
+"""The price is no larger where a share of the error decides: much of a large error is what no texel mends, such as of
+exposure, and does not hide that of rounding; and texels learn little behind steps above the 7.5 of 255 that this is."""
 TEXEL_SHARE = 0.5
 """Of the error that a bit is worth elsewhere, what it is worth in texels, which are tuned after it."""
 LEAST_ERROR = 1e-7
@@ -42,7 +45,7 @@ class Compact:
 
     Attributes:
         share: how much it may add to the mean square error of the pictures against the training photographs, as a share
-            of it, before the texels are tuned.
+            of it, before the texels are tuned; less where the price would be above `MOST_PRICE`.
         most_bytes: as small as it takes for surfels and texels to be no more than this; None = `share` decides.
         psnr: as small as it may be for the training photographs to be shown at so many dB, before the texels are tuned;
             None = `share` decides.
@@ -201,7 +204,7 @@ def compacted(
         found = _search(coder, lambda priced: priced.psnr >= options.psnr, progress)
     else:
         allowed = coder.error + max(LEAST_ERROR, options.share * coder.error)
-        found = _search(coder, lambda priced: priced.error <= allowed, progress)
+        found = _search(coder, lambda priced: priced.error <= allowed, progress, most=MOST_PRICE)
     rounded, coding = found.baked, found.coding
     assert rounded.codes is not None
     if options.most_bytes is not None:
@@ -215,8 +218,11 @@ def compacted(
 LEAST_TEXEL_BYTES = 1000
 
 
-def _search(coder: Coder, more: Callable[[Priced], bool], progress: Progress, upper: bool = False) -> Priced:
-    """The largest price of which `more` holds, or with `upper` the smallest of which it does not, within a tenth."""
+def _search(
+    coder: Coder, more: Callable[[Priced], bool], progress: Progress, upper: bool = False, most: float = math.inf
+) -> Priced:
+    """The largest price up to `most` of which `more` holds, or with `upper` the smallest of which it does not, within a
+    tenth."""
     low, high, found = None, None, {}
     price = START
     for step in range(_SEARCH):
@@ -226,8 +232,10 @@ def _search(coder: Coder, more: Callable[[Priced], bool], progress: Progress, up
             low = price
         else:
             high = price
+        if low == most:
+            break
         if low is None or high is None:
-            price = price * 8 if high is None else price / 8
+            price = min(most, price * 8) if high is None else price / 8
         else:
             price = math.sqrt(low * high)
     progress("choosing the precision", _SEARCH, _SEARCH)

@@ -22,7 +22,8 @@ class CompactOptions:
     """Write surfels.ply into a compact bundle, too, for other programs."""
     compact_error: float = Compact.share
     """How much making it compact may add to the mean square error against the training photographs, as a share of it,
-    before the texels are tuned. The bytes go where they save most of it: to surfels, view colours or texels."""
+    before the texels are tuned; less where texels would then be too coarse to learn. The bytes go where they save most
+    of it: to surfels, view colours or texels."""
     target_mb: float | None = None
     """Bytes of a compact bundle, in MB (10^6), in the place of compact_error: everything becomes as coarse as it
     takes."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from bitymi_ns.bake import Baked, TuneOptions, tune_atlas
-from bitymi_ns.bake.compact import Coder, Compact, compacted, with_coded_texels
+from bitymi_ns.bake.compact import MOST_PRICE, TEXEL_SHARE, Coder, Compact, compacted, with_coded_texels
+from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bake.texel_codes import TexelCodeOptions
 from bitymi_ns.bundle import check_files, export
 from bitymi_ns.train.views import View
@@ -57,6 +59,15 @@ def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(truth: Baked,
         assert sorted(rounded.rows.tolist()) == sorted(truth.rows.tolist())
         sizes.append(rounded.codes.surfels.nbytes() + with_coded_texels(rounded, coding).codes.texels.nbytes())
     assert sizes[1] < 0.9 * sizes[0]
+
+
+def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Baked, views: list[View]) -> None:
+    dark = [View(view.camera, view.image / 2) for view in views]
+    capped, coding = compacted(truth, dark, BACKGROUND, Compact(share=0.9))
+    assert coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MOST_PRICE / PER_BIT))
+    assert coding.step == pytest.approx(7.5, abs=0.01)
+    asked, wider = compacted(truth, dark, BACKGROUND, Compact(psnr=Coder(truth, dark, BACKGROUND, Compact()).psnr - 2))
+    assert wider.step > coding.step and asked.codes.surfels.nbytes() < capped.codes.surfels.nbytes()
 
 
 def test_the_pictures_are_as_good_as_is_asked_for(truth: Baked, views: list[View]) -> None:

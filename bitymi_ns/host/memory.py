@@ -34,6 +34,8 @@ PER_SURFEL = 3000
 
 PER_TEXEL = 60
 """Bytes in training: the texel, how far it moves, and the two states that a run could go back to."""
+VIEWS_OF_TEXELS = 4
+"""All texels together are about as many as those of so many views: 2.6 to 3.7 were measured."""
 
 
 @torch.no_grad()
@@ -68,7 +70,7 @@ def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int, p
     needed = PROGRAM + kept + PER_PIXEL * pixels + PER_FRAGMENT * fragments
     needed += PER_SURFEL * max(len(scene), most_surfels)
     if pixels_per_texel > 0:
-        needed += PER_TEXEL * fragments / pixels_per_texel
+        needed += PER_TEXEL * VIEWS_OF_TEXELS * fragments / pixels_per_texel
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
     _state("Training", needed, cameras, f"{advice} {max(1, fragments // 4)}")
 

@@ -27,9 +27,8 @@ from common import number, page, publish, say, table
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bitymi_ns.bake import Baked, BakeOptions, PolishOptions, TuneOptions, bake, polish_scene, reduced, tune_atlas
+from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, baked_and_reduced, tune_atlas
 from bitymi_ns.bake.compact import Coder, Compact
-from bitymi_ns.bake.learned import learned
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.export import STEPS_AFTER_POLISH, load_trained
 from bitymi_ns.scene.baked import BakedScene
@@ -48,13 +47,9 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
     cameras = data.undistorted_train_cameras()
     views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
-    background, options = model.background.cpu(), PolishOptions(steps=steps)
-    if isinstance(model.scene.field, TexelField):
-        baked = learned(model.scene, BakeOptions())
-    else:
-        baked = bake(model.scene, views, BakeOptions(), None, options.pixels_per_texel)
-        baked = polish_scene(baked, photographs, background, options, model.train_config)
-    baked = reduced(baked, views)
+    background, has_learned = model.background.cpu(), isinstance(model.scene.field, TexelField)
+    learning = Learning(None if has_learned else PolishOptions(steps=steps), train=model.train_config)
+    baked = baked_and_reduced(model.scene, views, photographs, background, BakeOptions(), learning)
     return {"baked": baked, "views": photographs, "held": list(data.eval_views), "background": background}
 
 

@@ -1,6 +1,6 @@
 """Trained field to texture atlas: resolution, plan, evaluation, reduction, packing, quantisation, fine-tuning."""
 
-from bitymi_ns.bake.learn import Learning, bake_and_learn
+from bitymi_ns.bake.learn import Learning, bake_and_learn, baked_and_reduced
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, bake, reduced
 from bitymi_ns.bake.polish import PolishOptions, polish_scene
@@ -16,6 +16,7 @@ __all__ = [
     "TuneOptions",
     "bake",
     "bake_and_learn",
+    "baked_and_reduced",
     "polish_scene",
     "reduced",
     "rich_progress",

@@ -120,10 +120,10 @@ class Coder:
         self._colors = color_choices(scene, cameras, progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
-        self._texels = self._weights = None
+        self._tiles = self._texels = self._weights = None
         if baked.texels is not None:
             texels = TexelScene(baked, background)
-            self._texels = texels.texels
+            self._tiles, self._texels = texels.tiles, texels.texels
             traced = TexelViews(texels, learned, MemoryBudget(0))
             self._weights = coverage(texels, traced, progress, squared=True)[:, 0]
 
@@ -146,7 +146,7 @@ class Coder:
         residual = baked.mean_residual[order]
         texels = pages = None
         if self._texels is not None:
-            moved = _rows_of(self._sizes, order)
+            moved = self._tiles.rows_of(order)
             texels, weights = self._texels[moved], self._weights[moved]
             pages = paged_texels(texels, packing)
         kept = Codes(
@@ -271,10 +271,3 @@ def _thinned(baked: Baked) -> ViewColorError | None:
 def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
     """The bake as it is drawn with coded texels."""
     return replace(baked, texels=paged_texels(coded.texels(), baked.packing)).with_mean_residual(coded.constants)
-
-
-def _rows_of(sizes: Tensor, order: Tensor) -> Tensor:
-    """Rows of the list of texels of tiles [N, 2], tile after tile in another order [N]."""
-    area = sizes.clamp(min=1).prod(dim=1)
-    first, count = (area.cumsum(0) - area)[order], area[order]
-    return (first - (count.cumsum(0) - count)).repeat_interleave(count) + torch.arange(int(count.sum()))

@@ -37,6 +37,31 @@ class Learning:
     compact: Compact | None = None
 
 
+def baked_and_reduced(
+    scene: BakeableScene,
+    cameras: Sequence[Camera],
+    photographs: Sequence[View],
+    background: Tensor,
+    options: BakeOptions,
+    learning: Learning,
+    progress: Progress = no_progress,
+    held_out: Sequence[View] = (),
+) -> Baked:
+    """The first part of `bake_and_learn`, with its arguments: tiles and view colours as the options say, of what was
+    learned in training, or of a field, polished or not."""
+    polish = learning.polish
+    has_learned = isinstance(scene.field, TexelField)
+    if has_learned:
+        baked = learned(scene, options)
+    else:
+        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+    if polish is not None and baked.texels is not None:
+        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
+    if polish is not None or has_learned:
+        baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
+    return baked
+
+
 def bake_and_learn(
     scene: BakeableScene,
     cameras: Sequence[Camera],
@@ -65,18 +90,10 @@ def bake_and_learn(
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
-    polish, tune = learning.polish, learning.tune
+    tune = learning.tune
     if learning.compact is not None:  # its texels are decoded to 8 bits: nothing has to be encoded to state their error
         options = replace(options, format="uint8")
-    has_learned = isinstance(scene.field, TexelField)
-    if has_learned:
-        baked = learned(scene, options)
-    else:
-        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
-    if polish is not None and baked.texels is not None:
-        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
-    if polish is not None or has_learned:
-        baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
+    baked = baked_and_reduced(scene, cameras, photographs, background, options, learning, progress, held_out)
     coding = None
     if learning.compact is not None:
         baked, coding = compacted(baked, photographs, background, learning.compact, progress)

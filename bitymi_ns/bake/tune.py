@@ -31,6 +31,7 @@ from bitymi_ns.ops import (
 from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.schedules import falling
@@ -43,16 +44,11 @@ FEWEST_VIEWS = 4
 
 
 @dataclass
-class TuneOptions:
+class TuneOptions(TexelSteps):
     """How an atlas is fine-tuned."""
 
     steps: int = 400
     """Steps; each looks at one training view."""
-    rate: float = 0.05
-    """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
-    prior: float = 0.3
-    """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
-    of the rate, one never seen not at all."""
     ssim_weight: float = 0.2
     """Share of 1 - SSIM in the loss; the rest is L1."""
     held_in_every: int = 8

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from bitymi_ns.bake import Baked, BakeOptions, bake, reduced, rich_progress
-from bitymi_ns.bake.learned import learned
+from bitymi_ns.bake import Baked, BakeOptions, Learning, baked_and_reduced, rich_progress
 from bitymi_ns.bake.options import STEPS
 from bitymi_ns.host.cameras import to_camera
 from bitymi_ns.host.errors import fail, say
@@ -184,10 +183,9 @@ class Knobs:
 
     def _bake(self, **options: Any) -> Baked:
         with rich_progress() as progress:
-            if self.has_learned:
-                made = learned(self.scene, replace(self.options, **options))
-                return reduced(made, self.views, progress).encoded(progress)
-            return bake(self.scene, self.views, replace(self.options, **options), progress)
+            chosen = replace(self.options, **options)
+            made = baked_and_reduced(self.scene, self.views, (), self.background, chosen, Learning(), progress)
+            return made.encoded(progress)
 
     def _all_colors(self, baked: Baked, scene: BakedScene) -> BakedScene:
         """With the view colours as they were trained: the knobs are the atlas's."""

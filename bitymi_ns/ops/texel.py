@@ -39,6 +39,12 @@ class TexelTiles:
         area = size.long().prod(dim=1)
         return cls(area.cumsum(0) - area, size.to(torch.int32).contiguous(), extent.contiguous())
 
+    def rows_of(self, surfels: Tensor) -> Tensor:
+        """[t] int64 rows of the texels of some surfels [n] int64, tile after tile in their order."""
+        area = self.size[surfels].long().prod(dim=1)
+        shift = self.first[surfels] - (area.cumsum(0) - area)
+        return shift.repeat_interleave(area) + torch.arange(int(area.sum()), device=area.device)
+
     @property
     def arrays(self) -> dict[str, Tensor]:
         """What the kernels take of each tile."""

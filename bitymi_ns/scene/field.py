@@ -184,11 +184,7 @@ class TexelField(nn.Module):
     @torch.no_grad()
     def keep(self, rows: Tensor) -> None:
         """Lets go of all surfels but `rows` [n] int64, which are in that order from now on."""
-        tiles = self.tiles
-        area = self.size[rows].long().prod(dim=1)
-        start = area.cumsum(0) - area
-        moved = torch.arange(int(area.sum()), device=area.device) - start.repeat_interleave(area)
-        old = tiles.first[rows].repeat_interleave(area) + moved
+        old = self.tiles.rows_of(rows)
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 

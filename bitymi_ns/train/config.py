@@ -141,17 +141,23 @@ class AdamConfig:
 
 
 @dataclass
-class TexelConfig:
-    """Texels that learn in the last part of a run, where the texture of the scene is `texels`."""
+class TexelSteps:
+    """How far texels move, in training and after it."""
 
-    start: int = 18_000
-    """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
-    as the training views see it; 30,000 or more = there is no such part."""
     rate: float = 0.05
     """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
     prior: float = 0.3
     """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
     of the rate, one never seen not at all."""
+
+
+@dataclass
+class TexelConfig(TexelSteps):
+    """Texels that learn in the last part of a run, where the texture of the scene is `texels`."""
+
+    start: int = 18_000
+    """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
+    as the training views see it; 30,000 or more = there is no such part."""
     surfel_rates: float = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: float = 2.0

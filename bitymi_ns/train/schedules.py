@@ -122,12 +122,13 @@ class Schedule:
         return not self.densify_steps or step > max(self.densify_steps)
 
     def field_trains(self, step: int) -> bool:
-        """Whether the texture field learns in this step; on the other steps it is evaluated without gradient.
+        """Whether the texture learns in this step; on the other steps it is evaluated without gradient.
 
         From `freeze_after` on it learns in one step in `freeze_every` (section Training Time of the paper). A run of
-        few steps freezes less often: it could not learn a texture in a tenth of them.
+        few steps freezes less often: it could not learn a texture in a tenth of them. Texels learn in every step of
+        theirs.
         """
-        return step < self.scaled(self.config.freeze_after) or step % self.freeze_every == 0
+        return self.texels_learn(step) or step < self.scaled(self.config.freeze_after) or step % self.freeze_every == 0
 
     @property
     def freeze_every(self) -> int:

@@ -54,7 +54,7 @@ def view_losses(
     output = scene.render(
         view.camera,
         background=background,
-        field_mode="train" if schedule.texels_learn(step) or schedule.field_trains(step) else "frozen",
+        field_mode="train" if schedule.field_trains(step) else "frozen",
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
         beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )

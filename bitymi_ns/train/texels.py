@@ -16,6 +16,7 @@ from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.losses import numbers
+from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.rotations import tangents
 
 if TYPE_CHECKING:
@@ -48,9 +49,8 @@ class LearningTexels:
             return False
         most = max(FEWEST_VIEWS, round(self.options.views * (self.schedule.max_steps - self.schedule.texels_start)))
         count = min(most, len(views))
-        self.scene.field = blank_texels(
-            self.scene, [views.at(i * len(views) // count, 1.0) for i in range(count)], len(views), self.options
-        )
+        some = OnDemand(count, lambda i: views.at(i * len(views) // count, 1.0))
+        self.scene.field = blank_texels(self.scene, some, len(views), self.options)
         return True
 
     def prepare(self, step: int, view: View, factor: float) -> None:

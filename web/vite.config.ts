@@ -16,6 +16,7 @@ export default defineConfig({
       },
     },
   },
+  worker: { format: 'es', rollupOptions: { output: { entryFileNames: '[name].js' } } },
   server: { fs: { allow: ['..'] } },
   test: { include: ['test/**/*.test.ts'] },
 });

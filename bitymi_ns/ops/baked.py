@@ -41,6 +41,6 @@ def draw(
         RuntimeError: the device has too little memory; or it is WebGPU that is asked for, and it is not there.
     """
     if scene.through_webgpu:
-        return webgpu.draw(scene, cameras, background, images)
+        return webgpu.draw(scene, cameras, background, images, photo_pixel)
     by = baked_cuda if cuda_backend(scene.tiles.device) else baked_cpu
     return by.draw(scene, cameras, background, images, photo_pixel)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
-from bitymi_ns.bundle.manifest import MANIFEST
-from bitymi_ns.bundle.read import read_manifest
+from bitymi_ns.bundle import archive
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
+from bitymi_ns.bundle.read import MANIFEST_LIMIT, read_manifest
 
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -39,19 +41,23 @@ class Site:
 
     Attributes:
         files: path on the server, without the first slash, to the file.
-        texts: the same for what is made here.
+        made: the same for what does not lie in a file of its own: to what gives its contents.
     """
 
     files: Mapping[str, Path]
-    texts: Mapping[str, bytes]
+    made: Mapping[str, Callable[[], bytes]]
 
     @property
     def paths(self) -> list[str]:
-        return sorted({*self.files, *self.texts})
+        return sorted({*self.files, *self.made})
 
     def read(self, path: str) -> bytes:
-        """The contents of one of `paths`."""
-        return self.texts[path] if path in self.texts else self.files[path].read_bytes()
+        """The contents of one of `paths`.
+
+        Raises:
+            OSError: it cannot be read, or no longer.
+        """
+        return self.made[path]() if path in self.made else self.files[path].read_bytes()
 
 
 def media_type(path: str) -> str:
@@ -73,23 +79,38 @@ def page_files() -> dict[str, Path]:
 
 
 def site_of(bundle: Path) -> Site:
-    """The page with a bundle.
+    """The page with a bundle, a folder or one file; of the latter the parts are sent as files are.
 
     Raises:
         PageError: the page was not built, or a file of the bundle lies elsewhere.
-        BundleError: the folder is not a bundle, or its bundle.json is damaged.
+        BundleError: there is no bundle, or its bundle.json is damaged.
     """
     info = read_manifest(bundle)
-    folder = bundle.resolve()
-    if folder.is_file():
-        raise PageError(f"{bundle} is a bundle in one file, which the viewer does not open yet: give it the folder")
-    files = dict(page_files())
-    for name in (MANIFEST, *info.files):
-        path = folder / name
-        if media_type(name).startswith("text/"):
-            continue  # a page or a script has no place in a bundle
-        if path.resolve().parent != folder:
+    place = bundle.resolve()
+    files, made = dict(page_files()), {}
+    # a page or a script has no place in a bundle
+    names = [name for name in (MANIFEST, *info.files) if not media_type(name).startswith("text/")]
+    for name in names:
+        path = place / name
+        if place.is_file():
+            made[f"{BUNDLE}{name}"] = partial(_part, place, info, name)
+        elif path.resolve().parent != place:
             raise PageError(f"{path} is a link that leads out of the bundle: it is not shown")
-        files[f"{BUNDLE}{name}"] = path
-    title = json.dumps({"title": folder.parent.name if folder.name == "bundle" else folder.name})
-    return Site(files, {"view.json": title.encode()})
+        else:
+            files[f"{BUNDLE}{name}"] = path
+    title = place.stem if place.is_file() else place.parent.name if place.name == "bundle" else place.name
+    text = json.dumps({"title": title}).encode()
+    return Site(files, {**made, "view.json": lambda: text})
+
+
+def _part(file: Path, info: Manifest, name: str) -> bytes:
+    """A part of a bundle in one file.
+
+    Raises:
+        OSError: the file is no longer what it was.
+    """
+    try:
+        with archive.opened(file, str(file)) as parts:
+            return parts.part(name, MANIFEST_LIMIT if name == MANIFEST else info.files[name].bytes)
+    except BundleError as error:
+        raise OSError(str(error)) from error

@@ -39,8 +39,8 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
         for path in site.paths:
             to = new / path
             to.parent.mkdir(exist_ok=True)
-            if path in site.texts:
-                to.write_bytes(site.texts[path])
+            if path in site.made:
+                to.write_bytes(site.read(path))
             else:
                 shutil.copyfile(site.files[path], to)
         return sum(path.stat().st_size for path in new.rglob("*") if path.is_file())

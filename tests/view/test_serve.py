@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from bitymi_ns.view import PageError, serve, site_of, write_static
 from tests.view.browser import served
@@ -118,6 +119,21 @@ def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, t
     with pytest.raises(PageError, match="something else"):
         write_static(site_of(bundle), other, overwrite=True)
     assert (other / "precious").read_text() == "x"
+
+
+def test_a_bundle_in_one_file_is_sent_and_exported_as_its_parts(bundle: Path, tmp_path: Path) -> None:
+    single = tmp_path / "little.bitymi"
+    write_single(bundle, single)
+    with served(site_of(single)) as address:
+        for name in ("bundle.json", "surfels.ply", "photograph-0001.jpg"):
+            assert ask(address, f"/bundle/{name}")[2] == (bundle / name).read_bytes()
+        assert json.loads(ask(address, "/view.json")[2]) == {"title": "little"}
+        assert ask(address, "/little.bitymi")[0] == 404 and ask(address, "/bundle/config.yml")[0] == 404
+        single.write_bytes(single.read_bytes()[:-30])
+        assert ask(address, "/bundle/surfels.ply")[0] == 404
+    write_single(bundle, single)
+    write_static(site_of(single), tmp_path / "site")
+    assert (tmp_path / "site" / "bundle" / "atlas.ktx2").read_bytes() == (bundle / "atlas.ktx2").read_bytes()
 
 
 def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:

@@ -53,6 +53,11 @@ export class App {
     this.bind();
   }
 
+  // The texture has come, or something else that changes the picture.
+  changed(): void {
+    this.touch();
+  }
+
   start(): void {
     const shared = fromHash(location.hash);
     if (shared) this.apply(shared);
@@ -130,15 +135,17 @@ export class App {
       if (!still && chosen === 'auto') this.pace.took(took);
       this.still = still;
       this.report(took, scale);
-      document.documentElement.dataset.frame = still ? 'still' : 'moving';
+      const { complete } = this.renderer.scene;
+      document.documentElement.dataset.frame = !complete ? 'first' : still ? 'still' : 'moving';
     }
     this.drawing = false;
   }
 
   private report(milliseconds: number, scale: number): void {
     const count = this.renderer.scene.count.toLocaleString('en');
+    const rest = this.renderer.scene.complete ? '' : ' · the texture is on its way';
     element('status').textContent =
-      `${milliseconds.toFixed(milliseconds < 10 ? 1 : 0)} ms · ${Math.round(100 * scale)} % · ${count} surfels`;
+      `${milliseconds.toFixed(milliseconds < 10 ? 1 : 0)} ms · ${Math.round(100 * scale)} % · ${count} surfels${rest}`;
   }
 
   private bind(): void {

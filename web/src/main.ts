@@ -42,6 +42,10 @@ async function main(): Promise<void> {
     notify('This device draws no BC7 textures: the texture was decoded, at four times the graphics memory.');
   }
   app.start();
+  if (bundle.later) {
+    scene.setTexels(await bundle.later());
+    app.changed();
+  }
 }
 
 main().catch(showError);

@@ -45,16 +45,18 @@ fn finish(axis: vec2f, along: vec2f, across: vec2f) -> Rectangle {
 fn rectangle(s: Seen) -> Rectangle {
   var r: Rectangle;
   let ratio = s.opacity / ALPHA_MIN;
-  if ratio < 1.0 - 1e-6 { return r; }
-  let level = max(log(ratio), 0.0) + 1e-5;
-  let r2 = level_radius2(level, s.beta);
+  let blurred = -s.area * ratio;  // of the low pass
+  let almost = 1.0 - 1e-6;
+  if max(ratio, blurred) < almost { return r; }
+  let r2 = level_radius2(log(max(ratio, 1.0)) + 1e-5, s.beta);
   // where the kernel is larger than the low pass everywhere, the low pass needs no room
-  let least = s.w0 - LOW_PASS_REACH * (abs(s.w.x) + abs(s.w.y));
+  let blur2 = 1.0 / low_pass_sharp();
+  let least = s.w0 - LOW_PASS_REACH * sqrt(blur2) * (abs(s.w.x) + abs(s.w.y));
   let slope = dot(s.u, s.u) + dot(s.v, s.v);
-  let covered = least > 0.0
-    && SUPPORT2 * least * least >= (s.beta + LOW_PASS_REACH * LOW_PASS_REACH) * 1.001 * slope;
+  let covered = -s.area <= 1.0 && least > 0.0
+    && SUPPORT2 * least * least >= (s.beta + LOW_PASS_REACH * LOW_PASS_REACH) * blur2 * 1.001 * slope;
   var blur = 0.0;
-  if !covered { blur = sqrt(level) + 0.01; }
+  if !covered && blurred >= almost { blur = sqrt((log(max(blurred, 1.0)) + 1e-5) * blur2) + 0.01; }
   if !(s.w0 > 0.0) {  // seen exactly edge-on: no ray hits it
     return finish(vec2f(1.0, 0.0), vec2f(-blur, blur), vec2f(-blur, blur));
   }

@@ -13,6 +13,7 @@
 @group(0) @binding(4) var<storage, read> visible: u32;
 @group(1) @binding(0) var atlas: texture_2d_array<f32>;
 @group(1) @binding(1) var bilinear: sampler;
+@group(1) @binding(2) var coarser: texture_2d_array<f32>;  // the levels 1 and 2 of the tiles, as its levels 0 and 1
 @group(2) @binding(0) var<uniform> layer: vec4u;  // which batch
 @group(2) @binding(1) var before: texture_2d<f32>;  // the target before this batch
 
@@ -23,7 +24,7 @@ struct Corner {
   @location(2) @interpolate(flat) w0_z_opacity_beta: vec4f,
   @location(3) @interpolate(flat) color_area: vec4f,
   @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile the residual
-  @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z
+  @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z; level
 }
 
 @vertex
@@ -44,13 +45,13 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
   out.v_w = vec4f(s.v, s.w);
   out.w0_z_opacity_beta = vec4f(s.w0, s.z, s.opacity, s.beta);
   out.color_area = vec4f(s.color, s.area);
-  if surfel.sides == 0 {
+  if s.level == TILE_LEVELS {
     out.tile = vec4f(surfel.residual, 0.0);
     out.texel = vec4f(-1.0, 0.0, s.normal_z, 0.0);
   } else {
-    let sides = vec2f(f32(surfel.sides & 0xffff), f32(surfel.sides >> 16));
-    out.tile = vec4f(vec2f(surfel.tile), sides - 1.0);
-    out.texel = vec4f(f32(surfel.layer), 0.5 / surfel.extent, s.normal_z, 0.0);
+    let sides = vec2u(surfel.sides & 0xffff, surfel.sides >> 16) >> vec2u(s.level);
+    out.tile = vec4f(vec2f(surfel.tile >> vec2u(s.level)), vec2f(sides) - 1.0);
+    out.texel = vec4f(f32(surfel.layer), 0.5 / surfel.extent, s.normal_z, f32(s.level));
   }
   return out;
 }
@@ -72,7 +73,7 @@ fn beta_fragment(c: Corner, d: vec2f) -> Fragment {
   let rest = 1.0 - dot(at, at) / SUPPORT2;
   let inside = hit && rest > 0.0;
   let kernel = select(0.0, exp2(c.w0_z_opacity_beta.w * log2(select(1.0, rest, inside))), inside);
-  let blur = exp(-dot(d, d));
+  let blur = -c.color_area.w * exp(-dot(d, d) * low_pass_sharp());
   var f: Fragment;
   f.at = clamp(at, vec2f(-SUPPORT), vec2f(SUPPORT));
   f.depth = select(w0 * z * inverse, z, blur > kernel);
@@ -112,7 +113,15 @@ fn residual(c: Corner, at: vec2f) -> vec3f {
   if c.texel.x < 0.0 { return c.tile.xyz; }
   let span = c.tile.zw;
   let texel = c.tile.xy + clamp(at * (span + 1.0) * c.texel.y + 0.5 * span, vec2f(0.0), span) + 0.5;
-  return frame.offset + frame.scale * textureSampleLevel(atlas, bilinear, texel / frame.atlas, u32(c.texel.x), 0.0).rgb;
+  let layer = u32(c.texel.x);
+  var stored: vec4f;
+  if c.texel.w == 0.0 {
+    stored = textureSampleLevel(atlas, bilinear, texel / frame.atlas, layer, 0.0);
+  } else {
+    let level = c.texel.w - 1.0;
+    stored = textureSampleLevel(coarser, bilinear, texel / vec2f(textureDimensions(coarser, u32(level))), layer, level);
+  }
+  return frame.offset + frame.scale * stored.rgb;
 }
 
 @fragment

@@ -52,7 +52,8 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   s.normal_z = -turn * n.z;
   let area = frame.lens.x * frame.lens.y * scales.x * scales.y * iz * iz;
   s.area = select(0.0, area, frame.through_pixel != 0 && area < 1e12);
-  if !finite(vec4f(s.center, s.w0, s.area)) || !finite(vec4f(s.u, s.v)) { return; }
+  if !(s.area > 0.0) { s = resized(s); }
+  if !finite(vec4f(s.center, s.w0, s.area)) || !finite(vec4f(s.opacity)) || !finite(vec4f(s.u, s.v)) { return; }
 
   var r: Rectangle;
   if s.area > 0.0 { r = filtered_rectangle(s); } else { r = rectangle(s); }
@@ -61,6 +62,7 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   s.middle = r.middle;
   s.half_size = select(r.half_size, vec2f(-1.0), r.whole);
   let direction = unit(surfel.mean - frame.color_center.xyz);
+  s.level = tile_level(s, surfel);
   s.color = max(view_color(frame.kind, surfel, direction) + COLOR_BIAS, vec3f(0.0));
   seen[i] = s;
   keys[i] = bitcast<u32>(p.z);  // positive floats are ordered as their bits are

@@ -5,6 +5,7 @@ struct Screen {
   size: vec2f,  // of the screen's part, pixels
   show: u32,  // SHOW_*
   most: f32,  // of a map: the value of the last colour
+  samples: u32,  // of a pixel, along each axis
 }
 
 @group(0) @binding(0) var<uniform> screen: Screen;
@@ -28,9 +29,21 @@ fn ramp(x: f32) -> vec3f {
   return mix(stops[k], stops[k + 1], at - f32(k));
 }
 
+// What was drawn of a pixel: between the pixels that there are, or the mean of its samples.
+fn drawn(position: vec2f) -> vec4f {
+  if screen.samples <= 1 { return textureSampleLevel(sums, smooth_sampler, position / screen.size, 0.0); }
+  let pixels = vec2f(textureDimensions(sums) / screen.samples);
+  let first = screen.samples * vec2u(position / screen.size * pixels);
+  var total = vec4f(0.0);
+  for (var y = 0u; y < screen.samples; y++) {
+    for (var x = 0u; x < screen.samples; x++) { total += textureLoad(sums, first + vec2u(x, y), 0); }
+  }
+  return total / f32(screen.samples * screen.samples);
+}
+
 @fragment
 fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
-  let s = textureSampleLevel(sums, smooth_sampler, position.xy / screen.size, 0.0);
+  let s = drawn(position.xy);
   let covered = 1.0 - s.a;
   switch screen.show {
     case SHOW_DEPTH: {

@@ -42,12 +42,12 @@ struct Seen {
   opacity: f32,
   beta: f32,
   color: vec3f,  // relu(f_view + 0.5)
-  area: f32,  // 0, or where the surfel is seen through a pixel
+  area: f32,  // > 0 where the surfel is seen through a pixel; else by how much the low pass is higher, negative
   axis: vec2f,  // of the rectangle that holds it on the screen, a unit vector
   middle: vec2f,  // of the rectangle, along the axis and across, pixels from `center`
   half_size: vec2f,  // x < 0: the whole screen
   normal_z: f32,
-  unused: f32,
+  level: u32,  // of its tile; TILE_LEVELS: the mean residual alone
 }
 
 struct Frame {
@@ -67,8 +67,16 @@ struct Frame {
   layers: u32,  // batches of surfels that are drawn one after the other
   show: u32,  // SHOW_*
   residuals: u32,  // whether they are added
-  unused: vec2u,
+  photo_pixel: f32,  // side of a photograph's pixel in pixels of the view: resize.wgsl
+  detail: u32,  // DETAIL_*
 }
+
+// What of the residuals is there.
+const DETAIL_MEANS: u32 = 0;  // their means alone: the texels are still to come
+const DETAIL_TEXELS: u32 = 1;
+const DETAIL_ALL: u32 = 2;
+
+const TILE_LEVELS: u32 = 3;  // of a tile: its texels, means of 2 x 2 of them, and of 4 x 4
 
 // What is blended: see draw.wgsl.
 const SHOW_COLOR: u32 = 0;

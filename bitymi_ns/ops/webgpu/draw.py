@@ -28,6 +28,7 @@ def draw(
     cameras: Sequence[Camera],
     background: Tensor | None,
     images: Sequence[str],
+    photo_pixel: float = 1.0,
     layers: int = LAYERS,
 ) -> dict[str, Tensor]:
     """As `baked.draw`, one view after the other; the images lie on the CPU.
@@ -45,7 +46,8 @@ def draw(
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:
         sums = {
-            show: torch.from_numpy(there.draw(camera, show, layers)) for show in {_FROM[name][0] for name in images}
+            show: torch.from_numpy(there.draw(camera, show, layers, photo_pixel))
+            for show in {_FROM[name][0] for name in images}
         }
         for name, views in drawn.items():
             show, channels = _FROM[name]

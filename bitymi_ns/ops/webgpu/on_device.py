@@ -85,6 +85,8 @@ class SceneOnDevice:
         numbers[:, 0] = np.arange(MOST_LAYERS)
         self._layers = self._upload(numbers, flags.UNIFORM)
         self._atlas, self._atlas_size = self._texture(scene)
+        self._detail = 1 if scene.mean_residual is None else 2
+        self._coarser: Any = None
         self._target: _Target | None = None
         self._bind()
 
@@ -167,9 +169,49 @@ class SceneOnDevice:
             )
         self._share = self._group(p.share_out.get_bind_group_layout(0), self._frame, self._visible, self._draws)
         self._drawn = self._group(p.layout[0], self._frame, self._surfels, self._seen, self._order[0], self._visible)
+        self._bind_pages(self._atlas)
+
+    def _bind_pages(self, coarser: Any) -> None:
+        """Binds the atlas and its coarser levels; any texture stands for those that are not looked at."""
         sampler = self._device.create_sampler(mag_filter="linear", min_filter="linear")
-        view = self._atlas.create_view(dimension="2d-array")
-        self._pages_bound = self._group(p.layout[1], view, sampler)
+        views = [texture.create_view(dimension="2d-array") for texture in (self._atlas, coarser)]
+        self._pages_bound = self._group(self._programs.layout[1], views[0], sampler, views[1])
+
+    def _make_coarser(self) -> None:
+        """The levels 1 and 2 of the tiles, of all pages: for the first view that is smaller than the photographs."""
+        formats = {"rgba16float": "rgba16float", "rgba32float": "rgba32float"}
+        format = formats.get(self._atlas.format, "rgba8unorm")
+        width, height, layers = self._atlas.size
+        flags = library().TextureUsage
+        size = (max(1, width // 2), max(1, height // 2), layers)
+        self._coarser = self._device.create_texture(
+            size=size,
+            format=format,
+            mip_level_count=min(2, max(size[:2]).bit_length()),
+            usage=flags.TEXTURE_BINDING | flags.RENDER_ATTACHMENT,
+        )
+        encoder, p = self._device.create_command_encoder(), self._programs
+        for level in range(self._coarser.mip_level_count):
+            source, at = (self._coarser, level - 1) if level else (self._atlas, 0)
+            for layer in range(layers):
+                finer, to = (
+                    texture.create_view(
+                        dimension="2d",
+                        base_mip_level=mip,
+                        mip_level_count=1,
+                        base_array_layer=layer,
+                        array_layer_count=1,
+                    )
+                    for texture, mip in ((source, at), (self._coarser, level))
+                )
+                attachment = {"view": to, "load_op": "clear", "store_op": "store"}
+                work = encoder.begin_render_pass(color_attachments=[attachment])
+                work.set_pipeline(p.halve[format])
+                work.set_bind_group(0, self._group(p.halve_layout, finer))
+                work.draw(3)
+                work.end()
+        self._device.queue.submit([encoder.finish()])
+        self._bind_pages(self._coarser)
 
     def _target_of(self, width: int, height: int) -> _Target:
         if self._target is None or self._target.size != (width, height):
@@ -186,35 +228,38 @@ class SceneOnDevice:
             self._target = _Target((width, height), (sums, copy), before, read, row)
         return self._target
 
-    def _set_frame(self, camera: Camera, show: str, layers: int) -> None:
+    def _set_frame(self, camera: Camera, show: str, layers: int, photo_pixel: float) -> None:
         viewmat, K = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
         center = camera.exact_center.cpu().double().numpy() - self._origin
         rows = [(*viewmat[k, :3], 0.0) for k in range(3)]
         data = struct.pack(
-            "<32f8I",
+            "<32f6IfI",
             *(value for row in rows for value in row),
             *(*center, 0.0, *center, 0.0),
             *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             *(camera.width, camera.height, self._near, self._bound),
             *(self._offset, self._scale, *self._atlas_size),
             *(self.count, self._kind, int(self._through_pixel), layers),
-            *(SHOW[show], 1, 0, 0),
+            *(SHOW[show], 1, photo_pixel, self._detail),
         )
         self._device.queue.write_buffer(self._frame, 0, data)
 
-    def draw(self, camera: Camera, show: str, layers: int) -> npt.NDArray[np.float32]:
+    def draw(self, camera: Camera, show: str, layers: int, photo_pixel: float = 1.0) -> npt.NDArray[np.float32]:
         """Draws a view.
 
         Args:
             camera: the view.
             show: of `SHOW`.
             layers: batches, at most `MOST_LAYERS`.
+            photo_pixel: side of a photograph's pixel in pixels of the view.
 
         Returns:
             [H, W, 4]: the sums, and what is left of the transmittance.
         """
         target = self._target_of(camera.width, camera.height)
-        self._set_frame(camera, show, layers)
+        if photo_pixel < 1.0 and self._coarser is None:
+            self._make_coarser()
+        self._set_frame(camera, show, layers, photo_pixel)
         self._device.queue.write_buffer(self._visible, 0, bytes(4))
         encoder = self._device.create_command_encoder()
         self._encode_sorting(encoder)

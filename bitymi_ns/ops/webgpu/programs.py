@@ -10,10 +10,11 @@ from typing import Any
 from .device import library
 
 PARTS = {
-    "prepare": ("scene", "view_color", "bounds", "prepare"),
+    "prepare": ("scene", "view_color", "resize", "bounds", "prepare"),
     "sort": ("sort",),
     "share_out": ("scene", "batches", "share_out"),
-    "draw": ("scene", "batches", "draw"),
+    "draw": ("scene", "batches", "resize", "draw"),
+    "halve": ("halve",),
 }
 """Files of every program, in the order in which they are put together."""
 
@@ -81,6 +82,7 @@ class Programs:
                 entries=[
                     {"binding": 0, "visibility": fragment, "texture": atlas},
                     {"binding": 1, "visibility": fragment, "sampler": {"type": "filtering"}},
+                    {"binding": 2, "visibility": fragment, "texture": atlas},
                 ]
             ),
             make(
@@ -127,3 +129,32 @@ class Programs:
     def count_fragments(self) -> Any:
         """Adds fragments as they are."""
         return self._draw({"operation": "add", "src_factor": "one", "dst_factor": "one"})
+
+    @cached_property
+    def _halve_module(self) -> Any:
+        return self._module("halve")
+
+    @cached_property
+    def halve(self) -> dict[str, Any]:
+        """Renders a page at half its size, by the format of the target."""
+        entries = {"rgba8unorm": "halve_bytes", "rgba16float": "halve_floats", "rgba32float": "halve_floats"}
+        return {format: self._halve(format, entry) for format, entry in entries.items()}
+
+    def _halve(self, format: str, entry: str) -> Any:
+        module = self._halve_module
+        wgpu = library()
+        return self.device.create_render_pipeline(
+            layout=self.device.create_pipeline_layout(bind_group_layouts=[self.halve_layout]),
+            vertex={"module": module, "entry_point": "page"},
+            primitive={"topology": wgpu.PrimitiveTopology.triangle_list},
+            fragment={"module": module, "entry_point": entry, "targets": [{"format": format}]},
+        )
+
+    @cached_property
+    def halve_layout(self) -> Any:
+        """Bind group layout of `halve`: the finer page."""
+        texture = {"sample_type": "unfilterable-float", "view_dimension": "2d"}
+        fragment = library().ShaderStage.FRAGMENT
+        return self.device.create_bind_group_layout(
+            entries=[{"binding": 0, "visibility": fragment, "texture": texture}]
+        )

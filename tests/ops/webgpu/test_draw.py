@@ -103,7 +103,7 @@ def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded() -> None:
 def test_more_batches_come_closer_to_the_weight_bound() -> None:
     scene, camera = replace(textured(200, 3), weight_bound=0.05), front()
     want = scene.render(camera).rgb
-    off = [float((webgpu.draw(scene, [camera], None, ["rgb"], n)["rgb"][0] - want).abs().mean()) for n in (1, 8, 64)]
+    off = [float((webgpu.draw(scene, [camera], None, ["rgb"], layers=n)["rgb"][0] - want).abs().mean()) for n in (1, 8, 64)]
     assert off[0] > off[1] > off[2] and off[2] < 0.5 * STEP
 
 
@@ -135,6 +135,36 @@ def test_a_scene_without_surfels_and_one_far_away() -> None:
     viewmat = camera.viewmat.clone()
     viewmat[:3, 3] -= torch.tensor([4096.0, -8192.0, 2048.0])
     check(far, replace(camera, viewmat=viewmat))
+
+
+def photographed(scene: BakedScene, camera: Camera) -> BakedScene:
+    """The scene as if it had been photographed by this camera, 4 units away."""
+    rate = float(torch.sqrt(camera.K[0, 0] * camera.K[1, 1])) / 4
+    points = torch.cat([scene.surfels["means"], torch.full((len(scene), 1), rate)], 1)
+    return replace(scene, photographed=points, weight_bound=0.0)
+
+
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+@pytest.mark.parametrize("share", [2.0, 1.0, 0.5, 0.25, 0.12])
+def test_views_of_other_sizes(share: float, prefilter: str) -> None:
+    camera = front(240, 176)
+    camera.K[:2, :2] *= 2.0
+    for dtype in (torch.uint8, torch.float32):
+        scene = photographed(replace(textured(300, 3, dtype), prefilter=prefilter), camera)
+        off = check(scene, camera.scaled(share), torch.tensor([0.2, 0.4, 0.6]), ("rgb", "alpha", "depth"))
+        assert off.mean() < 0.1 * STEP and off.max() < 2 * STEP, (off.mean() / STEP, off.max() / STEP)
+
+
+def test_levels_of_blocks_and_of_tiles_without_a_mean() -> None:
+    camera = front(240, 176)
+    scene = photographed(textured(60, 0), camera)
+    blocks = [bc7_encoder("ultrafast")(page.numpy()) for page in scene.atlas]
+    height, width = scene.atlas.shape[1:3]
+    scene.atlas = torch.from_numpy(np.stack([decode_bc7(bytes(page), width, height) for page in blocks]))
+    stored = np.stack([np.frombuffer(bytes(page), np.uint8) for page in blocks])
+    scene.blocks = torch.from_numpy(stored.reshape(len(blocks), height // 4, width // 4, 16))
+    for given in (scene, replace(scene, mean_residual=None)):
+        assert check(given, camera.scaled(0.3)).max() < 2 * STEP
 
 
 def test_what_was_changed_is_drawn_anew() -> None:

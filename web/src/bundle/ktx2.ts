@@ -37,12 +37,8 @@ export async function parseKtx2(data: ArrayBuffer, stated: Atlas): Promise<Pages
   if (levels !== 1 || at + length > data.byteLength) throw new DamagedBundle('atlas.ktx2 is truncated.');
   let texels = new Uint8Array(data, at, length);
   if (scheme === 2) {
-    const { decompress } = await import('fzstd');
-    try {
-      texels = decompress(texels, new Uint8Array(size * layers)) as Uint8Array<ArrayBuffer>;
-    } catch {
-      throw new DamagedBundle('atlas.ktx2: its zstd data is damaged.');
-    }
+    const { frameBytes } = await import('./zstd');
+    texels = frameBytes(texels, size * layers, 'atlas.ktx2') as Uint8Array<ArrayBuffer>;
   } else if (scheme !== 0) {
     throw new DamagedBundle(`atlas.ktx2 is compressed by a scheme (${scheme}) that is not known.`);
   }

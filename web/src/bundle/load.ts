@@ -1,13 +1,14 @@
 // Fetches a bundle's files, with progress, and checks their sizes and hashes.
 import { DamagedBundle, ViewerError } from '../errors';
 import { type Pages, parseKtx2 } from './ktx2';
-import { type Manifest, parseManifest } from './manifest';
+import { type Atlas, type Manifest, parseManifest } from './manifest';
 import { type Surfels, readSurfels } from './surfels';
 
 export interface Bundle {
   info: Manifest;
   surfels: Surfels;
   pages: Pages | null;
+  later: (() => Promise<Pages>) | null; // fetches the texels, where a first picture can be drawn without them
   cameras: string | null; // cameras.json
 }
 
@@ -30,21 +31,28 @@ async function get(url: string): Promise<Response> {
   return response;
 }
 
+// No memory is taken for what has not come.
 async function bytesOf(url: string, size: number, came: (bytes: number) => void): Promise<ArrayBuffer> {
   const response = await get(url);
-  const data = new Uint8Array(size);
   const name = url.split('/').pop() ?? url;
+  const parts: Uint8Array[] = [];
   let at = 0;
   const body = response.body?.getReader();
   while (body) {
     const { done, value } = await body.read();
     if (done) break;
     if (at + value.length > size) throw new DamagedBundle(`${name} is longer than the ${size} bytes of bundle.json.`);
-    data.set(value, at);
+    parts.push(value);
     at += value.length;
     came(value.length);
   }
   if (at !== size) throw new DamagedBundle(`${name} is truncated: ${at} of ${size} bytes.`);
+  const data = new Uint8Array(size);
+  at = 0;
+  for (const part of parts) {
+    data.set(part, at);
+    at += part.length;
+  }
   return data.buffer;
 }
 
@@ -53,8 +61,8 @@ const hex = (bytes: ArrayBuffer): string =>
 
 export async function loadBundle(folder: string, progress: Progress): Promise<Bundle> {
   const info = parseManifest(await (await get(`${folder}bundle.json`)).text());
-  const wanted = ['surfels.ply', ...(info.atlas ? ['atlas.ktx2'] : [])];
-  const total = wanted.reduce((sum, name) => sum + (info.files.get(name)?.bytes ?? 0), 0);
+  const first = info.compact ? ['surfels.bin'] : ['surfels.ply', ...(info.atlas ? ['atlas.ktx2'] : [])];
+  const total = first.reduce((sum, name) => sum + (info.files.get(name)?.bytes ?? 0), 0);
   let done = 0;
   const load = async (name: string): Promise<ArrayBuffer> => {
     const entry = info.files.get(name);
@@ -66,9 +74,16 @@ export async function loadBundle(folder: string, progress: Progress): Promise<Bu
     }
     return data;
   };
-  const [table, atlas] = await Promise.all(wanted.map(load));
-  const surfels = readSurfels(table, info);
-  const pages = info.atlas ? await parseKtx2(atlas, info.atlas) : null;
-  const cameras = info.files.has('cameras.json') ? await (await get(`${folder}cameras.json`)).text() : null;
-  return { info, surfels, pages, cameras };
+  const views = async (): Promise<string | null> =>
+    info.files.has('cameras.json') ? (await get(`${folder}cameras.json`)).text() : null;
+  const [cameras, table, atlas] = await Promise.all([views(), ...first.map(load)]);
+  if (!info.compact) {
+    const pages = info.atlas ? await parseKtx2(atlas, info.atlas) : null;
+    return { info, surfels: readSurfels(table, info), pages, later: null, cameras };
+  }
+  const { Decoder } = await import('./compact/decoder');
+  const decoder = new Decoder();
+  const surfels = await decoder.surfels(table, info);
+  const texels = async (of: Atlas): Promise<Pages> => decoder.texels(await load('texels.bin'), of, surfels);
+  return { info, surfels, pages: null, later: info.atlas ? () => texels(info.atlas!) : null, cameras };
 }

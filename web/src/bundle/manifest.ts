@@ -1,21 +1,38 @@
 // bundle.json: what the viewer needs of it. bitymi_ns/bundle/manifest.py is the whole description.
 import { DamagedBundle, ViewerError } from '../errors';
+import type { Column } from './compact/columns';
 
 export const FORMAT = 'bitymi-bundle';
-export const NEWEST_MAJOR = 2;
+export const NEWEST_MAJOR = 3;
 
 export type ViewKind = 'sv' | 'sh' | 'sb' | 'sg';
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
 export type Vec3 = [number, number, number];
 
+// What bundle.json says of surfels.bin.
+export interface CompactSurfels {
+  frame: { center: Vec3; scale: number; low: Vec3 }; // of the places
+  columns: Column[];
+}
+
+// What bundle.json says of texels.bin.
+export interface CodedTexels {
+  texels: number;
+  step: number;
+  pageWidth: number;
+  pageRows: number;
+  columns: Column[];
+}
+
 export interface Atlas {
-  format: AtlasFormat;
+  format: AtlasFormat | 'dct';
   width: number;
   height: number;
   layers: number;
   extent: number;
   offset: number;
   scale: number;
+  coded: CodedTexels | null; // of the format dct
 }
 
 export interface Manifest {
@@ -23,10 +40,12 @@ export interface Manifest {
   count: number;
   viewColor: ViewKind;
   terms: number | null;
+  compact: CompactSurfels | null; // of version 3
   atlas: Atlas | null;
   near: number;
   weightBound: number;
   throughPixel: boolean;
+  photographed: Float32Array | null; // rows x, y, z, pixels per unit of length
   background: Vec3;
   bounds: { min: Vec3; max: Vec3 };
   up: Vec3 | null;
@@ -43,6 +62,10 @@ class Reader {
 
   private refuse(key: string, what: string): never {
     throw new DamagedBundle(`bundle.json: ${this.path}${key} must be ${what}.`);
+  }
+  // What stands under a key, whose own keys are numbers.
+  at(key: string): Reader {
+    return new Reader(this.value[key] as Json, `${this.path}${key}.`);
   }
   has(key: string): boolean {
     return this.value[key] !== undefined && this.value[key] !== null;
@@ -75,6 +98,23 @@ class Reader {
     if (!Array.isArray(found) || found.length !== 3 || !found.every(good)) this.refuse(key, 'three numbers');
     return found as Vec3;
   }
+  list(key: string, most: number): unknown[] {
+    const found = this.value[key];
+    if (!Array.isArray(found) || found.length > most) this.refuse(key, `a list of at most ${most}`);
+    return found as unknown[];
+  }
+  parts(key: string, most: number): Reader[] {
+    return this.list(key, most).map((part, k) => {
+      if (typeof part !== 'object' || part === null) this.refuse(`${key}.${k}`, 'an object');
+      return new Reader(part as Json, `${this.path}${key}.${k}.`);
+    });
+  }
+  wholes(key: string, most: number, low: number, high: number): number[] {
+    const found = this.list(key, most);
+    const good = (x: unknown): boolean => Number.isInteger(x) && (x as number) >= low && (x as number) <= high;
+    if (!found.every(good)) this.refuse(key, `whole numbers from ${low} to ${high}`);
+    return found as number[];
+  }
   entries(): [string, Reader][] {
     return Object.keys(this.value).map((key) => [key, this.part(key)]);
   }
@@ -85,17 +125,71 @@ class Reader {
   }
 }
 
-function atlas(r: Reader): Atlas {
-  const side = 1 << 20;
+const SIDE = 1 << 20;
+const MOST_COLUMNS = 64;
+const MOST_NUMBERS = 16; // of a column
+const MOST_BYTES = 6; // of a number
+const MOST_POINTS = 4096;
+const RATES = [1e-12, 1e12]; // pixels per unit of length
+
+function columns(r: Reader): Column[] {
+  return r.parts('columns', MOST_COLUMNS).map((column) => ({
+    name: column.text('name', /^[a-z0-9_]{1,20}$/),
+    step: column.has('step') ? column.number('step', 1e-12, 1e6) : null,
+    low: column.wholes('low', MOST_NUMBERS, -(2 ** 40), 2 ** 40),
+    planes: column.list('planes', MOST_NUMBERS).map((_, k) => {
+      return column.at('planes').wholes(`${k}`, MOST_BYTES, 1, 2 ** 40);
+    }),
+  }));
+}
+
+function compact(r: Reader): CompactSurfels {
+  const frame = r.part('frame');
+  const [center, low] = [frame.point('center', 1e9), frame.point('low', 100)];
+  return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r) };
+}
+
+function coded(r: Reader): CodedTexels {
   return {
-    format: r.choice('format', ['bc7', 'uint8', 'fp16']),
-    width: r.whole('width', 1, side),
-    height: r.whole('height', 1, side),
-    layers: r.whole('layers', 1, side),
+    texels: r.whole('texels', 0, 2 ** 50),
+    step: r.number('step', 1e-6, 100),
+    pageWidth: r.whole('page_width', 1, SIDE),
+    pageRows: r.whole('page_rows', 1, SIDE),
+    columns: columns(r),
+  };
+}
+
+function atlas(r: Reader, isCompact: boolean): Atlas {
+  const format = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
+  return {
+    format,
+    width: r.whole('width', 1, SIDE),
+    height: r.whole('height', 1, SIDE),
+    layers: r.whole('layers', 1, SIDE),
     extent: r.has('extent') ? r.number('extent', 1e-6, 16) : 3,
     offset: r.number('offset', -256, 256),
     scale: r.number('scale', 0, 512),
+    coded: isCompact ? coded(r) : null,
   };
+}
+
+// Points of the scene, and with how many pixels per unit of length they were photographed.
+function points(r: Reader): Float32Array {
+  const text = r.text('photographed', /^[A-Za-z0-9+/]*={0,2}$/);
+  const refuse = (): never => {
+    throw new DamagedBundle('bundle.json: render.photographed must hold places and rates in range.');
+  };
+  let bytes: Uint8Array;
+  try {
+    bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  } catch {
+    return refuse();
+  }
+  if (bytes.length % 16 || bytes.length > 16 * MOST_POINTS) refuse();
+  const view = new DataView(bytes.buffer);
+  const found = Float32Array.from({ length: bytes.length / 4 }, (_, i) => view.getFloat32(4 * i, true));
+  const good = (x: number, i: number): boolean => (i % 4 < 3 ? Math.abs(x) <= 1e9 : x >= RATES[0] && x <= RATES[1]);
+  return found.every(good) ? found : refuse();
 }
 
 export function parseManifest(text: string): Manifest {
@@ -122,15 +216,18 @@ export function parseManifest(text: string): Manifest {
   const bounds = root.part('bounds');
   const world = root.has('world') ? root.part('world') : null;
   const files = root.part('files').entries();
+  const isCompact = version.startsWith('3.');
   return {
     version,
     count: surfels.whole('count', 0, 2 ** 28),
     viewColor: surfels.choice('view_color', ['sv', 'sh', 'sb', 'sg']),
-    terms: surfels.has('terms') ? surfels.whole('terms', 0, 2 ** 31) : null,
-    atlas: root.has('atlas') ? atlas(root.part('atlas')) : null,
+    terms: surfels.has('terms') || isCompact ? surfels.whole('terms', 0, 2 ** 31) : null,
+    compact: isCompact ? compact(surfels) : null,
+    atlas: root.has('atlas') ? atlas(root.part('atlas'), isCompact) : null,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),
     throughPixel: render.has('prefilter') && render.choice('prefilter', ['low_pass', 'pixel']) === 'pixel',
+    photographed: render.has('photographed') ? points(render) : null,
     background: render.point('background', 1),
     bounds: { min: bounds.point('min', 1e9), max: bounds.point('max', 1e9) },
     up: world?.has('up') ? world.point('up', 2) : null,

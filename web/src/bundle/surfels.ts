@@ -5,22 +5,24 @@ import { Table, parsePly } from './ply';
 
 export const SURFEL_WORDS = 24;
 export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const; // VIEW_* of view_color.wgsl
-const LEAN_WIDTH: Record<ViewKind, number> = { sv: 6, sh: 3, sb: 6, sg: 7 };
+export const LEAN_WIDTH: Record<ViewKind, number> = { sv: 6, sh: 3, sb: 6, sg: 7 };
 const MAX_TERMS = 32;
-// words of a surfel
-const MEAN = 0;
-const OPACITY = 3;
-const QUAT = 4;
-const LOG_SCALE = 8;
-const BETA = 10;
-const EXTENT = 11;
-const RESIDUAL = 12;
-const LAYER = 15;
-const BASE = 16;
-const FIRST_TERM = 19;
-const TILE = 20;
-const SIDES = 22;
-const TERMS = 23;
+// First words of what a surfel has.
+export const WORD = {
+  mean: 0,
+  opacity: 3,
+  quat: 4,
+  logScale: 8,
+  beta: 10,
+  extent: 11,
+  residual: 12,
+  layer: 15,
+  base: 16,
+  firstTerm: 19,
+  tile: 20,
+  sides: 22,
+  terms: 23,
+} as const;
 
 export interface Surfels {
   count: number;
@@ -28,20 +30,31 @@ export interface Surfels {
   terms: Float32Array;
   kind: number;
   origin: Vec3; // taken off the means
+  means: boolean; // whether the mean residuals of tiles are there
+}
+
+// The middle of the scene: far from the world's origin float32 would not place surfels.
+export const originOf = ({ bounds }: Manifest): Vec3 => bounds.min.map((low, c) => (low + bounds.max[c]) / 2) as Vec3;
+
+// Takes the origin off the means.
+export function centred(words: Float32Array, origin: Vec3): void {
+  for (let i = WORD.mean; i < words.length; i += SURFEL_WORDS) {
+    for (let c = 0; c < 3; c++) words[i + c] -= origin[c];
+  }
 }
 
 function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): Float32Array {
   const numbers = new Uint32Array(words.buffer);
   const width = LEAN_WIDTH[kind];
-  for (let c = 0; c < 3; c++) rows.into(`view_base_${c}`, words, BASE + c, SURFEL_WORDS);
+  for (let c = 0; c < 3; c++) rows.into(`view_base_${c}`, words, WORD.base + c, SURFEL_WORDS);
   const counts = new Int32Array(rows.count);
   rows.into('view_terms', counts, 0, 1);
   let first = 0;
   for (let i = 0; i < rows.count; i++) {
     if (counts[i] < 0 || counts[i] > MAX_TERMS)
       throw new DamagedBundle(`surfels.ply: view_terms is wrong in row ${i}.`);
-    numbers[i * SURFEL_WORDS + FIRST_TERM] = first * width;
-    numbers[i * SURFEL_WORDS + TERMS] = counts[i];
+    numbers[i * SURFEL_WORDS + WORD.firstTerm] = first * width;
+    numbers[i * SURFEL_WORDS + WORD.terms] = counts[i];
     first += counts[i];
   }
   if (first !== terms.count) throw new DamagedBundle('surfels.ply: view_terms does not count the rows of view_term.');
@@ -66,10 +79,10 @@ function whole(rows: Table, words: Float32Array, parts: [string, number][], base
     }
     from += w;
   }
-  if (base !== null) for (let c = 0; c < 3; c++) rows.into(`${base}_${c}`, words, BASE + c, SURFEL_WORDS);
+  if (base !== null) for (let c = 0; c < 3; c++) rows.into(`${base}_${c}`, words, WORD.base + c, SURFEL_WORDS);
   for (let i = 0; i < rows.count; i++) {
-    numbers[i * SURFEL_WORDS + FIRST_TERM] = i * count * width;
-    numbers[i * SURFEL_WORDS + TERMS] = count;
+    numbers[i * SURFEL_WORDS + WORD.firstTerm] = i * count * width;
+    numbers[i * SURFEL_WORDS + WORD.terms] = count;
   }
   return out;
 }
@@ -103,10 +116,10 @@ function tiles(rows: Table, words: Float32Array, info: Manifest): void {
     if (!fits || layer < 0 || layer >= layers || ru > 0 !== rv > 0) {
       throw new DamagedBundle(`surfels.ply: the tile of surfel ${i} lies outside the atlas.`);
     }
-    numbers[to + TILE] = x;
-    numbers[to + TILE + 1] = y;
-    numbers[to + LAYER] = layer;
-    numbers[to + SIDES] = ru | (rv << 16);
+    numbers[to + WORD.tile] = x;
+    numbers[to + WORD.tile + 1] = y;
+    numbers[to + WORD.layer] = layer;
+    numbers[to + WORD.sides] = ru | (rv << 16);
   }
 }
 
@@ -119,15 +132,16 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const rows = new Table(data, vertex, 'vertex');
   const words = new Float32Array(rows.count * SURFEL_WORDS);
   const copy = (column: string, at: number): void => rows.into(column, words, at, SURFEL_WORDS);
-  ['x', 'y', 'z'].forEach((name, c) => copy(name, MEAN + c));
-  [0, 1, 2, 3].forEach((c) => copy(`rot_${c}`, QUAT + c));
-  [0, 1].forEach((c) => copy(`scale_${c}`, LOG_SCALE + c));
-  copy('opacity', OPACITY);
-  copy('beta', BETA);
+  ['x', 'y', 'z'].forEach((name, c) => copy(name, WORD.mean + c));
+  [0, 1, 2, 3].forEach((c) => copy(`rot_${c}`, WORD.quat + c));
+  [0, 1].forEach((c) => copy(`scale_${c}`, WORD.logScale + c));
+  copy('opacity', WORD.opacity);
+  copy('beta', WORD.beta);
   const extent = info.atlas?.extent ?? 3;
-  if (rows.has('tile_extent')) copy('tile_extent', EXTENT);
-  else for (let at = EXTENT; at < words.length; at += SURFEL_WORDS) words[at] = extent;
-  if (rows.has('residual_0')) [0, 1, 2].forEach((c) => copy(`residual_${c}`, RESIDUAL + c));
+  if (rows.has('tile_extent')) copy('tile_extent', WORD.extent);
+  else for (let at = WORD.extent; at < words.length; at += SURFEL_WORDS) words[at] = extent;
+  const means = rows.has('residual_0');
+  if (means) [0, 1, 2].forEach((c) => copy(`residual_${c}`, WORD.residual + c));
   tiles(rows, words, info);
   const term = elements.get('view_term');
   const form = WHOLE[info.viewColor];
@@ -135,14 +149,13 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
     ? lean(rows, new Table(data, term, 'view_term'), words, info.viewColor)
     : whole(rows, words, form.parts, form.base);
   for (let i = 0; i < words.length; i += SURFEL_WORDS) {
-    for (let c = MEAN; c < RESIDUAL; c++) {
+    for (let c = WORD.mean; c < WORD.residual; c++) {
       if (!Number.isFinite(words[i + c])) {
         throw new DamagedBundle(`surfels.ply: surfel ${i / SURFEL_WORDS} has a number that is not finite.`);
       }
     }
   }
-  const { min, max } = info.bounds;
-  const origin = min.map((low, c) => (low + max[c]) / 2) as Vec3;
-  for (let i = 0; i < words.length; i += SURFEL_WORDS) for (let c = 0; c < 3; c++) words[i + c] -= origin[c];
-  return { count: rows.count, words, terms, kind: term ? KINDS[info.viewColor] : form.kind, origin };
+  const origin = originOf(info);
+  centred(words, origin);
+  return { count: rows.count, words, terms, kind: term ? KINDS[info.viewColor] : form.kind, origin, means };
 }

@@ -2,8 +2,10 @@
 import batches from '../../../bitymi_ns/ops/shaders/batches.wgsl?raw';
 import bounds from '../../../bitymi_ns/ops/shaders/bounds.wgsl?raw';
 import draw from '../../../bitymi_ns/ops/shaders/draw.wgsl?raw';
+import halve from '../../../bitymi_ns/ops/shaders/halve.wgsl?raw';
 import prepare from '../../../bitymi_ns/ops/shaders/prepare.wgsl?raw';
 import present from '../../../bitymi_ns/ops/shaders/present.wgsl?raw';
+import resize from '../../../bitymi_ns/ops/shaders/resize.wgsl?raw';
 import scene from '../../../bitymi_ns/ops/shaders/scene.wgsl?raw';
 import shareOut from '../../../bitymi_ns/ops/shaders/share_out.wgsl?raw';
 import sort from '../../../bitymi_ns/ops/shaders/sort.wgsl?raw';
@@ -27,6 +29,7 @@ export class Programs {
   readonly shareOut: GPUComputePipeline;
   readonly layouts: [GPUBindGroupLayout, GPUBindGroupLayout, GPUBindGroupLayout];
   private readonly drawing: GPUShaderModule;
+  private readonly halving: GPUShaderModule;
   private readonly presenting: GPUShaderModule;
   private readonly draws = new Map<string, GPURenderPipeline>();
   private readonly presents = new Map<string, GPURenderPipeline>();
@@ -36,7 +39,7 @@ export class Programs {
       device.createShaderModule({ label, code: parts.join('\n') });
     const compute = (from: GPUShaderModule, entryPoint: string): GPUComputePipeline =>
       device.createComputePipeline({ layout: 'auto', compute: { module: from, entryPoint } });
-    this.prepare = compute(module('prepare', scene, viewColor, bounds, prepare), 'prepare');
+    this.prepare = compute(module('prepare', scene, viewColor, resize, bounds, prepare), 'prepare');
     const sorting = module('sort', sort);
     this.sort = {
       count: compute(sorting, 'count'),
@@ -44,7 +47,8 @@ export class Programs {
       scatter: compute(sorting, 'scatter'),
     };
     this.shareOut = compute(module('share_out', scene, batches, shareOut), 'share_out');
-    this.drawing = module('draw', scene, batches, draw);
+    this.drawing = module('draw', scene, batches, resize, draw);
+    this.halving = module('halve', halve);
     this.presenting = module('present', scene, present);
     this.layouts = this.makeLayouts();
   }
@@ -66,6 +70,7 @@ export class Programs {
       make(
         { binding: 0, visibility: FRAGMENT, texture: { sampleType: 'float', viewDimension: '2d-array' } },
         { binding: 1, visibility: FRAGMENT, sampler: { type: 'filtering' } },
+        { binding: 2, visibility: FRAGMENT, texture: { sampleType: 'float', viewDimension: '2d-array' } },
       ),
       make(
         {
@@ -95,6 +100,16 @@ export class Programs {
       this.draws.set(key, found);
     }
     return found;
+  }
+
+  // Renders a page at half its size.
+  halve(format: GPUTextureFormat): GPURenderPipeline {
+    const entryPoint = format === 'rgba8unorm' ? 'halve_bytes' : 'halve_floats';
+    return this.device.createRenderPipeline({
+      layout: 'auto',
+      vertex: { module: this.halving, entryPoint: 'page' },
+      fragment: { module: this.halving, entryPoint, targets: [{ format }] },
+    });
   }
 
   present(format: GPUTextureFormat): GPURenderPipeline {

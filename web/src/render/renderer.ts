@@ -1,6 +1,7 @@
 // Draws frames of a scene: to a target of sums, and from there to a screen.
 import type { Vec3 } from '../bundle/manifest';
 import type { View } from '../view/pose';
+import { type Sampling, samplingOf, sizeOf } from '../view/size';
 import type { Graphics } from './device';
 import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
 import { type SceneOnDevice, STRIDE, group } from './scene';
@@ -18,11 +19,14 @@ interface Target {
   width: number;
   height: number;
   format: TargetFormat;
+  samples: number; // of a pixel of the picture, along each axis
   sums: GPUTexture;
   before: GPUTexture;
   batch: GPUBindGroup;
 }
 
+const MOST_SAMPLES = 4; // per pixel, along each axis, of a picture that stays
+const MOST_PIXELS = 1 << 22; // of a target
 export const MOST_OVERDRAW = 64; // of the last colour of the map
 
 export class Renderer {
@@ -36,13 +40,13 @@ export class Renderer {
     readonly scene: SceneOnDevice,
   ) {
     const { device } = graphics;
-    this.screen = device.createBuffer({ size: 32, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
+    this.screen = device.createBuffer({ size: 48, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
     this.smooth = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
   }
 
-  private targetOf(width: number, height: number, format: TargetFormat): Target {
+  private targetOf(width: number, height: number, samples: number, format: TargetFormat): Target {
     const t = this.target;
-    if (t && t.width === width && t.height === height && t.format === format) return t;
+    if (t && t.samples === samples && t.width === width && t.height === height && t.format === format) return t;
     t?.sums.destroy();
     t?.before.destroy();
     const { device } = this.graphics;
@@ -57,11 +61,19 @@ export class Renderer {
         { binding: 1, resource: before.createView() },
       ],
     });
-    this.target = { width, height, format, sums, before, batch };
+    this.target = { width, height, samples, format, sums, before, batch };
     return this.target;
   }
 
-  private setFrame(view: View, width: number, height: number, look: Look): void {
+  private samplingOf(view: View, width: number, height: number, look: Look): Sampling {
+    const { photographed } = this.scene.info;
+    if (!photographed?.length) return { samples: 1, photoPixel: 1 };
+    const side = this.graphics.device.limits.maxTextureDimension2D;
+    const most = look.fine ? Math.max(1, Math.min(MOST_SAMPLES, Math.floor(side / Math.max(width, height)))) : 1;
+    return samplingOf(sizeOf(photographed, view), width * height, most, MOST_PIXELS);
+  }
+
+  private setFrame(view: View, width: number, height: number, photoPixel: number, look: Look): void {
     const { info, surfels, atlasSize, count } = this.scene;
     const data = new ArrayBuffer(160);
     const [f, u] = [new Float32Array(data), new Uint32Array(data)];
@@ -74,14 +86,21 @@ export class Renderer {
     f.set([width, height, info.near, info.weightBound], 24);
     f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
     u.set([count, surfels.kind, info.throughPixel ? 1 : 0, look.layers], 32);
-    u.set([SHOW[look.show], look.residuals ? 1 : 0, 0, 0], 36);
+    u.set([SHOW[look.show], look.residuals ? 1 : 0], 36);
+    f[38] = photoPixel;
+    u[39] = this.scene.detail;
     this.graphics.device.queue.writeBuffer(this.scene.frame, 0, data);
   }
 
-  private encode(encoder: GPUCommandEncoder, view: View, width: number, height: number, look: Look): Target {
+  private encode(encoder: GPUCommandEncoder, view: View, look: Look): Target {
+    const { width: pixelsAcross, height: pixelsDown } = view;
     const { scene, programs } = this;
-    const target = this.targetOf(width, height, look.fine && this.graphics.floats ? 'rgba32float' : 'rgba16float');
-    this.setFrame(view, width, height, look);
+    const { samples, photoPixel } = this.samplingOf(view, pixelsAcross, pixelsDown, look);
+    const [width, height] = [samples * pixelsAcross, samples * pixelsDown];
+    const format = look.fine && this.graphics.floats ? 'rgba32float' : 'rgba16float';
+    const target = this.targetOf(width, height, samples, format);
+    if (photoPixel < 1) scene.makeCoarser();
+    this.setFrame(view.scaledTo(width, height), width, height, photoPixel, look);
     encoder.clearBuffer(scene.visible);
     scene.encodeSorting(encoder);
     const pipeline = programs.draw(target.format, look.show === 'overdraw' ? 'count' : 'blend');
@@ -112,10 +131,11 @@ export class Renderer {
   ): void {
     const { device } = this.graphics;
     const pipeline = this.programs.present(to.format);
-    const data = new ArrayBuffer(32);
+    const data = new ArrayBuffer(48);
     new Float32Array(data).set([...look.background, 1, to.width, to.height]);
     new Uint32Array(data)[6] = SHOW[look.show];
     new Float32Array(data)[7] = look.show === 'overdraw' ? MOST_OVERDRAW : farthest;
+    new Uint32Array(data)[8] = target.samples;
     device.queue.writeBuffer(this.screen, 0, data);
     const bound = group(device, pipeline.getBindGroupLayout(0), [this.screen, target.sums.createView(), this.smooth]);
     const work = encoder.beginRenderPass({
@@ -131,7 +151,7 @@ export class Renderer {
   draw(view: View, to: GPUTexture, scale: number, look: Look, farthest: number): void {
     const encoder = this.graphics.device.createCommandEncoder();
     const [width, height] = [to.width, to.height].map((side) => Math.max(1, Math.round(side * scale)));
-    const target = this.encode(encoder, view.scaledTo(width, height), width, height, look);
+    const target = this.encode(encoder, view.scaledTo(width, height), look);
     this.encodePresent(encoder, target, to, look, farthest);
     this.graphics.device.queue.submit([encoder.finish()]);
   }
@@ -155,7 +175,7 @@ export class Renderer {
     const { COPY_DST, MAP_READ } = GPUBufferUsage;
     const buffer = device.createBuffer({ size: bytesPerRow * height, usage: COPY_DST | MAP_READ });
     const encoder = device.createCommandEncoder();
-    this.encodePresent(encoder, this.encode(encoder, view, width, height, look), to, look, farthest);
+    this.encodePresent(encoder, this.encode(encoder, view, look), to, look, farthest);
     encoder.copyTextureToBuffer({ texture: to }, { buffer, bytesPerRow }, [width, height]);
     device.queue.submit([encoder.finish()]);
     await buffer.mapAsync(GPUMapMode.READ);

@@ -31,9 +31,11 @@ export class SceneOnDevice {
   readonly draws: GPUBuffer;
   readonly layers: GPUBuffer;
   readonly drawn: GPUBindGroup;
-  readonly pages: GPUBindGroup;
   readonly decoded: boolean; // BC7 that this device does not draw as it is
-  readonly atlasSize: [number, number];
+  pages: GPUBindGroup;
+  complete: boolean; // with its texels, if it has any
+  private atlas: GPUTexture;
+  private coarser: GPUTexture | null = null;
   private readonly device: GPUDevice;
   private readonly preparing: GPUBindGroup;
   private readonly rounds: Record<SortEntry, GPUBindGroup>[] = [];
@@ -41,7 +43,7 @@ export class SceneOnDevice {
   private readonly blocks: number;
 
   constructor(
-    graphics: Graphics,
+    private readonly graphics: Graphics,
     private readonly programs: Programs,
     readonly info: Manifest,
     readonly surfels: Surfels,
@@ -85,10 +87,67 @@ export class SceneOnDevice {
     this.sharing = bind(programs.shareOut.getBindGroupLayout(0), this.frame, this.visible, this.draws);
     this.drawn = bind(programs.layouts[0], this.frame, stored, seen, order[0], this.visible);
     this.decoded = pages?.format === 'bc7' && !graphics.blocks;
-    const texture = this.texture(pages, graphics.blocks);
-    this.atlasSize = [texture.width, texture.height];
-    const sampler = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
-    this.pages = bind(programs.layouts[1], texture.createView({ dimension: '2d-array' }), sampler);
+    this.complete = pages !== null || info.atlas === null;
+    this.atlas = this.texture(pages, graphics.blocks);
+    this.pages = this.boundPages();
+  }
+
+  get atlasSize(): [number, number] {
+    return [this.atlas.width, this.atlas.height];
+  }
+  // DETAIL_* of scene.wgsl.
+  get detail(): number {
+    return this.complete ? (this.surfels.means ? 2 : 1) : 0;
+  }
+
+  // Texels that were not there at first.
+  setTexels(pages: Pages): void {
+    this.atlas = this.texture(pages, this.graphics.blocks);
+    this.coarser = null;
+    this.complete = true;
+    this.pages = this.boundPages();
+  }
+
+  // Any texture stands for coarser levels that are not looked at.
+  private boundPages(): GPUBindGroup {
+    const [atlas, coarser] = [this.atlas, this.coarser ?? this.atlas].map((t) =>
+      t.createView({ dimension: '2d-array' }),
+    );
+    const sampler = this.device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
+    return group(this.device, this.programs.layouts[1], [atlas, sampler, coarser]);
+  }
+
+  // Sees that the levels 1 and 2 of the tiles are there, for a view that is smaller than the photographs.
+  makeCoarser(): void {
+    if (this.coarser || !this.complete) return;
+    const { width, height, depthOrArrayLayers: layers } = this.atlas;
+    const format = this.atlas.format === 'rgba16float' ? 'rgba16float' : 'rgba8unorm';
+    const size: [number, number] = [Math.max(1, width >> 1), Math.max(1, height >> 1)];
+    const coarser = this.device.createTexture({
+      size: [...size, layers],
+      format,
+      mipLevelCount: Math.max(...size) > 1 ? 2 : 1,
+      usage: GPUTextureUsage.TEXTURE_BINDING | GPUTextureUsage.RENDER_ATTACHMENT,
+    });
+    const pipeline = this.programs.halve(format);
+    const encoder = this.device.createCommandEncoder();
+    const page = (texture: GPUTexture, baseMipLevel: number, baseArrayLayer: number): GPUTextureView =>
+      texture.createView({ dimension: '2d', baseMipLevel, mipLevelCount: 1, baseArrayLayer, arrayLayerCount: 1 });
+    for (let level = 0; level < coarser.mipLevelCount; level++) {
+      for (let layer = 0; layer < layers; layer++) {
+        const finer = level ? page(coarser, level - 1, layer) : page(this.atlas, 0, layer);
+        const work = encoder.beginRenderPass({
+          colorAttachments: [{ view: page(coarser, level, layer), loadOp: 'clear', storeOp: 'store' }],
+        });
+        work.setPipeline(pipeline);
+        work.setBindGroup(0, group(this.device, pipeline.getBindGroupLayout(0), [finer]));
+        work.draw(3);
+        work.end();
+      }
+    }
+    this.device.queue.submit([encoder.finish()]);
+    this.coarser = coarser;
+    this.pages = this.boundPages();
   }
 
   private checkRoom(): void {

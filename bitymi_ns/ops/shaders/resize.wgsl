@@ -1,0 +1,64 @@
+// A surfel in a view of another size than the photographs that it was trained on: as core/resize.h and core/texel.h.
+
+// Side of a photograph's pixel, for the kernels. One that is seen through a pixel is so through any.
+fn kernel_pixel() -> f32 {
+  return select(frame.photo_pixel, 1.0, frame.through_pixel != 0);
+}
+// Variance that a pixel adds along each axis, pixels^2.
+fn pixel_variance() -> f32 {
+  let p = kernel_pixel();
+  return max(0.0, (1.0 - p * p) / 12.0);
+}
+// 1 / squared radius of the low pass.
+fn low_pass_sharp() -> f32 {
+  let p = kernel_pixel();
+  return 1.0 / (p * p + 2.0 * pixel_variance());
+}
+
+// The surfel widened by the pixel, its low pass by the view's size; `area` then holds by how much that is higher than
+// the kernel.
+fn resized(seen: Seen) -> Seen {
+  var s = seen;
+  let variance = pixel_variance();
+  let p = kernel_pixel();
+  let share = p * p * low_pass_sharp();
+  s.area = -share;
+  if variance == 0.0 || !(s.w0 > 0.0) { return s; }
+  // M' = (1 + c M M^T)^(-1/2) M: sums of positive terms
+  let c = variance * 2.0 / SUPPORT2 * (s.beta + 2.0);
+  let u = s.u / s.w0;
+  let v = s.v / s.w0;
+  let uu = c * dot(u, u);
+  let uv = c * dot(u, v);
+  let vv = c * dot(v, v);
+  let across = c * (u.x * v.y - u.y * v.x);
+  let root = sqrt(1.0 + uu + vv + across * across);
+  let k = 1.0 / (root * sqrt(2.0 + uu + vv + 2.0 * root));
+  let inverse = vec3f(1.0 + vv + root, -uv, 1.0 + uu + root) * k;
+  s.u = inverse.x * seen.u + inverse.y * seen.v;
+  s.v = inverse.y * seen.u + inverse.z * seen.v;
+  s.opacity = seen.opacity / root;
+  s.area = -share * root;
+  return s;
+}
+
+// The level of a tile whose texels are about as large as a pixel, as far as the tile has it.
+fn tile_level(s: Seen, surfel: Surfel) -> u32 {
+  if surfel.sides == 0 || frame.detail == DETAIL_MEANS { return TILE_LEVELS; }
+  let p = frame.photo_pixel;
+  if !(p < 1.0) { return 0; }
+  let sides = vec2u(surfel.sides & 0xffff, surfel.sides >> 16);
+  let k = 0.5 / (surfel.extent * s.w0);
+  let area = sqrt(dot(s.u, s.u) * dot(s.v, s.v)) * k * k * f32(sides.x) * f32(sides.y);  // texels per pixel
+  let most = 1.0 / (p * p);
+  var level = 0u;
+  for (var size = 2.0; level < TILE_LEVELS && area > size && most >= size; size *= 4.0) { level++; }
+  if level > 0 && (max(sides.x, sides.y) >> level) <= 2 {
+    if frame.detail == DETAIL_ALL { return TILE_LEVELS; }
+    return 0;
+  }
+  level = min(level, TILE_LEVELS - 1);
+  let grid = surfel.tile.x | surfel.tile.y | sides.x | sides.y;
+  while level > 0 && (grid & ((1u << level) - 1)) != 0 { level--; }
+  return level;
+}

@@ -1,0 +1,60 @@
+// Columns of integers, a Zstandard frame for each byte of each number: docs/baking.md, "Columns of integers".
+import { DamagedBundle } from '../../errors';
+import { frameBytes } from '../zstd';
+
+export interface Column {
+  name: string;
+  step: number | null;
+  low: number[];
+  planes: number[][]; // sizes of the frames: by number, from its lowest byte
+}
+
+export type Codes = Float64Array | Int32Array;
+
+const bytesOf = (column: Column): number => column.planes.flat().reduce((sum, size) => sum + size, 0);
+
+// Refuses a file whose columns do not fill it, or are others than expected: [name, numbers in a row].
+export function checkColumns(columns: Column[], expected: [string, number][], size: number, file: string): void {
+  const names = (list: string[]): string => list.join(', ') || 'none';
+  const [found, wanted] = [columns.map((c) => c.name), expected.map(([name]) => name)];
+  if (names(found) !== names(wanted)) throw new DamagedBundle(`${file}: its columns are ${names(found)}.`);
+  columns.forEach((column, k) => {
+    const [name, numbers] = expected[k];
+    if (column.low.length !== numbers || column.planes.length !== numbers) {
+      throw new DamagedBundle(`${file}: the column ${name} needs ${numbers} numbers.`);
+    }
+  });
+  const stated = columns.reduce((sum, column) => sum + bytesOf(column), 0);
+  if (stated !== size) throw new DamagedBundle(`${file} has ${size} bytes, its columns need ${stated}.`);
+}
+
+// Hands out the columns of a file one after the other.
+export class ColumnReader {
+  private at = 0;
+  private next = 0;
+
+  constructor(
+    private readonly data: Uint8Array,
+    private readonly columns: Column[],
+    private readonly file: string,
+  ) {}
+
+  get name(): string | undefined {
+    return this.columns[this.next]?.name;
+  }
+
+  // The numbers of the next column: by number, of as many rows.
+  read<T extends Codes>(rows: number, make: (rows: number) => T): T[] {
+    const { low, planes } = this.columns[this.next++];
+    return low.map((least, k) => {
+      const codes = make(rows).fill(least) as T;
+      planes[k].forEach((size, plane) => {
+        const found = frameBytes(this.data.subarray(this.at, this.at + size), rows, this.file);
+        const weight = 256 ** plane;
+        for (let i = 0; i < rows; i++) codes[i] += weight * found[i];
+        this.at += size;
+      });
+      return codes;
+    });
+  }
+}

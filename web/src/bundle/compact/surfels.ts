@@ -1,0 +1,236 @@
+// surfels.bin: docs/baking.md says what the numbers of its columns stand for; bake/surfel_codes.py is their writer.
+import { DamagedBundle } from '../../errors';
+import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
+import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD, centred, originOf } from '../surfels';
+import { ColumnReader, checkColumns } from './columns';
+import { pack } from './packing';
+
+export const SURFELS_PER_BYTE = 256; // a file that is said to hold more is refused, and so many beside
+export const SPARE_SURFELS = 1 << 12;
+const PLACE_BITS = 17;
+const SHARE = 1 / 1024; // of their ranges: what opacities and betas keep from their ends
+const ALPHA_MIN = 1 / 255;
+const EXTENT = 3; // of surfels without a tile
+const LEAST_EXPONENT = 2; // of two, in the side of a tile
+const MOST_EXPONENT = 12;
+const MOST_TERMS = 32;
+const BENT = 50; // of sinh: beyond all limits
+const FILE = 'surfels.bin';
+// largest values: bake/limits.py
+const PLACES = 1e9;
+const LOG_SCALES = 104;
+const COLORS = 256;
+const EXTENTS: [number, number] = [1e-6, 16];
+// The numbers of a lean term that are no colours: from where on, and their limits.
+const SHAPES: Record<ViewKind, { at: number; limits: number[] }> = {
+  sv: { at: 0, limits: [2e7, 2e7, 2e7] },
+  sh: { at: 0, limits: [] },
+  sb: { at: 3, limits: [1e4, 1e4, 1e4] },
+  sg: { at: 0, limits: [1e6, 1e6, 1e6, 1e4] },
+};
+
+const clip = (x: number, low: number, high: number): number => Math.min(Math.max(x, low), high);
+const within = (x: number, limit: number): number => clip(x, -limit, limit);
+const logit = (share: number, least: number): number => {
+  const x = clip(share, least, 1 - SHARE);
+  return Math.log(x) - Math.log1p(-x);
+};
+const sinh = (x: number): number => Math.sinh(within(x, BENT));
+
+function expected(kind: ViewKind): [string, number][] {
+  const shapes = SHAPES[kind].limits.length;
+  return [
+    ['place', 1],
+    ['largest', 1],
+    ['rotation', 3],
+    ['log_scales', 2],
+    ['opacity', 1],
+    ['beta', 1],
+    ['size', 1],
+    ['residual', 3],
+    ['view_base', 3],
+    ['extent', 1],
+    ['view_count', 1],
+    ['term_shape', shapes],
+    ['term_color', LEAN_WIDTH[kind] - shapes],
+  ];
+}
+const STEPPED = ['place', 'rotation', 'log_scales', 'opacity', 'beta', 'residual', 'view_base', 'extent', 'term_shape'];
+
+// Every third bit of a number below 2^27, from the lowest.
+function thirds(key: number): number {
+  let cell = 0;
+  for (let i = 0; i < 9; i++) cell |= ((key >> (3 * i)) & 1) << i;
+  return cell;
+}
+
+// Colours of columns green, red less green, blue less green: their `number`-th, of row i.
+const red = (of: Float64Array[], at: number, i: number): number => of[at + 1][i] + of[at][i];
+const green = (of: Float64Array[], at: number, i: number): number => of[at][i];
+const blue = (of: Float64Array[], at: number, i: number): number => of[at + 2][i] + of[at][i];
+function color(to: Float32Array, first: number, of: Float64Array[], at: number, i: number, step: number): void {
+  [red, green, blue].forEach((channel, c) => (to[first + c] = within(step * channel(of, at, i), COLORS)));
+}
+
+class Decoder {
+  private readonly words: Float32Array;
+  private readonly numbers: Uint32Array;
+  private readonly codes = new Map<string, Float64Array[]>();
+  private readonly count: number;
+  private readonly terms: number;
+  private readonly stated: CompactSurfels;
+
+  constructor(
+    data: Uint8Array,
+    private readonly info: Manifest,
+  ) {
+    this.stated = info.compact!;
+    this.count = info.count;
+    this.terms = info.terms ?? 0;
+    const columns = this.stated.columns;
+    checkColumns(columns, expected(info.viewColor), data.length, FILE);
+    if (Math.max(this.count, this.terms) > SURFELS_PER_BYTE * data.length + SPARE_SURFELS) {
+      throw new DamagedBundle(`${FILE}: ${this.count} surfels cannot be in ${data.length} bytes.`);
+    }
+    for (const { name, step } of columns) {
+      if (step === null && (STEPPED.includes(name) || name === 'term_color')) this.refuse(`${name} has no step`);
+    }
+    const reader = new ColumnReader(data, columns, FILE);
+    for (let name = reader.name; name !== undefined; name = reader.name) {
+      this.codes.set(
+        name,
+        reader.read(this.rowsOf(name), (rows) => new Float64Array(rows)),
+      );
+    }
+    this.words = new Float32Array(this.count * SURFEL_WORDS);
+    this.numbers = new Uint32Array(this.words.buffer);
+  }
+
+  private refuse(why: string): never {
+    throw new DamagedBundle(`${FILE}: ${why}.`);
+  }
+  private column(name: string): Float64Array[] {
+    return this.codes.get(name)!;
+  }
+  private step(name: string): number {
+    return this.stated.columns.find((column) => column.name === name)?.step ?? 0;
+  }
+  private rowsOf(name: string): number {
+    if (name === 'extent') return this.column('size')[0].reduce((sum, size) => sum + (size > 0 ? 1 : 0), 0);
+    return name.startsWith('term_') ? this.terms : this.count;
+  }
+
+  private places(): void {
+    const { center, scale, low } = this.stated.frame;
+    const [differences, step] = [this.column('place')[0], this.step('place')];
+    let key = 0;
+    for (let i = 0, to = WORD.mean; i < this.count; i++, to += SURFEL_WORDS) {
+      key += differences[i];
+      if (differences[i] < 0 || key >= 2 ** (3 * PLACE_BITS)) this.refuse('places do not ascend, or leave their grid');
+      const [lower, upper] = [key % 2 ** 24, Math.floor(key / 2 ** 24)];
+      for (let a = 0; a < 3; a++) {
+        const cell = (thirds(lower >> a) & 0xff) | (thirds(upper >> a) << 8);
+        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), PLACES);
+      }
+    }
+  }
+
+  private rotations(): void {
+    const [largest, rest, step] = [this.column('largest')[0], this.column('rotation'), this.step('rotation')];
+    const quat = [0, 0, 0, 0];
+    for (let i = 0, to = WORD.quat; i < this.count; i++, to += SURFEL_WORDS) {
+      if (!(largest[i] >= 0 && largest[i] <= 3)) this.refuse("a rotation's largest number is not one of four");
+      let squares = 0;
+      for (let k = 0, from = 0; k < 4; k++) {
+        if (k === largest[i]) continue;
+        quat[k] = step * rest[from++][i];
+        squares += quat[k] * quat[k];
+      }
+      quat[largest[i]] = Math.sqrt(Math.max(0, 1 - squares));
+      const length = Math.max(Math.hypot(...quat), 1e-9);
+      for (let k = 0; k < 4; k++) this.words[to + k] = quat[k] / length;
+    }
+  }
+
+  private shapes(): void {
+    const step = (name: string): number => this.step(name);
+    const [scales, [opacity], [beta]] = ['log_scales', 'opacity', 'beta'].map((name) => this.column(name));
+    const [residual, base] = [this.column('residual'), this.column('view_base')];
+    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
+      for (let c = 0; c < 2; c++) {
+        this.words[to + WORD.logScale + c] = within(step('log_scales') * scales[c][i], LOG_SCALES);
+      }
+      this.words[to + WORD.opacity] = logit(step('opacity') * opacity[i], ALPHA_MIN);
+      this.words[to + WORD.beta] = logit(step('beta') * beta[i], SHARE);
+      color(this.words, to + WORD.residual, residual, 0, i, step('residual'));
+      color(this.words, to + WORD.base, base, 0, i, step('view_base'));
+    }
+  }
+
+  private tiles(): void {
+    const [[size], [extent]] = [this.column('size'), this.column('extent')];
+    const [u, v] = [new Uint16Array(this.count), new Uint16Array(this.count)];
+    const good = (exponent: number): boolean => exponent >= LEAST_EXPONENT && exponent <= MOST_EXPONENT;
+    for (let i = 0, tile = 0, to = WORD.extent; i < this.count; i++, to += SURFEL_WORDS) {
+      this.words[to] = EXTENT;
+      if (size[i] === 0) continue;
+      const exponents = [Math.floor(size[i] / 16), size[i] % 16];
+      if (!exponents.every(good)) this.refuse('a tile has a side that is not a power of two from 4 to 4096');
+      [u[i], v[i]] = exponents.map((exponent) => 1 << exponent);
+      this.words[to] = clip(this.step('extent') * extent[tile++], ...EXTENTS);
+    }
+    const atlas = this.info.atlas;
+    if (!atlas?.coded) {
+      if (u.some((side) => side > 0)) this.refuse('a surfel has a tile, and there is no atlas');
+      return;
+    }
+    const packing = pack(u, v, atlas.coded.pageWidth, atlas.coded.pageRows);
+    if (packing.width !== atlas.width || packing.height !== atlas.height || packing.layers !== atlas.layers) {
+      throw new DamagedBundle('bundle.json: width, height and layers of the atlas are not those of its tiles.');
+    }
+    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
+      if (!u[i]) continue;
+      this.numbers[to + WORD.tile] = packing.x[i];
+      this.numbers[to + WORD.tile + 1] = packing.y[i];
+      this.numbers[to + WORD.layer] = packing.layer[i];
+      this.numbers[to + WORD.sides] = u[i] | (v[i] << 16);
+    }
+  }
+
+  private viewColors(): Float32Array {
+    const kind = this.info.viewColor;
+    const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
+    const good = kind === 'sh' ? [0, 3, 8, 15] : Array.from({ length: MOST_TERMS + 1 }, (_, k) => k);
+    const width = LEAN_WIDTH[kind];
+    let first = 0;
+    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
+      if (!good.includes(counts[i])) this.refuse('a view colour has a number of terms that none can have');
+      this.numbers[to + WORD.firstTerm] = first * width;
+      this.numbers[to + WORD.terms] = counts[i];
+      first += counts[i];
+    }
+    if (first !== this.terms) this.refuse(`the view colours do not have the ${this.terms} terms of bundle.json`);
+    const { at, limits } = SHAPES[kind];
+    const colored = at === 0 ? limits.length : 0;
+    const out = new Float32Array(this.terms * width);
+    const [shapeStep, colorStep] = [this.step('term_shape'), this.step('term_color')];
+    for (let i = 0, to = 0; i < this.terms; i++, to += width) {
+      limits.forEach((limit, k) => (out[to + at + k] = within(sinh(shapeStep * shape[k][i]), limit)));
+      for (let c = 0; c < colors.length; c += 3) color(out, to + colored + c, colors, c, i, colorStep);
+    }
+    return out;
+  }
+
+  surfels(): Surfels {
+    this.places();
+    this.rotations();
+    this.shapes();
+    this.tiles();
+    const terms = this.viewColors();
+    const origin = originOf(this.info);
+    centred(this.words, origin);
+    return { count: this.count, words: this.words, terms, kind: KINDS[this.info.viewColor], origin, means: true };
+  }
+}
+
+export const readCompactSurfels = (data: Uint8Array, info: Manifest): Surfels => new Decoder(data, info).surfels();

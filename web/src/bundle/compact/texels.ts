@@ -1,0 +1,180 @@
+// texels.bin: the cosine transforms of the tiles (docs/baking.md), decoded to pages of bytes.
+import { DamagedBundle } from '../../errors';
+import type { Pages } from '../ktx2';
+import type { Atlas, CodedTexels } from '../manifest';
+import { SURFEL_WORDS, type Surfels, WORD } from '../surfels';
+import { ColumnReader, checkColumns } from './columns';
+
+export const TEXELS_PER_BYTE = 4096; // a file that is said to hold more is refused, and so many beside
+export const SPARE_TEXELS = 1 << 20;
+const MOST_TEXELS = 2 ** 30; // of all pages: four gigabytes
+const BLOCK = 8;
+const GRADES: [number, number] = [-8, 24];
+const MOST_PLANES = 3; // bytes of a coefficient
+const FILE = 'texels.bin';
+
+// The tiles of surfels, in their order.
+interface Tile {
+  surfel: number;
+  u: number;
+  v: number;
+}
+
+function tilesOf(surfels: Surfels): Tile[] {
+  const numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
+  const tiles: Tile[] = [];
+  for (let surfel = 0; surfel < surfels.count; surfel++) {
+    const sides = numbers[surfel * SURFEL_WORDS + WORD.sides];
+    if (sides) tiles.push({ surfel, u: sides & 0xffff, v: sides >>> 16 });
+  }
+  return tiles;
+}
+
+// C(k, i, count) of all frequencies k and places i.
+function cosines(count: number): number[][] {
+  return Array.from({ length: count }, (_, k) =>
+    Array.from({ length: count }, (_, i) => {
+      return Math.sqrt((k ? 2 : 1) / count) * Math.cos((Math.PI * (i + 0.5) * k) / count);
+    }),
+  );
+}
+
+// What each coefficient adds to the texels of a block, in the order in which they are kept: one row for each.
+function wavesOf(u: number, v: number): Float64Array[] {
+  const [across, down] = [cosines(u), cosines(v)];
+  const order: [number, number][] = [];
+  for (let k_v = 0; k_v < v; k_v++) for (let k_u = 0; k_u < u; k_u++) order.push([k_v, k_u]);
+  order.sort((a, b) => a[0] * u + a[1] * v - (b[0] * u + b[1] * v) || a[0] - b[0] || a[1] - b[1]);
+  return order.map(([k_v, k_u]) =>
+    Float64Array.from({ length: u * v }, (_, t) => {
+      return down[k_v][Math.floor(t / u)] * across[k_u][t % u];
+    }),
+  );
+}
+
+// Rounds to the nearest whole number, halves to the even one.
+const round = (x: number): number => {
+  const near = Math.round(x);
+  return near - x === 0.5 && near % 2 ? near - 1 : near;
+};
+
+class Painter {
+  private readonly pages: Uint32Array; // all of them
+  private readonly numbers: Uint32Array;
+  private readonly sums = [0, 1, 2].map(() => new Float64Array(BLOCK * BLOCK));
+
+  constructor(
+    private readonly atlas: Atlas,
+    private readonly surfels: Surfels,
+  ) {
+    const { width, height, layers } = atlas;
+    this.pages = new Uint32Array(width * height * layers).fill(this.code(0, 0, 0));
+    this.numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
+  }
+
+  private byte(value: number): number {
+    return round(Math.min(Math.max((value - this.atlas.offset) / this.atlas.scale, 0), 1) * 255);
+  }
+  private code(r: number, g: number, b: number): number {
+    return (this.byte(r) | (this.byte(g) << 8) | (this.byte(b) << 16) | (255 << 24)) >>> 0;
+  }
+
+  // Blocks of one size of all tiles; [channel][frequency * blocks + block] are the coefficients.
+  blocks(tiles: Tile[], u: number, v: number, blocks: number, coefficients: Int32Array[], steps: Float64Array): void {
+    const [waves, texels] = [wavesOf(u, v), u * v];
+    const [p0, p1, p2] = this.sums;
+    let block = 0;
+    tiles.forEach((tile, number) => {
+      if (Math.min(tile.u, BLOCK) !== u || Math.min(tile.v, BLOCK) !== v) return;
+      const row = tile.surfel * SURFEL_WORDS;
+      const [red, green, blue] = this.surfels.words.subarray(row + WORD.residual, row + WORD.residual + 3);
+      const { width, height } = this.atlas;
+      const [x, y, layer] = [WORD.tile, WORD.tile + 1, WORD.layer].map((word) => this.numbers[row + word]);
+      const first = (layer * height + y) * width + x;
+      const [a, b, c] = [steps[number] / Math.sqrt(3), steps[number] / Math.sqrt(2), steps[number] / Math.sqrt(6)];
+      for (let at_v = 0; at_v < tile.v; at_v += v) {
+        for (let at_u = 0; at_u < tile.u; at_u += u, block++) {
+          this.sums.forEach((sum, channel) => {
+            sum.fill(0, 0, texels);
+            const values = coefficients[channel];
+            for (let f = 0, from = block; f < texels; f++, from += blocks) {
+              const value = values[from];
+              if (value === 0) continue;
+              const wave = waves[f];
+              for (let t = 0; t < texels; t++) sum[t] += value * wave[t];
+            }
+          });
+          let t = 0;
+          for (let j = 0; j < v; j++) {
+            const to = first + (at_v + j) * width + at_u;
+            for (let i = 0; i < u; i++, t++) {
+              const grey = a * p0[t];
+              const [tilt, bend] = [b * p1[t], c * p2[t]];
+              this.pages[to + i] = this.code(
+                red + grey + tilt + bend,
+                green + grey - 2 * bend,
+                blue + grey - tilt + bend,
+              );
+            }
+          }
+        }
+      }
+    });
+  }
+
+  // The pages, each in memory of its own.
+  layers(): Uint8Array[] {
+    const size = this.atlas.width * this.atlas.height;
+    return Array.from({ length: this.atlas.layers }, (_, k) => {
+      return new Uint8Array(this.pages.slice(k * size, (k + 1) * size).buffer);
+    });
+  }
+}
+
+function check(data: Uint8Array, atlas: Atlas, coded: CodedTexels, found: number): void {
+  const texels = atlas.width * atlas.height * atlas.layers;
+  if (Math.max(coded.texels, texels) > TEXELS_PER_BYTE * data.length + SPARE_TEXELS || texels > MOST_TEXELS) {
+    throw new DamagedBundle(`${FILE}: ${texels} texels cannot be in ${data.length} bytes.`);
+  }
+  if (found !== coded.texels) {
+    throw new DamagedBundle(
+      `${FILE}: the tiles of the surfels have ${found} texels, bundle.json says ${coded.texels}.`,
+    );
+  }
+}
+
+export function readCompactTexels(data: Uint8Array, atlas: Atlas, surfels: Surfels): Pages {
+  const coded = atlas.coded!;
+  const tiles = tilesOf(surfels);
+  const held = new Map<string, { u: number; v: number; texels: number }>();
+  for (const tile of tiles) {
+    const [u, v] = [Math.min(tile.u, BLOCK), Math.min(tile.v, BLOCK)];
+    const of = held.get(`${u}x${v}`) ?? { u, v, texels: 0 };
+    of.texels += tile.u * tile.v;
+    held.set(`${u}x${v}`, of);
+  }
+  const names = [...held.keys()].sort();
+  check(
+    data,
+    atlas,
+    coded,
+    [...held.values()].reduce((sum, { texels }) => sum + texels, 0),
+  );
+  checkColumns(coded.columns, [['grade', 1], ...names.map((name): [string, number] => [name, 3])], data.length, FILE);
+  const reader = new ColumnReader(data, coded.columns, FILE);
+  const [grades] = reader.read(tiles.length, (rows) => new Float64Array(rows));
+  if (grades.some((grade) => !(grade >= GRADES[0] && grade <= GRADES[1]))) {
+    throw new DamagedBundle(`${FILE}: a grade is not from ${GRADES.join(' to ')}.`);
+  }
+  const painter = new Painter(atlas, surfels);
+  const steps = grades.map((grade) => coded.step * 2 ** (grade / 2));
+  for (const name of names) {
+    const { u, v, texels } = held.get(name)!;
+    if (coded.columns.find((column) => column.name === name)?.planes.some((planes) => planes.length > MOST_PLANES)) {
+      throw new DamagedBundle(`${FILE}: the coefficients ${name} have more than ${MOST_PLANES} bytes.`);
+    }
+    const coefficients = reader.read(texels, (rows) => new Int32Array(rows));
+    painter.blocks(tiles, u, v, texels / (u * v), coefficients, steps);
+  }
+  return { format: 'uint8', width: atlas.width, height: atlas.height, layers: painter.layers() };
+}

@@ -1,0 +1,46 @@
+// Decodes what decoder.ts asks for.
+import { ViewerError } from '../../errors';
+import type { Pages } from '../ktx2';
+import type { Atlas, Manifest } from '../manifest';
+import type { Surfels } from '../surfels';
+import { readCompactSurfels } from './surfels';
+import { readCompactTexels } from './texels';
+
+export type Job =
+  | { what: 'surfels'; data: ArrayBuffer; info: Manifest }
+  | { what: 'texels'; data: ArrayBuffer; atlas: Atlas; surfels: Surfels };
+
+export type Answer = { made: Surfels | Pages } | { made: null; title: string; detail: string; advice: string };
+
+function answer(made: Surfels | Pages, memory: Iterable<Float32Array | Uint8Array>): void {
+  postMessage({ made }, { transfer: [...memory].map((array) => array.buffer as ArrayBuffer) });
+}
+
+function run(job: Job): void {
+  const data = new Uint8Array(job.data);
+  if (job.what === 'surfels') {
+    const surfels = readCompactSurfels(data, job.info);
+    answer(surfels, [surfels.words, surfels.terms]);
+  } else {
+    const pages = readCompactTexels(data, job.atlas, job.surfels);
+    answer(pages, pages.layers);
+  }
+}
+
+function reasonOf(error: unknown): ViewerError {
+  if (error instanceof ViewerError) return error;
+  if (error instanceof RangeError) {
+    const room = 'There is not enough memory for it.';
+    return new ViewerError('This scene is too large for this device', room, 'Open it on a device with more memory.');
+  }
+  return new ViewerError('The viewer stopped', String(error), 'Reload the page to try again.');
+}
+
+addEventListener('message', ({ data: job }: MessageEvent<Job>) => {
+  try {
+    run(job);
+  } catch (error) {
+    const { title, message, advice } = reasonOf(error);
+    postMessage({ made: null, title, detail: message, advice } satisfies Answer);
+  }
+});

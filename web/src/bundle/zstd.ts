@@ -1,0 +1,115 @@
+// Zstandard frames of a stated size. fzstd decodes them; what it does not look at is looked at here, so that a damaged
+// frame is an error: it trusts the sizes of a frame, and never ends with one kind of table.
+import { decompress } from 'fzstd';
+import { DamagedBundle } from '../errors';
+
+const MAGIC = 0xfd2fb528;
+const MOST_IN_BLOCK = 1 << 17; // bytes, of what a block holds
+const MOST_ACCURACY = 6; // of the probabilities of a Huffman table's weights
+const SHORTEST_MATCH = 3; // bytes: so many more sequences than that a block cannot have
+
+class Bytes {
+  constructor(
+    private readonly data: Uint8Array,
+    public at: number,
+    private readonly end: number,
+  ) {}
+  // A little-endian number of `count` bytes.
+  number(count: number): number {
+    if (this.at + count > this.end) throw new Error('it ends early');
+    let value = 0;
+    for (let i = 0; i < count; i++) value += this.data[this.at++] * 2 ** (8 * i);
+    return value;
+  }
+  skip(count: number): void {
+    this.at += count;
+    if (this.at > this.end) throw new Error('it ends early');
+  }
+}
+
+// `count` bits from bit `at`, the lowest first; beyond the end they are 0.
+const bits = (data: Uint8Array, at: number, count: number): number => {
+  const byte = (k: number): number => data[(at >> 3) + k] ?? 0;
+  return ((byte(0) | (byte(1) << 8) | (byte(2) << 16)) >> (at & 7)) & ((1 << count) - 1);
+};
+
+// Whether a table of probabilities that begins at byte `at` gives all of them to one symbol. Its states then take no
+// bits, and whoever reads until the bits are used up reads forever. Nobody writes such a table: it says nothing.
+function oneSymbol(data: Uint8Array, at: number): boolean {
+  const accuracy = bits(data, 8 * at, 4) + 5;
+  if (accuracy > MOST_ACCURACY) return false; // which is refused elsewhere
+  let place = 8 * at + 4;
+  for (let symbol = 0; symbol < 256;) {
+    if (bits(data, place, accuracy + 1) === 2 ** (accuracy + 1) - 1) return true;
+    if (bits(data, place, accuracy) !== 1) return false; // not the probability 0
+    place += accuracy;
+    let more: number;
+    do {
+      more = bits(data, place, 2);
+      place += 2;
+      symbol += more;
+    } while (more === 3 && symbol < 256);
+    symbol++;
+  }
+  return false;
+}
+
+// A block of literals and sequences: that it has no more of them than it could hold.
+function checkCompressed(data: Uint8Array, begin: number, size: number): void {
+  const bytes = new Bytes(data, begin, begin + size);
+  const first = data[begin];
+  const [type, format] = [first & 3, (first >> 2) & 3];
+  let literals: number;
+  if (type < 2) {
+    const header = bytes.number(format & 1 ? (format & 2 ? 3 : 2) : 1);
+    literals = header >> (format & 1 ? 4 : 3);
+    bytes.skip(type === 0 ? literals : 1);
+  } else {
+    const width = format < 2 ? 10 : format === 2 ? 14 : 18;
+    const header = bytes.number((4 + 2 * width) >> 3);
+    literals = Math.floor(header / 16) % 2 ** width;
+    const packed = Math.floor(header / 2 ** (4 + width));
+    if (type === 2 && data[bytes.at] < 128 && oneSymbol(data, bytes.at + 1)) throw new Error('a table says nothing');
+    bytes.skip(packed);
+  }
+  const head = bytes.number(1);
+  let sequences = head;
+  if (head === 255) sequences = bytes.number(2) + 0x7f00;
+  else if (head > 127) sequences = (head - 128) * 256 + bytes.number(1);
+  if (literals + SHORTEST_MATCH * sequences > MOST_IN_BLOCK) throw new Error('a block holds too much');
+}
+
+// The number of bytes that a frame declares; null where it declares none. Throws where its blocks do not fill it.
+function declared(frame: Uint8Array): number | null {
+  const bytes = new Bytes(frame, 0, frame.length);
+  if (bytes.number(4) !== MAGIC) throw new Error('it is no frame');
+  const flags = bytes.number(1);
+  const single = (flags >> 5) & 1;
+  if (flags & 0b1011) throw new Error('it needs what is not there'); // reserved, dictionary
+  if (!single) bytes.skip(1);
+  const width = [single, 2, 4, 8][flags >> 6];
+  const size = width ? bytes.number(width) + (width === 2 ? 256 : 0) : null;
+  for (let last = 0; !last;) {
+    const head = bytes.number(3);
+    last = head & 1;
+    const [type, held] = [(head >> 1) & 3, head >> 3];
+    if (type === 3 || held > MOST_IN_BLOCK) throw new Error('a block is of no kind');
+    if (type === 2) checkCompressed(frame, bytes.at, held);
+    bytes.skip(type === 1 ? 1 : held);
+  }
+  bytes.skip(flags & 4);
+  if (bytes.at !== frame.length) throw new Error('something follows it');
+  return size;
+}
+
+// The bytes of a frame that must hold `size` of them; no memory is taken before its header has said so too.
+export function frameBytes(frame: Uint8Array, size: number, name: string): Uint8Array {
+  try {
+    const found = declared(frame);
+    if (found !== null && found !== size) throw new Error(`it declares ${found} bytes, ${size} are wanted`);
+    return decompress(frame, new Uint8Array(size));
+  } catch (error) {
+    const why = error instanceof Error ? error.message : String(error);
+    throw new DamagedBundle(`${name}: a Zstandard frame is damaged: ${why}.`);
+  }
+}

@@ -1,0 +1,46 @@
+// How a view of another size than the photographs is drawn: bitymi_ns/scene/sampling.py does the same.
+import { dot, subtract } from './vector';
+import type { View } from './pose';
+import type { Vec3 } from '../bundle/manifest';
+
+const AS_TRAINED = [0.75, 1.5]; // views between these sizes are drawn as in training
+const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, for what they are; in between it changes over
+const SAMPLE = 0.375; // a photograph's pixel is at least so many samples wide
+const FARTHEST = [1 / 64, 64];
+
+export interface Sampling {
+  samples: number; // per pixel, along each axis
+  photoPixel: number; // side of a photograph's pixel in samples
+}
+
+// How large a view shows what was photographed: 1 = as large as the photographs. `photographed` has rows x, y, z, rate.
+export function sizeOf(photographed: Float32Array, view: View): number {
+  const { pose } = view;
+  const sizes: number[] = [];
+  for (let i = 0; i < photographed.length; i += 4) {
+    const point: Vec3 = [photographed[i], photographed[i + 1], photographed[i + 2]];
+    const from = subtract(point, pose.position);
+    const z = dot(from, pose.forward);
+    if (!(z > 0)) continue;
+    const x = (view.fx * dot(from, pose.right)) / z + view.cx;
+    const y = (view.fy * dot(from, pose.down)) / z + view.cy;
+    if (x >= 0 && x < view.width && y >= 0 && y < view.height) {
+      sizes.push(Math.sqrt(view.fx * view.fy) / (z * photographed[i + 3]));
+    }
+  }
+  if (!sizes.length) return 1;
+  sizes.sort((a, b) => a - b);
+  return Math.min(Math.max(sizes[(sizes.length - 1) >> 1], FARTHEST[0]), FARTHEST[1]);
+}
+
+// `pixels` of the view; at most `mostSamples` per pixel along each axis, and `mostPixels` in all.
+export function samplingOf(size: number, pixels: number, mostSamples: number, mostPixels: number): Sampling {
+  const [low, high] = AS_TRAINED;
+  if (low <= size && size <= high) return { samples: 1, photoPixel: 1 };
+  const room = Math.floor(Math.sqrt(mostPixels / Math.max(pixels, 1)));
+  const samples = Math.max(1, Math.min(Math.ceil(SAMPLE / size), mostSamples, room));
+  let photoPixel = samples * size;
+  if (SMALLEST < size && size < low) photoPixel = SMALLEST ** (Math.log(low / size) / Math.log(low / SMALLEST));
+  else if (high < size && size < LARGEST) photoPixel = LARGEST ** (Math.log(size / high) / Math.log(LARGEST / high));
+  return { samples, photoPixel };
+}

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from bitymi_ns.bake import bake
+from bitymi_ns.bake.compact import compacted, with_coded_texels
 from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export
 from bitymi_ns.scene import Camera
@@ -26,8 +27,11 @@ def view() -> Camera:
     return front(WIDTH, HEIGHT, 3.0)
 
 
-def write(folder: Path, format: str = "bc7", count: int = 120, **options: object) -> Path:
-    """A bundle of the bake's test scene, with a camera and its photograph."""
+def write(
+    folder: Path, format: str = "bc7", count: int = 120, compact: bool = False, seen: bool = False, **options: object
+) -> Path:
+    """A bundle of the bake's test scene, with a camera and its photograph; `compact`: of version 3;
+    `seen`: photographed by this camera, so that it is drawn for the size of a view."""
     made = real_scene(make_surfels, count=count)
     camera = view()
     picture = io.BytesIO()
@@ -47,7 +51,10 @@ def write(folder: Path, format: str = "bc7", count: int = 120, **options: object
         "photograph-0001.jpg": picture.getvalue(),
     }
     with torch.no_grad():
-        export(bake(made, options=BakeOptions(format=format, **options)), folder, extra_files=extra)
+        baked = bake(made, [camera] if seen else [], options=BakeOptions(format=format, **options))
+        if compact:
+            baked = with_coded_texels(*compacted(baked, [], torch.zeros(3)))
+        export(baked, folder, extra_files=extra)
     return folder
 
 

@@ -35,6 +35,8 @@ const actions = {
   },
   // until the picture stays, or the page says why there is none
   settle: () => page.waitForFunction(settled, null, { polling: 200 }),
+  // until a picture is there without its texture
+  first: () => page.waitForFunction(() => document.documentElement.dataset.frame === 'first', null, { polling: 100 }),
   stir: () => page.evaluate(() => void (document.documentElement.dataset.frame = 'moving')),
   click: ([selector]) => page.click(selector),
   press: ([selector]) => page.evaluate(press, selector), // also where the screen is too small to show it

@@ -6,9 +6,11 @@ blends it, else in half.
 
 from __future__ import annotations
 
+import hashlib
 import http.server
 import json
 import shutil
+import time
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -18,7 +20,10 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.view import site_of, write_static
+from bitymi_ns.bundle.single import read_single, write_single
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.view import Site, site_of, write_static
+from tests.bundle.damage import signed
 from tests.view.browser import drive, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 
@@ -29,10 +34,10 @@ STATE = "document.documentElement.dataset.state"
 LINK = "location.hash"
 
 
-def difference(path: Path, bundle: Path) -> tuple[float, float]:
-    """Mean and largest difference of a saved picture from the CPU's."""
-    scene = read_bundle(bundle).scene
-    want = scene.render(view()).rgb.clamp(0, 1).numpy()
+def difference(path: Path, bundle: Path | BakedScene, share: float = 1.0) -> tuple[float, float]:
+    """Mean and largest difference of a saved picture, of that share of the size, from the CPU's."""
+    scene = bundle if isinstance(bundle, BakedScene) else read_bundle(bundle).scene
+    want = scene.render(view().scaled(share)).rgb.clamp(0, 1).numpy()
     got = np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
     assert got.shape == want.shape
     off = np.abs(got - want)
@@ -41,8 +46,8 @@ def difference(path: Path, bundle: Path) -> tuple[float, float]:
 
 @pytest.mark.parametrize(
     "format, options",
-    [("bc7", {}), ("uint8", {}), ("fp16", {}), ("bc7", {"tolerance": 0.0})],
-    ids=["bc7", "uint8", "fp16", "all terms"],
+    [("bc7", {}), ("uint8", {}), ("fp16", {}), ("bc7", {"tolerance": 0.0}), ("uint8", {"compact": True})],
+    ids=["bc7", "uint8", "fp16", "all terms", "compact"],
 )
 def test_frames_are_those_of_the_cpu_renderer(format: str, options: dict, tmp_path: Path) -> None:
     bundle = write(tmp_path / "b", format, **options)
@@ -51,6 +56,60 @@ def test_frames_are_those_of_the_cpu_renderer(format: str, options: dict, tmp_pa
     assert not found.problems
     mean, largest = difference(tmp_path / "p.png", bundle)
     assert mean < MEAN and largest < 12 / 255
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.25])
+@pytest.mark.parametrize("compact", [True, False], ids=["compact", "bc7"])
+def test_frames_of_other_sizes_are_those_of_the_cpu_renderer(compact: bool, share: float, tmp_path: Path) -> None:
+    bundle = write(tmp_path / "b", "uint8" if compact else "bc7", compact=compact, seen=True)
+    screen = (round(WIDTH * share), round(HEIGHT * share))
+    with served(site_of(bundle)) as address:
+        found = drive([["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]], screen)
+    assert not found.problems
+    mean, largest = difference(tmp_path / "p.png", bundle, share)
+    print(f"{'compact' if compact else 'bc7'}, {share}: mean {255 * mean:.2f}, largest {255 * largest:.1f} of 255")
+    assert mean < MEAN and largest < 12 / 255
+
+
+def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
+    """The server keeps them back until that picture is saved; the bundle is one file."""
+    bundle = write(tmp_path / "b", "uint8", compact=True)
+    single, first = tmp_path / "b.bitymi", tmp_path / "first.png"
+    write_single(bundle, single)
+    site = site_of(single)
+
+    def late() -> bytes:
+        for _ in range(600):
+            if first.exists():
+                break
+            time.sleep(0.1)
+        return site.read("bundle/texels.bin")
+
+    slow = Site(site.files, {**site.made, "bundle/texels.bin": late})
+    steps = [["first"], ["save", "#screenshot", first], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]]
+    with served(slow) as address:
+        found = drive([["goto", address], *steps], SCREEN)
+    assert not found.problems
+    with open(single, "rb") as file:
+        plain = read_single(file, textured=False).scene
+    assert difference(first, plain)[0] < MEAN and difference(tmp_path / "p.png", bundle)[0] < MEAN
+    assert difference(first, bundle)[0] > 4 * difference(first, plain)[0]
+
+
+@pytest.mark.parametrize("name", ["surfels.bin", "texels.bin"])
+def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: Path) -> None:
+    """Damaged past its hash, as whoever writes one on purpose would."""
+    bundle = write(tmp_path / "b", "uint8", compact=True)
+    data = bytearray((bundle / name).read_bytes())
+    data[4] ^= 8  # of the first frame's header
+    (bundle / name).write_bytes(data)
+    info = json.loads((bundle / "bundle.json").read_text())
+    info["files"][name]["sha256"] = hashlib.sha256(data).hexdigest()
+    (bundle / "bundle.json").write_bytes(signed(info))
+    with served(site_of(bundle)) as address:
+        found = drive([["goto", address], ["settle"], ["ask", STATE], ["ask", "document.body.innerText"]], SCREEN)
+    assert found.results[-2] == "error"
+    assert "damaged" in found.results[-1] and "Zstandard frame" in found.results[-1]
 
 
 def test_every_control(bundle: Path, tmp_path: Path) -> None:

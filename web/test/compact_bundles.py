@@ -1,4 +1,4 @@
-"""Writes compact.json: little compact bundles, and what the package reads of them. Run it from the root of a checkout."""
+"""Writes compact.json: little compact bundles, and what the package reads of them; from the root of a checkout."""
 
 from __future__ import annotations
 

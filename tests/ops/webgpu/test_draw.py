@@ -103,7 +103,9 @@ def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded() -> None:
 def test_more_batches_come_closer_to_the_weight_bound() -> None:
     scene, camera = replace(textured(200, 3), weight_bound=0.05), front()
     want = scene.render(camera).rgb
-    off = [float((webgpu.draw(scene, [camera], None, ["rgb"], layers=n)["rgb"][0] - want).abs().mean()) for n in (1, 8, 64)]
+    off = [
+        float((webgpu.draw(scene, [camera], None, ["rgb"], layers=n)["rgb"][0] - want).abs().mean()) for n in (1, 8, 64)
+    ]
     assert off[0] > off[1] > off[2] and off[2] < 0.5 * STEP
 
 

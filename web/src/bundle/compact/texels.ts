@@ -52,15 +52,23 @@ function wavesOf(u: number, v: number): Float64Array[] {
   );
 }
 
-// Rounds to the nearest whole number, halves to the even one.
-const round = (x: number): number => {
-  const near = Math.round(x);
-  return near - x === 0.5 && near % 2 ? near - 1 : near;
-};
+// The texels of a block of one channel; every `stride`-th number from `first` on is a coefficient.
+function inverse(values: Int32Array, first: number, stride: number, waves: Float64Array[], texels: Float64Array): void {
+  const count = waves.length;
+  for (let t = 0; t < count; t++) texels[t] = 0;
+  for (let f = 0, from = first; f < count; f++, from += stride) {
+    const value = values[from];
+    if (value === 0) continue; // most of them
+    const wave = waves[f];
+    for (let t = 0; t < count; t++) texels[t] += value * wave[t];
+  }
+}
 
 class Painter {
   private readonly pages: Uint32Array; // all of them
   private readonly numbers: Uint32Array;
+  private readonly offset: number;
+  private readonly perByte: number;
   private readonly sums = [0, 1, 2].map(() => new Float64Array(BLOCK * BLOCK));
 
   constructor(
@@ -68,12 +76,16 @@ class Painter {
     private readonly surfels: Surfels,
   ) {
     const { width, height, layers } = atlas;
+    this.offset = atlas.offset;
+    this.perByte = 255 / atlas.scale;
     this.pages = new Uint32Array(width * height * layers).fill(this.code(0, 0, 0));
     this.numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
   }
 
+  // The nearest byte of a residual colour.
   private byte(value: number): number {
-    return round(Math.min(Math.max((value - this.atlas.offset) / this.atlas.scale, 0), 1) * 255);
+    const x = (value - this.offset) * this.perByte;
+    return x > 0 ? (x < 255 ? (x + 0.5) | 0 : 255) : 0;
   }
   private code(r: number, g: number, b: number): number {
     return (this.byte(r) | (this.byte(g) << 8) | (this.byte(b) << 16) | (255 << 24)) >>> 0;
@@ -81,7 +93,7 @@ class Painter {
 
   // Blocks of one size of all tiles; [channel][frequency * blocks + block] are the coefficients.
   blocks(tiles: Tile[], u: number, v: number, blocks: number, coefficients: Int32Array[], steps: Float64Array): void {
-    const [waves, texels] = [wavesOf(u, v), u * v];
+    const waves = wavesOf(u, v);
     const [p0, p1, p2] = this.sums;
     let block = 0;
     tiles.forEach((tile, number) => {
@@ -94,22 +106,16 @@ class Painter {
       const [a, b, c] = [steps[number] / Math.sqrt(3), steps[number] / Math.sqrt(2), steps[number] / Math.sqrt(6)];
       for (let at_v = 0; at_v < tile.v; at_v += v) {
         for (let at_u = 0; at_u < tile.u; at_u += u, block++) {
-          this.sums.forEach((sum, channel) => {
-            sum.fill(0, 0, texels);
-            const values = coefficients[channel];
-            for (let f = 0, from = block; f < texels; f++, from += blocks) {
-              const value = values[from];
-              if (value === 0) continue;
-              const wave = waves[f];
-              for (let t = 0; t < texels; t++) sum[t] += value * wave[t];
-            }
-          });
+          for (let channel = 0; channel < 3; channel++) {
+            inverse(coefficients[channel], block, blocks, waves, this.sums[channel]);
+          }
           let t = 0;
           for (let j = 0; j < v; j++) {
             const to = first + (at_v + j) * width + at_u;
             for (let i = 0; i < u; i++, t++) {
               const grey = a * p0[t];
-              const [tilt, bend] = [b * p1[t], c * p2[t]];
+              const tilt = b * p1[t];
+              const bend = c * p2[t];
               this.pages[to + i] = this.code(
                 red + grey + tilt + bend,
                 green + grey - 2 * bend,

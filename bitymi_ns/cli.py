@@ -264,7 +264,7 @@ class View:
     """Show a bundle in the browser; or write it with its page as a folder, which any web server can send."""
 
     bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle."""
+    """Folder of the bundle, or its one file."""
     export: Path | None = None
     """Folder to write the page and the bundle to; none = show it now."""
     overwrite: Flag = False

@@ -84,6 +84,7 @@ export async function loadBundle(folder: string, progress: Progress): Promise<Bu
   const { Decoder } = await import('./compact/decoder');
   const decoder = new Decoder();
   const surfels = await decoder.surfels(table, info);
+  if (!info.atlas) decoder.end();
   const texels = async (of: Atlas): Promise<Pages> => decoder.texels(await load('texels.bin'), of, surfels);
   return { info, surfels, pages: null, later: info.atlas ? () => texels(info.atlas!) : null, cameras };
 }

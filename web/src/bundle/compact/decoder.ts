@@ -13,7 +13,7 @@ export class Decoder {
   private ask<T extends Surfels | Pages>(job: Job, data: ArrayBuffer): Promise<T> {
     return new Promise((resolve, reject) => {
       const end = setTimeout(() => {
-        this.worker.terminate();
+        this.end();
         reject(new DamagedBundle(`${job.what}.bin cannot be decoded in ${LONGEST / 1000} seconds.`));
       }, LONGEST);
       this.worker.onmessage = ({ data: answer }: MessageEvent<Answer>) => {
@@ -39,7 +39,11 @@ export class Decoder {
     try {
       return await this.ask({ what: 'texels', data, atlas, surfels: { ...surfels, terms: new Float32Array() } }, data);
     } finally {
-      this.worker.terminate();
+      this.end();
     }
+  }
+
+  end(): void {
+    this.worker.terminate();
   }
 }

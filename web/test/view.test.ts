@@ -4,6 +4,7 @@ import { commonTarget, parseCameras } from '../src/view/cameras';
 import { Pace } from '../src/view/pace';
 import { DEFAULT_LENS, View, look, lookAt, orbit } from '../src/view/pose';
 import { fromHash, toHash } from '../src/view/share';
+import { samplingOf, sizeOf } from '../src/view/size';
 import { dot, length, subtract } from '../src/view/vector';
 
 const UP: Vec3 = [0, 0, 1];
@@ -89,5 +90,38 @@ describe('the pace', () => {
     expect(pace.scale).toBeGreaterThan(0.4);
     for (let k = 0; k < 60; k++) pace.took(4 * pace.scale ** 2);
     expect(pace.scale).toBeGreaterThan(0.92);
+  });
+});
+
+describe('views of other sizes', () => {
+  // what bitymi_ns.scene.sampling gives for a thousand pixels
+  it.each([
+    [1 / 64, 4, 0.0625],
+    [0.1, 4, 0.4],
+    [0.25, 2, 0.5],
+    [0.3, 2, 0.6],
+    [0.5, 1, 0.5],
+    [0.6, 1, 0.682859316],
+    [0.74, 1, 0.977314471],
+    [0.8, 1, 1],
+    [1.4, 1, 1],
+    [1.6, 1, 1.168242471],
+    [1.9, 1, 1.76748927],
+    [3, 1, 3],
+  ])('of %d are drawn as the package draws them', (size, samples, photoPixel) => {
+    const found = samplingOf(size, 1000, 4, 1 << 24);
+    expect(found.samples).toBe(samples);
+    expect(found.photoPixel).toBeCloseTo(photoPixel, 8);
+  });
+  it('have no more samples than there is room for', () => {
+    expect(samplingOf(0.05, 1 << 22, 4, 1 << 24)).toEqual({ samples: 2, photoPixel: 0.1 });
+    expect(samplingOf(0.05, 1 << 24, 4, 1 << 24).samples).toBe(1);
+  });
+  it('are told by the points in the picture', () => {
+    const view = new View(lookAt([0, 0, -4], [0, 0, 0], [0, -1, 0]), 60, 60, 30, 20, 60, 40);
+    const points = (...rows: number[][]): Float32Array => Float32Array.from(rows.flat());
+    expect(sizeOf(points([0, 0, 0, 15], [0.5, 0, 0, 15], [0, 0, -9, 1], [99, 0, 0, 1]), view)).toBeCloseTo(1);
+    expect(sizeOf(points([0, 0, 0, 30]), view)).toBeCloseTo(0.5);
+    expect(sizeOf(points([0, 0, -9, 1]), view)).toBe(1);
   });
 });

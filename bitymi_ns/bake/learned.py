@@ -23,7 +23,7 @@ def learned(scene: BakeableScene, options: BakeOptions) -> Baked:
     drawn. `pipeline.reduced` then leaves out what the options say.
 
     Args:
-        scene: with a `TexelField`, on the CPU.
+        scene: with a `TexelField`.
         options: see `BakeOptions`.
 
     Raises:
@@ -34,8 +34,8 @@ def learned(scene: BakeableScene, options: BakeOptions) -> Baked:
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {len(scene.surfels['means'])}: left out {left_out}")
     surfels = {name: value.detach()[rows].float().cpu() for name, value in scene.surfels.items()}
-    field = copy.deepcopy(scene.field)
-    assert isinstance(field, TexelField)
+    assert isinstance(scene.field, TexelField)
+    field, rows = copy.deepcopy(scene.field).cpu(), rows.cpu()
     field.keep(rows)
     bare = field.size.long().prod(1) == 1  # their one texel is their constant
     packing = pack(torch.where(bare[:, None], 0, field.size), options.page_width, options.page_rows)

@@ -74,7 +74,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
-        self._settle_texture()
+        self.pipeline.model.scene = self.pipeline.model.scene.settled(self.machine.device_type)
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
@@ -132,16 +132,6 @@ class BitymiTrainerConfig(TrainerConfig):
             why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"
             text += f", the short schedule ({why}); for the full one: --max-num-iterations {self.default_iterations}"
         return text
-
-    def _settle_texture(self) -> None:
-        """Choose by the device what is left to it."""
-        model, device = self.pipeline.model, self.machine.device_type
-        model.scene = model.scene.settled(device)
-        if model.scene.texture == "texels" and device != "cpu":
-            fail(
-                "texels learn on the CPU alone: leave --pipeline.model.scene.texture at auto, which takes the field on "
-                "a GPU, or add --machine.device-type cpu"
-            )
 
     def _make_paths_absolute(self) -> None:
         """So that the capture is found from any folder, also by the commands that read config.yml later."""

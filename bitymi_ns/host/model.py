@@ -82,13 +82,6 @@ class BitymiModel(SurfelModel):
         self.resume_state: dict[str, Any] = {}
         self._run: TrainingRun | None = None
 
-    def to(self, *args: Any, **kwargs: Any) -> BitymiModel:
-        """As `SurfelModel.to`; a scene of texels stays on the CPU, where their kernels are."""
-        if self.config.scene.texture == "texels":
-            return self
-        super().to(*args, **kwargs)
-        return self
-
     # rendering
 
     @property

@@ -1,9 +1,8 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image`, `texel_colors`
-and their gradients run on the CPU only, `field_tiles` on a CUDA device only: elsewhere they raise a RuntimeError that
-says so.
-`baked.draw` draws a baked scene on both, by `baked_cpu` or `baked_cuda`.
+Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image`, its
+gradient and `TexelFragments` are for the CPU only, `field_tiles` for a CUDA device only: elsewhere they raise a
+RuntimeError that says so. `baked.draw` draws a baked scene on both, by `baked_cpu` or `baked_cuda`.
 """
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
@@ -17,6 +16,7 @@ from .texel import (
     TexelDescent,
     TexelFragments,
     TexelTiles,
+    add_list_coverage,
     add_texel_coverage,
     add_texel_gradient,
     texel_colors,
@@ -36,6 +36,7 @@ __all__ = [
     "TexelFragments",
     "TexelTiles",
     "TooManyFragments",
+    "add_list_coverage",
     "add_texel_coverage",
     "add_texel_gradient",
     "band",

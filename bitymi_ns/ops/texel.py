@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, require
+from .backend import cuda_backend, dense, kernel, module, on_same_device, require
 from .trace import FRAGMENT, Fragments, by_name
 
 
@@ -50,9 +51,9 @@ class TexelTiles:
         """What the kernels take of each tile."""
         return {"first": self.first, "size": self.size, "extent": self.extent}
 
-    @property
+    @functools.cached_property
     def count(self) -> int:
-        """T: texels of all tiles."""
+        """T: texels of all tiles. Read back once: a step must not wait for the device to tell."""
         return int(self.size.long().prod(dim=1).sum())
 
 
@@ -248,6 +249,51 @@ def add_texel_coverage(
     add_texel_gradient(counts, fragments, grey, torch.zeros_like(total), tiles, 0.0, total)
 
 
+def _backward_memory(texels: Tensor, surfels: int, sums_texels: bool) -> dict[str, Tensor]:
+    """Working memory of the backward kernel of `texel_colors`, by name: none on the CPU.
+
+    On CUDA: a row of four numbers per texel, where their gradients are added up; where torch is asked for deterministic
+    algorithms, int64 sums in its place, as in `field.backward_memory`.
+    """
+    if not cuda_backend(texels.device):
+        return {}
+    entries = 4 * len(texels) if sums_texels else 0
+    if not torch.are_deterministic_algorithms_enabled():
+        return {"texel_work": texels.new_empty(entries)} if entries else {}
+    numbers = module(texels.device).exact_size(entries, surfels, False)
+    return {"exact_work": torch.empty(numbers, dtype=torch.int64, device=texels.device)}
+
+
+def add_list_coverage(
+    fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor
+) -> None:
+    """What `add_texel_coverage` adds, of a fragment list as it was traced; on either device.
+
+    Args:
+        fragments: of an H x W view.
+        tiles: where the T texels lie.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        bound: fragments of weight below this count as nothing.
+        total: [T, 3] of the fragments' dtype, dense, added to, alike in all columns.
+    """
+    counts = dense(fragments.weight, total)
+    if mask is not None:
+        counts = counts * mask.reshape(-1)[fragments.pixel.long()]
+    share, base = total.new_ones(len(total)), total.new_zeros(fragments.surfels, 3)
+    # the gradient of colours of which no channel is cut off, as a step of length -1
+    kernel("texel_colors_backward", total)(
+        **by_name(fragments.arrays),
+        **tiles.arrays,
+        **_backward_memory(total, len(base), True),
+        **{"bound": bound, "base": base, "texels": total, "moved": total, "share": share, "rate": -1.0},
+        colors=total.new_ones(len(fragments), 3),
+        dcolors=counts[:, None].expand(-1, 3).contiguous(),
+        dbase=None,
+        dtexels=None,
+        duv=None,
+    )
+
+
 class _TexelColors(torch.autograd.Function):
     @staticmethod
     def forward(ctx, base, texels, uv, fragments, tiles, bound, descent):
@@ -271,6 +317,7 @@ class _TexelColors(torch.autograd.Function):
         given = {"colors": colors, "dcolors": dense(dcolors, texels), "rate": 0.0}
         if ctx.descent is not None:
             given |= {"moved": texels, "share": ctx.descent.share, "rate": ctx.descent.rate}
+        given |= _backward_memory(texels, len(base), dtexels is not None or ctx.descent is not None)
         kernel("texel_colors_backward", texels)(**arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv)
         return dbase, dtexels, duv, None, None, None, None
 
@@ -287,7 +334,8 @@ def texel_colors(
     """Colour of every fragment, ReLU(ReLU(f_view(d) + 0.5) + r(u, v)), with the texels' residual r of `texel_image`.
 
     Differentiable in `base`, `texels` and the fragments' coordinates. Along u and v the slope is that of the bilinear
-    fetch, and 0 beyond the outer texel centres. Sums do not depend on the number of threads.
+    fetch, and 0 beyond the outer texel centres. Sums do not depend on the number of threads of the CPU; those of a card
+    are the same from call to call after torch.use_deterministic_algorithms(True).
 
     Args:
         fragments: F fragments, of N surfels.
@@ -304,10 +352,10 @@ def texel_colors(
 
     Raises:
         ValueError: the tiles are not those of these texels or surfels, or the fragments those of others; or texels
-            that ask for a gradient are to be moved.
-        RuntimeError: the tensors are not on the CPU.
+            that ask for a gradient are to be moved; or tensors lie on several devices.
     """
-    _on_the_cpu("texel_colors", texels)
+    named = {"share": descent.share} if descent is not None else {}
+    on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
     _check(base, texels, tiles)
     if fragments.surfels != len(base):
         raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")

@@ -191,7 +191,7 @@ class TexelField(nn.Module):
     def shade(
         self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
     ) -> Tensor:
-        """See `ResidualField`; on the CPU only."""
+        """See `ResidualField`."""
         descent = self.descent if learns else None
         texels = self.texels if learns and descent is None else self.texels.detach()
         return texel_colors(fragments, base, texels, self.tiles, bound, moves_surfels, descent)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import TexelDescent, TexelFragments, add_texel_coverage, fitting_lists, project
+from bitymi_ns.ops import TexelDescent, add_list_coverage, fitting_lists, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
@@ -73,7 +73,7 @@ def blank_texels(scene: Scene, views: Sequence[View], count: int, options: Texel
     A surfel of which no view shows a residual has one texel.
 
     Args:
-        scene: its surfels; on the CPU.
+        scene: its surfels.
         views: those that are looked through.
         count: of all training views, which these stand for.
         options: see `TexelConfig`.
@@ -128,8 +128,13 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     total = torch.zeros_like(field.texels)
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
-        projection = project(*geometry, view.camera, scene.near, scene.config.through_pixel)
-        bound = scene.config.weight_bound
-        shown = TexelFragments.of_lists((each, each.weight >= bound) for each in fitting_lists(projection))
-        add_texel_coverage(shown, field.tiles, view.mask, total)
+        camera, mask, top = view.camera.to(total.device), view.mask, 0
+        projection = project(*geometry, camera, scene.near, scene.config.through_pixel)
+        if mask is not None:
+            mask = mask.to(total.device).reshape(camera.height, camera.width)
+        for fragments in fitting_lists(projection):
+            rows = None if mask is None else mask[top : top + fragments.height]
+            add_list_coverage(fragments, field.tiles, rows, scene.config.weight_bound, total)
+            top += fragments.height
+            del fragments  # before the next list is made
     return total[:, 0]

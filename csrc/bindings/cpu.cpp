@@ -94,8 +94,6 @@ void bind_operations(nb::module_& m) {
   bind_tracer<S>(m);
   bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
   bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
-  bind_operation(m, name("texel_colors_forward"), &texel_colors_forward<S>);
-  bind_operation(m, name("texel_colors_backward"), &texel_colors_backward<S>);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }
 }  // namespace

@@ -5,18 +5,20 @@
 
 // Functions of bt and of bt::cuda, templates of the type of number.
 // clang-format off
-#define BT_OPERATIONS(each) \
-  each(project_forward)     \
-  each(project_backward)    \
-  each(trace_backward)      \
-  each(composite_forward)   \
-  each(composite_backward)  \
-  each(view_color_forward)  \
-  each(view_color_backward) \
-  each(lean_color)          \
-  each(field_forward)       \
-  each(field_backward)      \
-  each(shade_forward)       \
-  each(shade_backward)      \
+#define BT_OPERATIONS(each)   \
+  each(project_forward)       \
+  each(project_backward)      \
+  each(trace_backward)        \
+  each(composite_forward)     \
+  each(composite_backward)    \
+  each(view_color_forward)    \
+  each(view_color_backward)   \
+  each(lean_color)            \
+  each(field_forward)         \
+  each(field_backward)        \
+  each(shade_forward)         \
+  each(shade_backward)        \
+  each(texel_colors_forward)  \
+  each(texel_colors_backward) \
   each(ssim)
 // clang-format on

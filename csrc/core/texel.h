@@ -76,9 +76,14 @@ BT_HD Vec3<S> texel_fetch(const S* tile, const TexelCorners<S>& c) {
   for (int k = 1; k < 4; ++k) sum = sum + c.weight[k] * load3(tile + 3 * c.at[k]);
   return sum;
 }
+// add(k, gradient of corner k).
+template <class S, class F>
+BT_HD void texel_corner_gradients(const TexelCorners<S>& c, Vec3<S> g, F&& add) {
+  for (int k = 0; k < 4; ++k) add(k, c.weight[k] * g);
+}
 template <class S>
 BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
-  for (int k = 0; k < 4; ++k) store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + c.weight[k] * g);
+  texel_corner_gradients(c, g, [&](int k, Vec3<S> d) { store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + d); });
 }
 // Adds the gradient with respect to u and v. It is 0 beyond the outer texel centres; at a centre, where the slope
 // jumps, it is that of the side of larger coordinates.
@@ -91,6 +96,12 @@ BT_HD void texel_fetch_uv_vjp(const S* tile, const TexelCorners<S>& c, int r_u, 
   // of the last texel the neighbour is itself: the difference is 0
   if (c.x > S(0)) du += S(r_u) / (S(2) * extent) * ((S(1) - fy) * (along[1] - along[0]) + fy * (along[3] - along[2]));
   if (c.y > S(0)) dv += S(r_v) / (S(2) * extent) * ((S(1) - fx) * (along[2] - along[0]) + fx * (along[3] - along[1]));
+}
+
+// Where a step takes a texel whose gradient is g.
+template <class S>
+BT_HD Vec3<S> texel_step(Vec3<S> texel, Vec3<S> g, S rate, S share) {
+  return texel + -rate * share * g;
 }
 
 }  // namespace bt

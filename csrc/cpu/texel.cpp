@@ -11,23 +11,6 @@
 namespace bt {
 
 namespace {
-// What the fragments of one surfel share.
-template <class S>
-struct Patch {
-  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
-  int64_t first;        // texel
-  S extent;
-  Vec3<S> view;  // the colour without residual
-
-  Patch(const TexelTiles<S>& tiles, int64_t id)
-      : size(tiles.size + 2 * id),
-        first(tiles.first[id]),
-        extent(tiles.extent[id]),
-        view(view_base(load3(tiles.base + 3 * id))) {}
-  bool textured() const { return size[0] > 0; }
-  TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
-};
-
 // Fragments of one surfel that follow each other, from `start[r]` to `start[r + 1]`; `order` sorts the runs by surfel.
 struct Runs {
   const int32_t* surfel;  // of every fragment
@@ -77,19 +60,16 @@ void texel_image_forward(const TexelForward<S>& a) {
   const TexelFragments<S>& f = a.f;
   const TexelTiles<S>& table = a.table;
   const int64_t *tile_start = a.layout.start, tiles = a.layout.tiles;
-  const S *texels = table.values, bound = a.bound;
+  const S bound = a.bound;
   S* image = a.image;
   std::fill(image, image + 3 * a.pixels, S(0));
   parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     for (int64_t i = tile_start[first]; i < tile_start[last];) {
       const int32_t id = f.surfel[i];
-      const Patch<S> patch(table, id);
+      const TexelPatch<S> patch(table, id);
       for (; i < tile_start[last] && f.surfel[i] == id; ++i) {
         Vec3<S> c = patch.view;
-        if (patch.textured() && f.weight[i] >= bound) {
-          const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
-          c = shaded(c, texel_fetch(texels + 3 * patch.first, corners));
-        }
+        if (patch.textured() && f.weight[i] >= bound) c = patch.color(patch.corners(f.uv[i], f.uv[f.count + i]));
         S* to = image + 3 * int64_t(f.pixel[i]);
         store3(to, load3(to) + f.weight[i] * c);
       }
@@ -102,19 +82,19 @@ void texel_image_backward(const TexelBackward<S>& a) {
   const TexelFragments<S>& f = a.f;
   const TexelTiles<S>& table = a.table;
   const Runs runs{f.surfel, a.runs.start, a.order, a.runs.tiles};
-  const S *base = table.base, *texels = table.values, *dimage = a.dimage, bound = a.bound;
+  const S *base = table.base, *dimage = a.dimage, bound = a.bound;
   S *dtexels = a.dtexels, *dbase = a.dbase;
   if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
   for_surfels(runs, [&](int64_t first, int64_t last) {
     const int64_t id = runs.id(first);
-    const Patch<S> patch(table, id);
+    const TexelPatch<S> patch(table, id);
     for (int64_t r = first; r < last; ++r) {
       Vec3<S> sum = {S(0), S(0), S(0)};
       for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
         Vec3<S> g = f.weight[i] * load3(dimage + 3 * int64_t(f.pixel[i]));
         if (patch.textured() && f.weight[i] >= bound) {
           const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
-          g = residual_gradient(shaded(patch.view, texel_fetch(texels + 3 * patch.first, corners)), g);
+          g = residual_gradient(patch.color(corners), g);
           if (dtexels) texel_fetch_vjp(corners, g, dtexels + 3 * patch.first);
         }
         sum = sum + g;
@@ -131,11 +111,10 @@ void texel_colors_forward(const TexelColorsForward<S>& a) {
   parallel_parts(f.total, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end;) {
       const int32_t id = f.surfel[i];
-      const Patch<S> patch(a.of.table, id);
+      const TexelPatch<S> patch(a.of.table, id);
       for (; i < end && f.surfel[i] == id; ++i) {
         Vec3<S> c = patch.view;
-        if (patch.textured() && f.weight[i] >= a.of.bound)
-          c = shaded(c, texel_fetch(a.of.table.values + 3 * patch.first, patch.corners(f.uv[i], f.uv[f.total + i])));
+        if (patch.textured() && f.weight[i] >= a.of.bound) c = patch.color(patch.corners(f.uv[i], f.uv[f.total + i]));
         store3(a.colors + 3 * i, c);
       }
     }
@@ -154,8 +133,7 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
   const Runs runs{f.surfel, found.start.data(), found.order.data(), int64_t(found.order.size())};
   for_surfels(runs, [&](int64_t first, int64_t last) {
     const int64_t id = runs.id(first);
-    const Patch<S> patch(table, id);
-    const S* tile = table.values + 3 * patch.first;
+    const TexelPatch<S> patch(table, id);
     thread_local std::vector<S> own;  // the tile's gradient, where it is not kept
     const int64_t area = int64_t(patch.size[0]) * patch.size[1];
     if (moved) own.assign(3 * area, S(0));
@@ -168,14 +146,13 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
         if (!patch.textured() || f.weight[i] < a.of.bound) continue;
         const auto corners = patch.corners(f.uv[i], f.uv[f.total + i]);
         if (dtile) texel_fetch_vjp(corners, g, dtile);
-        if (duv)
-          texel_fetch_uv_vjp(tile, corners, patch.size[0], patch.size[1], patch.extent, g, duv[i], duv[f.total + i]);
+        if (duv) patch.uv_vjp(corners, g, duv[i], duv[f.total + i]);
       }
     if (dbase) store3(dbase + 3 * id, base_gradient(load3(table.base + 3 * id), sum));
     if (!moved) return;
     for (int64_t t = 0; t < area; ++t) {
       S* at = moved + 3 * (patch.first + t);
-      store3(at, load3(at) + -a.rate * a.share[patch.first + t] * load3(dtile + 3 * t));
+      store3(at, texel_step(load3(at), load3(dtile + 3 * t), a.rate, a.share[patch.first + t]));
     }
   });
 }

@@ -282,10 +282,11 @@ struct ExactSums {
   unsigned long long *table = nullptr, *base = nullptr, *frames = nullptr;
   ExactRange* range = nullptr;
 };
-// Clears the exact sums and finds their units, such that no sum of `count` gradients [count, 3] can overflow. field may
-// be null; frames tells whether those are summed.
+// Clears the exact sums in memory of exact_size(entries, surfels, frames) and finds their units, such that no sum of
+// `count` gradients [count, 3] can overflow. The entries are those of the field's table; without a field, sums of
+// shares of the gradients, of at most 1 each in all. frames tells whether those of the surfels are summed.
 template <class S>
-ExactSums begin_exact(const FieldWork<S>& work, const FieldArrays<S>* field, int64_t surfels, bool frames,
+ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
                       int64_t count, const S* gradients, Stream stream);
 // Writes the exact sums as numbers: where not null, dtable (of a given field), dbase and dframes.
 template <class S>

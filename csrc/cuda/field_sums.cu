@@ -91,7 +91,7 @@ __global__ void range_kernel(FieldArrays<S> f, int64_t count, ExactRange* range)
     }
     steepest += double(f.resolution(l)) * 2 * level * entry;  // of each coordinate: two faces of the cell
   }
-  range->table = scale_for(feature, count);
+  range->table = f.levels ? scale_for(feature, count) : range->base;  // entries get shares of the gradients
   // three coordinates, the contraction's slope of at most 1 / half each, and |u|, |v| <= kSupport
   range->frames = scale_for(steepest * 3 * kSupport / double(f.half), count);
 }
@@ -100,7 +100,7 @@ template <class S>
 __global__ void __launch_bounds__(kThreads)
     convert_kernel(int64_t n, const unsigned long long* from, const double* scale, S* to) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) to[i] = S(double(static_cast<long long>(from[i])) / *scale);
+  if (i < n) to[i] = exact_value<S>(from[i], *scale);
 }
 template <class S>
 void convert(int64_t n, const unsigned long long* from, const double* scale, S* to, Stream stream) {
@@ -110,15 +110,14 @@ void convert(int64_t n, const unsigned long long* from, const double* scale, S* 
 }  // namespace
 
 template <class S>
-ExactSums begin_exact(const FieldWork<S>& work, const FieldArrays<S>* field, int64_t surfels, bool frames,
+ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
                       int64_t count, const S* gradients, Stream stream) {
-  const int64_t entries = field ? field->table_size() : 0;
   ExactSums e;
-  e.table = reinterpret_cast<unsigned long long*>(work.exact);
+  e.table = reinterpret_cast<unsigned long long*>(memory);
   e.range = reinterpret_cast<ExactRange*>(e.table + entries);
   e.base = e.table + entries + kExactRange;
   e.frames = e.base + 3 * surfels;
-  fill_zero(work.exact, exact_size(entries, surfels, frames), stream);
+  fill_zero(memory, exact_size(entries, surfels, frames), stream);
   largest(3 * count, gradients, &e.range->gradient, stream);
   if (frames) largest(entries, field->table, &e.range->entry, stream);
   FieldArrays<S> f = {};
@@ -142,10 +141,10 @@ void sum_weights(const S* partial, int blocks, int levels, const FieldGradients<
             blocks, levels, out);
 }
 
-#define BT_INSTANTIATE(S)                                                                                         \
-  template ExactSums begin_exact<S>(const FieldWork<S>&, const FieldArrays<S>*, int64_t, bool, int64_t, const S*, \
-                                    Stream);                                                                      \
-  template void end_exact<S>(const ExactSums&, const FieldArrays<S>*, int64_t, S*, S*, S*, Stream);               \
+#define BT_INSTANTIATE(S)                                                                                       \
+  template ExactSums begin_exact<S>(int64_t*, int64_t, const FieldArrays<S>*, int64_t, bool, int64_t, const S*, \
+                                    Stream);                                                                    \
+  template void end_exact<S>(const ExactSums&, const FieldArrays<S>*, int64_t, S*, S*, S*, Stream);             \
   template void sum_weights<S>(const S*, int, int, const FieldGradients<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

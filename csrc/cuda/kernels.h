@@ -6,6 +6,7 @@
 #include "cuda/pairs.h"
 #include "ops/appearance.h"
 #include "ops/field.h"
+#include "ops/texel.h"
 #include "ops/visibility.h"
 
 namespace bt::cuda {
@@ -143,6 +144,10 @@ template <class S>
 void shade_forward(const ShadeForward<S>& a, Stream stream);
 template <class S>
 void shade_backward(const ShadeBackward<S>& a, Stream stream);
+template <class S>
+void texel_colors_forward(const TexelColorsForward<S>& a, Stream stream);
+template <class S>
+void texel_colors_backward(const TexelColorsBackward<S>& a, Stream stream);
 template <class S>
 void field_tiles(const FieldTiles<S>& a, Stream stream);
 

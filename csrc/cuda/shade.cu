@@ -118,16 +118,6 @@ __global__ void __launch_bounds__(kForwardWarps* kWarp, kForwardResident<S>)
   }
 }
 
-// Adds M numbers of every lane to rows of width M, one addition per run of lanes with the same row. Row -1: none.
-template <int M, class S, bool kExact>
-__device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S, kExact>& to) {
-  const unsigned run = run_of(row, lane);
-  sum_over_run(run, lane, value);
-  if (row < 0 || count_below(run, lane)) return;
-  BT_UNROLL
-  for (int k = 0; k < M; ++k) to.add(int64_t(row) * M + k, value[k]);
-}
-
 // kTrainsField: the field gets gradients, too.
 template <class S, bool kExact, bool kTrainsField>
 __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>)
@@ -256,7 +246,8 @@ void shade_backward(const ShadeBackward<S>& a, Stream stream) {
               exact);
   };
   if (a.work.exact) {
-    const ExactSums exact = begin_exact(a.work, learned, a.n, a.dframes != nullptr, a.f.total, a.dcolors, stream);
+    const ExactSums exact = begin_exact(a.work.exact, learned ? learned->table_size() : 0, learned, a.n,
+                                        a.dframes != nullptr, a.f.total, a.dcolors, stream);
     trains_field ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
     end_exact(exact, learned, a.n, out.table, a.dbase, a.dframes, stream);
   } else {

@@ -35,6 +35,12 @@ __device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
   }
 }
 
+// The sum of integers in units of 1 / scale as a number.
+template <class S>
+__device__ S exact_value(unsigned long long sum, double scale) {
+  return S(double(static_cast<long long>(sum)) / scale);
+}
+
 // Adds to memory that all blocks share. Sums of floating-point numbers depend on the order in which the blocks come;
 // for a result that does not, values are added as integers in units of 1 / scale.
 template <class S, bool kExact>
@@ -47,6 +53,8 @@ struct Adder<S, false> {
   __device__ void add4(int64_t at, const S* v) const {
     for (int j = 0; j < 4; ++j) atomicAdd(to + at + j, v[j]);
   }
+  // once all have been added
+  __device__ S sum(int64_t at) const { return to[at]; }
 };
 template <>
 __device__ inline void Adder<float, false>::add4(int64_t at, const float* v) const {
@@ -69,6 +77,17 @@ struct Adder<S, true> {
   __device__ void add4(int64_t at, const S* v) const {
     for (int j = 0; j < 4; ++j) add(at + j, v[j]);
   }
+  __device__ S sum(int64_t at) const { return exact_value<S>(to[at], scale); }
 };
+
+// Adds M numbers of every lane to rows of width M, one addition per run of lanes with the same row. Row -1: none.
+template <int M, class S, bool kExact>
+__device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S, kExact>& to) {
+  const unsigned run = run_of(row, lane);
+  sum_over_run(run, lane, value);
+  if (row < 0 || count_below(run, lane)) return;
+  BT_UNROLL
+  for (int k = 0; k < M; ++k) to.add(int64_t(row) * M + k, value[k]);
+}
 
 }  // namespace bt::cuda

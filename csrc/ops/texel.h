@@ -1,7 +1,10 @@
 // Arguments of the images and colours that texels give, and of their gradients.
 #pragma once
 
+#include "core/shading.h"
+#include "core/texel.h"
 #include "ops/arguments.h"
+#include "ops/field.h"
 
 namespace bt {
 
@@ -22,6 +25,29 @@ struct TexelTiles {
     r.array("extent", extent, n);
     r.array("base", base, 3 * n);
     r.rows("texels", values, texels, 3);
+  }
+};
+// What the fragments of one surfel share.
+template <class S>
+struct TexelPatch {
+  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
+  const S* tile;        // its texels
+  int64_t first;        // of them
+  S extent;
+  Vec3<S> view;  // the colour without residual
+
+  BT_HD TexelPatch(const TexelTiles<S>& tiles, int64_t id)
+      : size(tiles.size + 2 * id),
+        tile(tiles.values + 3 * tiles.first[id]),
+        first(tiles.first[id]),
+        extent(tiles.extent[id]),
+        view(view_base(load3(tiles.base + 3 * id))) {}
+  BT_HD bool textured() const { return size[0] > 0; }
+  BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
+  BT_HD Vec3<S> color(const TexelCorners<S>& at) const { return shaded(view, texel_fetch(tile, at)); }
+  // adds the gradient with respect to u and v
+  BT_HD void uv_vjp(const TexelCorners<S>& at, Vec3<S> g, S& du, S& dv) const {
+    texel_fetch_uv_vjp(tile, at, size[0], size[1], extent, g, du, dv);
   }
 };
 template <class S>
@@ -111,6 +137,21 @@ struct TexelColorsForward {
     r.array("colors", colors, 3 * of.f.total);
   }
 };
+// Working memory of the backward pass on CUDA: where the texels' gradients are added up, rows of four, the last 0.
+template <class S>
+struct TexelWork {
+  S* sums;         // [texels, 4]
+  int64_t* exact;  // null, or in its place for sums that do not depend on the order: [exact_size(...)]
+
+  template <class R>
+  void fields(R& r, int64_t texels, int64_t surfels) {
+    sums = nullptr, exact = nullptr;
+    if (r.given("exact_work"))
+      r.work("exact_work", exact, exact_size(4 * texels, surfels, false));
+    else if (texels)
+      r.work("texel_work", sums, 4 * texels);
+  }
+};
 // Writes dbase [n, 3], dtexels [texels, 3] and duv [2, F]; each may be null. With `moved`, the texels themselves, their
 // gradient g is not kept: every texel moves by -rate `share` [texels] g.
 template <class S>
@@ -120,7 +161,9 @@ struct TexelColorsBackward {
   const S* share;
   S rate;
   S *dbase, *dtexels, *duv, *moved;
+  TexelWork<S> work;
 
+  bool sums_texels() const { return dtexels || moved; }
   template <class R>
   void fields(R& r) {
     of.fields(r);
@@ -132,6 +175,7 @@ struct TexelColorsBackward {
     r.maybe("moved", moved, 3 * of.table.texels);
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
+    work.fields(r, sums_texels() ? of.table.texels : 0, of.table.n);
     if (moved && (moved != of.table.values || !share || dtexels))
       r.refuse("what moves are the texels, by a share of each, and their gradient is not kept");
   }

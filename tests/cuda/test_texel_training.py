@@ -1,0 +1,190 @@
+"""Scenes of texels on the device: pictures, tiles and whole runs as on the CPU, and what changes their number."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.learned import learned
+from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.ops import Bands
+from bitymi_ns.scene import Camera, Scene, SceneConfig
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.texels import blank_texels
+from bitymi_ns.train.views import View
+from tests.ops.golden import random_scene
+from tests.scene.test_texel_field import make
+
+Context = Callable[[], AbstractContextManager[None]]
+HERE = torch.device("cpu")
+STEPS, START = 12, 6
+
+
+def drawn(device: torch.device, most: int = 0) -> tuple[dict[str, Tensor], int]:
+    """A picture and all gradients, and into how many lists it was divided."""
+    scene, camera, _ = make(most=most, height=120, width=40)
+    output = scene.to(device).render(camera.to(device))
+    output.rgb.square().sum().backward()
+    found = {name: p.grad for name, p in scene.named_parameters()} | {"rgb": output.rgb.detach()}
+    lists = len(output.fragments.rows) if isinstance(output.fragments, Bands) else 1
+    return {name: value.cpu() for name, value in found.items()}, lists
+
+
+@pytest.mark.parametrize("most", [0, 9000])
+def test_a_picture_and_its_gradients_are_those_of_the_cpu(most: int, device: torch.device, cpu: Context) -> None:
+    got, lists = drawn(device, most)
+    with cpu():
+        want, cpu_lists = drawn(HERE)
+    assert got.keys() == want.keys() >= {"field.texels", "surfels.means"} and (lists > 1) == (most > 0)
+    assert cpu_lists == 1
+    for name, value in want.items():
+        assert (got[name] - value).abs().max() <= 1e-9 * value.abs().max(), name
+
+
+def scene_and_views() -> tuple[Scene, list[View]]:
+    """A few discs that will have texels, and photographs of other colours, one of them with a mask."""
+    case = random_scene(20, 5, width=24, height=20, scale=0.5)
+    config = SceneConfig(texture="texels", near=0.2)
+    scene = Scene(config, {key: value.float() for key, value in case.params.items()}, None)
+    g = torch.Generator().manual_seed(2)
+    camera = Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
+    mask = (torch.arange(20 * 24) % 5 > 0).view(20, 24, 1)
+    return scene, [View(camera, torch.rand(20, 24, 3, generator=g), each) for each in (None, mask)]
+
+
+def config() -> TrainConfig:
+    """Texels in the second half of the run, with the final prunes within it."""
+    densify = DensifyConfig(max_surfels=20, min_interval=1, min_reset_interval=1000, pixels_per_surfel=0)
+    texels = TexelConfig(start=30_000 * START // STEPS, pixels_per_texel=0.5)
+    return TrainConfig(background="black", resolution_schedule=0, densify=densify, texels=texels)
+
+
+def trainer_on(device: torch.device) -> Trainer:
+    scene, views = scene_and_views()
+    return Trainer(scene.to(device), views, config(), STEPS)
+
+
+def state_of(scene: Scene) -> dict[str, Tensor]:
+    return {name: value.detach().cpu().clone() for name, value in scene.state_dict().items()}
+
+
+def test_tiles_and_coverage_are_those_of_the_cpu(device: torch.device, cpu: Context) -> None:
+    fields = []
+    for where, context in ((device, None), (HERE, cpu)):
+        scene, views = scene_and_views()
+        scene = scene.to(where)
+        if context is None:
+            fields.append(blank_texels(scene, views, 4, config().texels))
+        else:
+            with context():
+                fields.append(blank_texels(scene, views, 4, config().texels))
+    got, want = fields
+    assert got.texels.device.type == device.type and len(got.texels) == len(want.texels) > 200
+    assert torch.equal(got.size.cpu(), want.size) and want.size.max() > 4
+    torch.testing.assert_close(got.extent.cpu(), want.extent, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got.share.cpu(), want.share, rtol=1e-3, atol=1e-5)
+    assert want.share.max() > 2 * want.share.min()
+
+
+def test_a_run_is_that_of_the_cpu(device: torch.device, cpu: Context) -> None:
+    def losses(where: torch.device) -> tuple[list[float], list[int], dict[str, Tensor]]:
+        trainer, seen, surfels = trainer_on(where), [], []
+        for _ in range(STEPS):
+            trainer.advance()
+            seen.append(trainer.loss)
+            surfels.append(len(trainer.scene))
+        return seen, surfels, state_of(trainer.scene)
+
+    got, surfels, state = losses(device)
+    with cpu():
+        want, cpu_surfels, cpu_state = losses(HERE)
+    assert got == pytest.approx(want, rel=2e-3)
+    assert surfels == cpu_surfels and surfels[-1] < surfels[START]  # pruned while texels learned
+    assert state.keys() == cpu_state.keys() and torch.equal(state["field.size"], cpu_state["field.size"])
+    assert cpu_state["field.texels"].abs().max() > 0.1
+    for name, value in cpu_state.items():
+        # Adam's first steps are as long as the rate whatever the gradient: where that is all but 0 its sign may differ
+        close = torch.isclose(state[name].double(), value.double(), rtol=1e-2, atol=2e-3)
+        assert close.double().mean() > 0.95, name
+
+
+def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) -> None:
+    torch.use_deterministic_algorithms(True, warn_only=True)  # torch's own operations have not all such sums
+    try:
+        straight, states = trainer_on(device), []
+        for done in range(STEPS):
+            if done in (START - 1, START + 3):
+                states.append(copy.deepcopy(straight.state_dict()))
+            straight.advance()
+        want = state_of(straight.scene)
+        for state in states:
+            resumed = trainer_on(device)
+            resumed.load_state_dict(state)
+            while resumed.step < STEPS:
+                resumed.advance()
+            got = state_of(resumed.scene)
+            assert got.keys() == want.keys()
+            for name, value in want.items():
+                if device.type == "cpu":  # the emulated one
+                    assert torch.equal(got[name], value), name
+                else:
+                    torch.testing.assert_close(got[name], value, rtol=1e-3, atol=1e-3)
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def test_surfels_that_are_pruned_take_their_texels_along(device: torch.device) -> None:
+    trainer = trainer_on(device)
+    for _ in range(START + 1):
+        trainer.advance()
+    scene, field, n = trainer.scene, trainer.scene.field, len(trainer.scene)
+    assert isinstance(field, TexelField) and field.texels.device.type == device.type
+    camera = scene_and_views()[1][0].camera.to(device)
+    with torch.no_grad():
+        scene.surfels["opacity_logits"][3] = -20.0
+        before = scene.render(camera).rgb
+    left = len(field.texels) - int(field.size[3].prod())
+    trainer.training.strategy._remove(torch.arange(n, device=device) == 3, scene, trainer.optimizers)
+    assert len(scene) == len(field.size) == n - 1 and len(field.texels) == len(field.share) == field.tiles.count == left
+    with torch.no_grad():
+        torch.testing.assert_close(scene.render(camera).rgb, before, rtol=0, atol=1e-6)
+    trainer.advance()
+
+
+def test_a_run_that_diverges_goes_back_to_its_texels(device: torch.device) -> None:
+    trainer = trainer_on(device)
+    for _ in range(START + 2):
+        trainer.advance()
+    scene = trainer.scene
+    with torch.no_grad():
+        scene.field.texels[7] = float("nan")
+        scene.surfels["means"][:] = float("nan")
+    with pytest.warns(UserWarning, match="back to the state"):
+        while trainer.step < STEPS:  # on a card it is noticed some steps later
+            trainer.advance()
+    assert all(torch.isfinite(p).all() for p in scene.parameters())
+    assert scene.field.texels.device.type == device.type
+    assert len(scene.field.size) == len(scene) and len(scene.field.texels) == scene.field.tiles.count
+
+
+def test_what_a_device_has_learned_can_be_baked(device: torch.device, cpu: Context) -> None:
+    trainer = trainer_on(device)
+    for _ in range(START + 3):
+        trainer.advance()
+    scene = trainer.scene
+    baked = learned(scene, BakeOptions())
+    assert baked.texels is not None and baked.texels.device == baked.scene.tiles.device == HERE
+    camera = scene_and_views()[1][0].camera
+    with torch.no_grad():
+        want = scene.render(camera.to(device)).rgb.cpu()
+    with cpu():
+        got = baked.unquantised().render(camera).rgb
+    assert want.any() and scene.field.texels.abs().max() > 0.05
+    torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5)

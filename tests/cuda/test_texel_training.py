@@ -37,13 +37,12 @@ def drawn(device: torch.device, most: int = 0) -> tuple[dict[str, Tensor], int]:
     return {name: value.cpu() for name, value in found.items()}, lists
 
 
-@pytest.mark.parametrize("most", [0, 9000])
+@pytest.mark.parametrize("most", [0, 4500])
 def test_a_picture_and_its_gradients_are_those_of_the_cpu(most: int, device: torch.device, cpu: Context) -> None:
     got, lists = drawn(device, most)
     with cpu():
-        want, cpu_lists = drawn(HERE)
-    assert got.keys() == want.keys() >= {"field.texels", "surfels.means"} and (lists > 1) == (most > 0)
-    assert cpu_lists == 1
+        want, cpu_lists = drawn(HERE, most)
+    assert got.keys() == want.keys() >= {"field.texels", "surfels.means"} and lists == cpu_lists == (2 if most else 1)
     for name, value in want.items():
         assert (got[name] - value).abs().max() <= 1e-9 * value.abs().max(), name
 
@@ -61,7 +60,8 @@ def scene_and_views() -> tuple[Scene, list[View]]:
 
 def config() -> TrainConfig:
     """Texels in the second half of the run, with the final prunes within it."""
-    densify = DensifyConfig(max_surfels=20, min_interval=1, min_reset_interval=1000, pixels_per_surfel=0)
+    prunes = {"min_surfels": 5, "final_prune_steps": (20_000, 22_500), "final_prune_opacity": 0.3}
+    densify = DensifyConfig(max_surfels=20, min_interval=1, min_reset_interval=1000, pixels_per_surfel=0, **prunes)
     texels = TexelConfig(start=30_000 * START // STEPS, pixels_per_texel=0.5)
     return TrainConfig(background="black", resolution_schedule=0, densify=densify, texels=texels)
 
@@ -160,15 +160,14 @@ def test_surfels_that_are_pruned_take_their_texels_along(device: torch.device) -
 
 def test_a_run_that_diverges_goes_back_to_its_texels(device: torch.device) -> None:
     trainer = trainer_on(device)
-    for _ in range(START + 2):
+    for _ in range(STEPS - 1):  # behind the final prunes
         trainer.advance()
     scene = trainer.scene
     with torch.no_grad():
         scene.field.texels[7] = float("nan")
         scene.surfels["means"][:] = float("nan")
     with pytest.warns(UserWarning, match="back to the state"):
-        while trainer.step < STEPS:  # on a card it is noticed some steps later
-            trainer.advance()
+        trainer.advance()
     assert all(torch.isfinite(p).all() for p in scene.parameters())
     assert scene.field.texels.device.type == device.type
     assert len(scene.field.size) == len(scene) and len(scene.field.texels) == scene.field.tiles.count

@@ -55,7 +55,7 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """What can be run: name -> steps. `fox` needs that capture in `data`; `train` takes every other one there.
+    """What can be run: name -> steps. `fox` and `textures` need that capture in `data`; `train` takes every other one.
 
     Args:
         results: folder of the tables.
@@ -104,6 +104,16 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
                 90,
             ),
         ],
+        "textures": [
+            Step(
+                "textures",
+                [
+                    python("gpu_train.py", str(data / "fox"), "--presets", "bitymi", "--textures", "hash", "texels")
+                    + [*length, "--output", str(results / "textures.md")]
+                ],
+                600,
+            ),
+        ],
         "profile": [
             Step(
                 "profile",
@@ -129,7 +139,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-PROFILED = ("baked", "training")  # sections of card_smoke.py
+PROFILED = ("baked", "training", "texels")  # sections of card_smoke.py
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 

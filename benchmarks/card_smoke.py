@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import torch
 from gpu_baked import textured
-from gpu_common import deterministic, photo_loss, trained_like, training_step
+from gpu_common import deterministic, photo_loss, trained_like, training_step, with_texels
 
 from bitymi_ns import ops
 from bitymi_ns.scene.baked_renderer import BakedRenderer
@@ -40,12 +40,20 @@ def training(n: int, width: int, height: int, device: torch.device) -> Callable[
     return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.parameters()))
 
 
+def texels(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+    """A training step in which texels learn: SSIM, Adam of the surfels."""
+    scene, camera = with_texels(n, width, height, device)
+    loss = photo_loss(torch.rand(height, width, 3, device=device))
+    return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.surfels.parameters()))
+
+
 def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """A training step with sums that do not depend on the order."""
-    return deterministic(training(n, width, height, device), warn_only=True)
+    """A training step of either texture with sums that do not depend on the order."""
+    steps = [training(n, width, height, device), texels(n, width, height, device)]
+    return deterministic(lambda: [step() for step in steps], warn_only=True)
 
 
-SECTIONS = {"baked": baked, "images": images, "training": training, "deterministic": exact}
+SECTIONS = {"baked": baked, "images": images, "training": training, "texels": texels, "deterministic": exact}
 
 
 def main() -> int:

@@ -2,7 +2,8 @@
 
 Bytes that an operation cannot do without and its floating-point operations, single precision, with v visible surfels
 of 7 sites (n in all), f fragments of which t are textured, L = 4 levels, x values of an image, q parameters, e texels.
-Gathers from the table are counted apart: they come from the caches, 16 bytes each, 8 L a look-up.
+Gathers from the table are counted apart: they come from the caches, 16 bytes each, 8 L a look-up; and so are those of
+texels and their gradients, 4 a look-up of 12 and 16 bytes.
 
   view colours        208 v + n; 330 v
   ... backward        404 v + 220 n; 550 v
@@ -11,6 +12,9 @@ Gathers from the table are counted apart: they come from the caches, 16 bytes ea
   ... backward,
     field frozen      28 f + 12 n; 9 f
   ... learning        28 f + 52 t + 12 n + 64 MB; 9 f + 3850 t; gathers and additions 256 L t
+  texel colours       32 f + 28 t; 6 f + 50 t; gathers 48 t
+  ... backward, with
+    a step            40 f + 28 t + 12 n + 60 e; 9 f + 75 t; gathers and additions 112 t
   SSIM, forward and
     backward          60 x; 411 x   (both images twice, three parts of the gradient written and read, the gradient)
   Adam                28 q; 14 q
@@ -20,7 +24,7 @@ Gathers from the table are counted apart: they come from the caches, 16 bytes ea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -36,6 +40,7 @@ from gpu_common import (
     failures,
     milliseconds,
     trained_like,
+    with_texels,
     without_graph,
 )
 from torch import Tensor
@@ -50,6 +55,7 @@ LEVELS = 4
 LOOK_UP = 1550
 LEARN = 3850
 NEEDS = ("view_color_forward_f32", "shade_forward_f32", "shade_backward_f32", "ssim_f32", "field_tiles_f32")
+NEEDS += ("texel_colors_forward_f32", "texel_colors_backward_f32")
 
 
 @dataclass(frozen=True)
@@ -151,9 +157,40 @@ def _cases(n: int, width: int, height: int, device: torch.device) -> list[Case]:
             deterministic(exact),
             3 * gathers * t,
         ),
+        *_texel_cases(n, width, height, device),
         Case("SSIM, both passes", x, "values", 60 * x, 411 * x, lambda: ops.ssim(a, b)),
         Case("Adam", numbers, "numbers", 28 * numbers, 14 * numbers, lambda: [o.step() for o in adam.values()]),
         _bake_case(n, scene, projection),
+    ]
+
+
+def _texel_cases(n: int, width: int, height: int, device: torch.device) -> list[Case]:
+    scene, camera = with_texels(n, width, height, device)
+    field, q, bound = scene.field, scene.surfels, scene.config.weight_bound
+    with torch.no_grad():
+        projection = ops.project(*(q[name] for name in GEOMETRY), camera, scene.near)
+        fragments = ops.trace(projection, scene.config.rim)
+    fragments = replace(fragments, uv=fragments.uv.detach().requires_grad_())
+    f, t, e = len(fragments), int((fragments.weight >= bound).sum()), len(field.texels)
+    base = scene.base_color(projection).detach().requires_grad_()
+
+    def colors() -> Tensor:
+        return field.shade(fragments, base, projection.frames, bound, True, True)
+
+    back = backward(colors(), (base, fragments.uv))
+    count = 40 * f + 28 * t + 12 * n
+    return [
+        Case("texel colours", f, "fragments", 32 * f + 28 * t, 6 * f + 50 * t, without_graph(colors), 48.0 * t),
+        Case("texel colours, backward and step", f, "fragments", count + 60 * e, 9 * f + 75 * t, back, 112.0 * t),
+        Case(
+            "... with deterministic sums",
+            f,
+            "fragments",
+            count + 92 * e,
+            9 * f + 75 * t,
+            deterministic(back),
+            176.0 * t,
+        ),
     ]
 
 

@@ -21,6 +21,9 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.texels import blank_texels
+from bitymi_ns.train.views import View
 
 SITES = 7
 LOG2_TABLE = 17
@@ -272,6 +275,20 @@ def trained_like(
             field.field_w3.copy_(0.1 * normal(*field.field_w3.shape))  # starts at zero
     scene = Scene(config, surfels, field).to(device)
     return scene, Camera(torch.eye(4), K, width, height).to(device)
+
+
+def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[Scene, Camera]:
+    """The same with a tile for every surfel, as fine as that camera sees it, and random texels, which backward passes
+    move by a rate of zero: the work of a step, but they stay what they are."""
+    scene, camera = trained_like(n, width, height, device, texture=False)
+    scene.config.texture = "texels"
+    field = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
+    g = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        field.texels.copy_(0.1 * torch.randn(field.texels.shape, generator=g))
+    field.descent = ops.TexelDescent(field.share, 0.0)
+    scene.field = field
+    return scene, camera
 
 
 PIXEL_SCALE = 0.9

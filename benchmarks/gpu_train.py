@@ -14,7 +14,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from common import number, page, publish, say, table
 from gpu_common import Options, milliseconds
 from plain_capture import Capture, load_capture
 
-from bitymi_ns import bake, bundle
+from bitymi_ns import bundle
+from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
 from bitymi_ns.host.preset import Preset, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
@@ -100,10 +101,20 @@ def waits_of(trainer: Trainer, steps: int) -> float:
 
 
 def run(
-    name: str, capture: Capture, steps: int, points: int, device: torch.device, options: Options, keep: Path | None
+    name: str,
+    texture: str | None,
+    capture: Capture,
+    steps: int,
+    points: int,
+    device: torch.device,
+    options: Options,
+    keep: Path | None,
 ) -> Result:
-    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given."""
+    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given. A texture takes the place of
+    the preset's."""
     preset = load_preset(name)
+    if texture is not None:
+        preset, name = replace(preset, scene=replace(preset.scene, texture=texture)), f"{name}-{texture}"
     scene = new_scene(capture, preset).to(device)
     trainer = Trainer(scene, capture.train, preset.train, steps)
     due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
@@ -134,7 +145,9 @@ def run(
     with torch.no_grad():
         frame = milliseconds(lambda: scene.render(camera, field_mode="frozen"), options)
     start = time.perf_counter()
-    made = bake.bake(scene, [view.camera for view in capture.train])
+    background = judging_background(preset.train.background, torch.device("cpu"))
+    cameras = [view.camera for view in capture.train]
+    made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning())  # nothing learns
     bake_seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder if keep is None else keep) / f"{name}-{steps}"
@@ -198,6 +211,9 @@ def main() -> int:
     parser.add_argument(
         "--presets", nargs="+", default=["bitymi", "bitymi-quality"], help="method_configs (%(default)s)"
     )
+    parser.add_argument(
+        "--textures", nargs="+", choices=("hash", "texels", "none"), help="each of them in place of a preset's own"
+    )
     parser.add_argument("--steps", type=int, help="length of a run; default: the preset's on a GPU")
     parser.add_argument("--points", type=int, default=10, help="evaluations over a run (%(default)s)")
     parser.add_argument("--downscale", type=int, default=1, help="whole factor by which photographs are reduced")
@@ -218,15 +234,17 @@ def main() -> int:
     what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     notes = [f"Device: {what}.", f"Frames: median of about {arguments.runs} after {arguments.warm_up}."]
     results, failed = [], False
-    for name in arguments.presets:
+    runs = [(name, texture) for name in arguments.presets for texture in arguments.textures or (None,)]
+    for name, texture in runs:
         steps = arguments.steps or load_preset(name).trainer.iterations
+        points = min(arguments.points, steps)
         try:
-            results.append(run(name, capture, steps, min(arguments.points, steps), device, options, arguments.keep))
+            results.append(run(name, texture, capture, steps, points, device, options, arguments.keep))
         except (RuntimeError, ValueError, OSError) as error:
             traceback.print_exc()
-            notes.append(f"{name} failed: {' '.join(str(error).split())[:400]}")
+            notes.append(f"{name} {texture or ''} failed: {' '.join(str(error).split())[:400]}")
             failed = True
-        last = name == arguments.presets[-1]
+        last = (name, texture) == runs[-1]
         text = page(f"Training on a card: {arguments.data.name}", report(results, capture), notes)
         publish(text, arguments.output, silent=not last)
     return int(failed)

@@ -32,6 +32,7 @@ from gpu_common import (
     photo_loss,
     trained_like,
     training_step,
+    with_texels,
     without_graph,
 )
 from torch import Tensor
@@ -43,6 +44,7 @@ from bitymi_ns.scene.scene import GEOMETRY, Scene
 
 OPERATIONS = ("project_forward_f32", "trace_mark_f32", "trace_backward_f32", "composite_backward_f32")
 STEP = (*OPERATIONS, "view_color_forward_f32", "shade_forward_f32", "shade_backward_f32")
+STEP += ("texel_colors_forward_f32", "texel_colors_backward_f32")
 
 
 def operations(options: Options) -> str:
@@ -152,9 +154,19 @@ def _steps(
 
     loss = photo_loss(photo, with_ssim)
     cases: list[tuple[str, Callable[[], object], int | None]] = []
-    for name, mode in (("bitymi, field training", "train"), ("bitymi, field frozen", "frozen"), ("bitymi, sv", "off")):
-        scene, camera = trained_like(n, width, height, device, texture=mode != "off")
-        parameters = list(scene.parameters() if mode == "train" else scene.surfels.parameters())
+    for name, mode in (
+        ("bitymi, field training", "train"),
+        ("bitymi, field frozen", "frozen"),
+        ("bitymi, sv", "off"),
+        ("bitymi, texels training", "train"),
+    ):
+        texels = "texels" in name  # which have no optimiser: the backward pass moves them
+        scene, camera = (
+            with_texels(n, width, height, device)
+            if texels
+            else trained_like(n, width, height, device, texture=mode != "off")
+        )
+        parameters = list(scene.parameters() if mode == "train" and not texels else scene.surfels.parameters())
 
         def render(scene: Scene = scene, camera: Camera = camera, mode: str = mode) -> Tensor:
             return scene.render(camera, field_mode=mode).rgb

@@ -53,6 +53,22 @@ def test_kernels_that_cannot_be_loaded_are_no_traceback(card: ModuleType, monkey
     assert "cannot be loaded" in device.why_not_cuda()
 
 
+@pytest.fixture
+def config():
+    """Of a run. nerfstudio is imported before a card is made up: its libraries ask for one."""
+    pytest.importorskip("nerfstudio")
+    from bitymi_ns.host.config import method_config
+
+    return method_config("bitymi").config
+
+
+@pytest.mark.parametrize(("texture", "trained"), [("auto", "hash"), ("texels", "texels"), ("none", "none")])
+def test_a_card_trains_any_texture(config, card: ModuleType, texture: str, trained: str) -> None:
+    config.machine.device_type, config.pipeline.model.scene.texture = "cuda", texture
+    config.set_timestamp()
+    assert config.machine.device_type == "cuda" and config.pipeline.model.scene.texture == trained
+
+
 def test_no_card_and_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     device.why_not_cuda.cache_clear()

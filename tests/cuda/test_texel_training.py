@@ -140,6 +140,25 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
         torch.use_deterministic_algorithms(False)
 
 
+def test_a_run_goes_on_on_the_cpu(device: torch.device, cpu: Context) -> None:
+    trainer = trainer_on(device)
+    for _ in range(START + 2):
+        trainer.advance()
+    state = copy.deepcopy(trainer.state_dict())
+    with cpu():
+        other = trainer_on(HERE)
+        other.load_state_dict(state)
+        assert all(
+            torch.equal(a, b)
+            for a, b in zip(state_of(trainer.scene).values(), state_of(other.scene).values(), strict=True)
+        )
+        while other.step < STEPS:
+            other.advance()
+    while trainer.step < STEPS:
+        trainer.advance()
+    assert other.loss == pytest.approx(trainer.loss, rel=2e-3) and len(other.scene) == len(trainer.scene)
+
+
 def test_surfels_that_are_pruned_take_their_texels_along(device: torch.device) -> None:
     trainer = trainer_on(device)
     for _ in range(START + 1):

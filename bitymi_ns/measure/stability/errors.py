@@ -12,6 +12,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.backends import Backend
 from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase
+from bitymi_ns.measure.stability.ways import PLAIN, TEXELS, Way, cells, tile_images, tiles_of
 from bitymi_ns.ops.reference import extended
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
@@ -26,8 +27,6 @@ CHANNELS = {
     "normal": slice(6, 9),
 }
 """Places of the channels in the image of `ops.composite_image`."""
-RIM = 1e-3
-"""Bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
 """Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene
@@ -40,10 +39,10 @@ PROBES = 3
 class Errors:
     """Errors of one case, each the largest over all pixels or numbers, relative to the largest value of its kind.
 
-    A pixel is compared only if both sides blend the same surfels there, in the same branch of the kernel. The gradients
-    are those of a loss over these pixels. In the other pixels rounding moved a value across a threshold (1/255, the
-    transmittance, which branch is the larger), so the two sides add up different terms. `flipped` is the share of these
-    pixels.
+    A pixel is compared only if both sides blend the same surfels there, in the same branch of the kernel, and fetch
+    between the same texels. The gradients are those of a loss over these pixels. In the other pixels rounding moved a
+    value across a threshold (1/255, the transmittance, which branch is the larger, a texel's centre), so the two sides
+    add up different terms. `flipped` is the share of these pixels.
     """
 
     forward: float
@@ -70,9 +69,19 @@ class _Result:
     blended: Tensor  # [P, N] bool
     low_pass: Tensor  # [P, N] bool
     leaves: dict[str, Tensor]
+    cells: Tensor | None = None  # [P, N] int64, of textured surfels
+
+    def same(self, other: _Result) -> Tensor:
+        """[P] bool, pixels in which both add up the same terms."""
+        alike = self.low_pass == other.low_pass
+        if self.cells is not None and other.cells is not None:
+            alike &= (self.cells == other.cells) & (self.cells >= 0)
+        return ((self.blended == other.blended) & (alike | ~other.blended)).all(1)
 
 
-def measure(case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2) -> Errors:
+def measure(
+    case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2, way: Way = PLAIN
+) -> Errors:
     """Draw a case with a backend and with the reference, and differentiate both.
 
     The reference gets the numbers that the backend gets: rounded to `dtype` first.
@@ -82,12 +91,13 @@ def measure(case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float3
         backend: what to measure.
         dtype: of its tensors.
         near: nearest depth that is drawn, camera z.
+        way: what is drawn of it, and how.
     """
-    rounded = _map(case, lambda t: t.to(dtype).double())
+    rounded = _map(way.of(case), lambda t: t.to(dtype).double())
     with backend.use():
-        got = _by_kernels(rounded, backend.device, dtype, near)
-        want = _by_reference(rounded, near)
-        same = ((got.blended == want.blended) & ((got.low_pass == want.low_pass) | ~want.blended)).all(1)  # [P]
+        got = _by_kernels(rounded, backend.device, dtype, near, way=way)
+        want = _by_reference(rounded, near, way=way)
+        same = got.same(want)
         weights = _loss_weights(want.images)
         grads = _gradients(got, weights, same)
         everywhere = _gradients(got, weights, torch.ones_like(same), keep=False)
@@ -99,8 +109,8 @@ def measure(case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float3
     generator = torch.Generator().manual_seed(0)
     for _ in range(PROBES):
         moved = _map(rounded, lambda t: t * (1 + ROUNDING[dtype] * _signs(t, generator)))
-        other = _by_reference(moved, near)
-        agree = ((other.blended == want.blended) & ((other.low_pass == want.low_pass) | ~want.blended)).all(1)
+        other = _by_reference(moved, near, way=way)
+        agree = other.same(want)
         probe_forward.append(_image_error(other.images, want.images, agree))
         here, there = (_gradients(result, weights, agree & same) for result in (want, other))
         probe_gradient += [_relative(there[key], here[key]) for key in here]
@@ -125,30 +135,45 @@ def _signs(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randint(0, 2, like.shape, generator=generator).double() * 2 - 1
 
 
-def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, rim: float = RIM) -> _Result:
+def _by_kernels(
+    case: SceneCase, device: str, dtype: torch.dtype, near: float, rim: float | None = None, way: Way = PLAIN
+) -> _Result:
+    rim = way.rim if rim is None else rim
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near)
+    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.through_pixel)
     fragments = ops.trace(projection, rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
-    colors = ops.shade(fragments, base, projection.frames)
+    if way.texels:
+        colors = ops.texel_colors(fragments, base, leaves[TEXELS], tiles_of(leaves[TEXELS]))
+    else:
+        colors = ops.shade(fragments, base, projection.frames)
     image = ops.composite_image(fragments, projection, colors, maps=True)
     shape = (case.width * case.height, len(leaves["means"]))
     blended, low_pass = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
     pixel, surfel = fragments.pixel.cpu().long(), fragments.surfel.cpu().long()
     blended[pixel, surfel] = True
     low_pass[pixel, surfel] = fragments.sigma.cpu() < 0
-    return _Result({key: image[:, CHANNELS[key]] for key in IMAGES}, blended, low_pass, leaves)
+    between = None
+    if way.texels:
+        between = torch.zeros(shape, dtype=torch.int64)
+        between[pixel, surfel] = cells(fragments.uv.T).cpu()
+    return _Result({key: image[:, CHANNELS[key]] for key in IMAGES}, blended, low_pass, leaves, between)
 
 
-def _by_reference(case: SceneCase, near: float, rim: float = RIM) -> _Result:
+def _by_reference(case: SceneCase, near: float, rim: float | None = None, way: Way = PLAIN) -> _Result:
+    rim = way.rim if rim is None else rim
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in SURFEL_KEYS]
-    result = reference_render.render(geometry, colors, case, near=near, rim=rim)
+    tiles = tile_images(leaves[TEXELS]) if way.texels else None
+    result = reference_render.render(
+        geometry, colors, case, tiles=tiles, near=near, rim=rim, prefilter=way.through_pixel
+    )
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
-    return _Result(images, result.trace.blended, result.trace.low_pass, leaves)
+    trace = result.trace
+    return _Result(images, trace.blended, trace.low_pass, leaves, cells(trace.uv) if way.texels else None)
 
 
 def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -16,9 +16,10 @@ from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.stability.backends import BACKENDS, Backend
 from bitymi_ns.measure.stability.cases import cases
-from bitymi_ns.measure.stability.errors import PROBES, RIM, ROUNDING, Errors, ExtendedErrors, against_extended, measure
+from bitymi_ns.measure.stability.errors import PROBES, ROUNDING, Errors, ExtendedErrors, against_extended, measure
 from bitymi_ns.measure.stability.scenes import SceneCase
 from bitymi_ns.measure.stability.sweeps import SWEEPS, Sweep
+from bitymi_ns.measure.stability.ways import PLAIN, RIM, WAYS, Way
 from bitymi_ns.measure.templates import rendered
 
 ACCURATE = 1e-4
@@ -60,12 +61,12 @@ class Row:
         return "**loses figures**"
 
 
-def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2) -> Row:
+def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> Row:
     """Everything that a line of a table shows."""
     size = scene.width * scene.height * len(scene.params["means"])
-    trust = against_extended(scene, near=near) if size <= EXTENDED_SIZE else None
-    double = measure(scene, backend, torch.float64, near)
-    return Row(label, measure(scene, backend, torch.float32, near), double, trust)
+    trust = against_extended(scene, near=near) if way is PLAIN and size <= EXTENDED_SIZE else None
+    double = measure(scene, backend, torch.float64, near, way)
+    return Row(label, measure(scene, backend, torch.float32, near, way), double, trust)
 
 
 def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None) -> list[Row]:
@@ -81,10 +82,14 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
     """
     tell = progress or (lambda text: None)
     check_writable(path)
-    named = []
-    for case in cases():
-        tell(f"case {case.name}")
-        named.append(measure_row(case.name.replace("_", " "), case.scene, backend))
+    named: dict[str, list[Row]] = {}
+    for way in (PLAIN, *(way for way in WAYS if way.runs_on(backend))):
+        named[way.name] = []
+        for case in cases(way):
+            tell(f"case {case.name}, {way.name}")
+            row = measure_row(case.name.replace("_", " "), case.scene, backend, way=way)
+            if way is PLAIN or row.single.drawn:
+                named[way.name].append(row)
     swept: dict[str, list[Row]] = {}
     for sweep in SWEEPS:
         tell(f"sweep {sweep.name}")
@@ -95,10 +100,10 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
     picture = path.with_suffix(".png")
     write_file(picture, _plot(swept))
     write_file(path, _page(backend, named, swept, picture.name).encode())
-    return named + [row for rows in swept.values() for row in rows]
+    return [row for rows in (*named.values(), *swept.values()) for row in rows]
 
 
-def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], picture: str) -> str:
+def _page(backend: Backend, named: dict[str, list[Row]], swept: dict[str, list[Row]], picture: str) -> str:
     return rendered(
         "stability.md.j2",
         backend=backend.name,
@@ -109,7 +114,7 @@ def _page(backend: Backend, named: Sequence[Row], swept: dict[str, list[Row]], p
         allowance=f"{ALLOWANCE:g}",
         picture=picture,
         sweeps=[(sweep, _table(sweep.name, swept[sweep.name])) for sweep in SWEEPS],
-        cases=_table("case", named),
+        cases={name: _table("case", rows) for name, rows in named.items()},
     )
 
 

@@ -70,12 +70,11 @@ def render(
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]
     if tiles is not None:
-        pixel, surfel = t.blended.nonzero(as_tuple=True)
-        texture = torch.zeros_like(color)
-        for i, tile in enumerate(tiles):
-            pick = surfel == i
-            texture = texture.index_put((pixel[pick], surfel[pick]), texel(tile, t.uv[pixel[pick], i]))
-        color = torch.relu(color + texture)
+        surfel, pixel = t.blended.T.nonzero(as_tuple=True)  # surfel by surfel
+        counts = t.blended.sum(0).tolist()
+        parts = zip(tiles, t.uv[pixel, surfel].split(counts), strict=True)
+        fetched = torch.cat([texel(tile, uv) for tile, uv in parts]) if counts else color.new_zeros(0, 3)
+        color = torch.relu(color + torch.zeros_like(color).index_put((pixel, surfel), fetched))
     if residual is not None:
         pixel, surfel = t.blended.nonzero(as_tuple=True)
         u, v = t.uv[pixel, surfel, :, None].unbind(1)  # [F, 1]

@@ -16,16 +16,16 @@ from bitymi_ns.measure.stability.scenes import random_scene
 
 def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     short = tuple(dataclasses.replace(sweep, values=sweep.values[:1]) for sweep in page.SWEEPS)
-    some = page.cases()[:2]
+    every = page.cases
     monkeypatch.setattr(page, "SWEEPS", short)
-    monkeypatch.setattr(page, "cases", lambda: some)
+    monkeypatch.setattr(page, "cases", lambda way: every(way)[:2])
     target = tmp_path / "deep" / "numbers.md"
     assert cli.main(["stability", "--output", str(target)]) == 0
     text = target.read_text("utf8")
     assert "(numbers.png)" in text and (tmp_path / "deep" / "numbers.png").read_bytes().startswith(b"\x89PNG")
     assert text.count("accurate |") >= 6 and "through the camera plane" in text
     assert sorted(path.name for path in target.parent.iterdir()) == ["numbers.md", "numbers.png"]
-    assert "10 scenes, 0 of them" in capsys.readouterr().out
+    assert "13 scenes, 0 of them" in capsys.readouterr().out
     assert cli.main(["stability", "--backend", "abacus"]) == 1
     assert "no backend 'abacus'" in capsys.readouterr().err
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.codes import Codes
-from bitymi_ns.bake.looks import set_aside
+from bitymi_ns.bake.looks import FEWEST_VIEWS, set_aside
 from bitymi_ns.bake.methods import Tiles
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.pages import listed_texels, paged_texels
@@ -19,7 +19,7 @@ from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.statistics import Rounding, ViewColorError
 from bitymi_ns.bake.surfel_codes import code_surfels
 from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
-from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, coverage
+from bitymi_ns.bake.texel_scene import TexelScene, TexelViews, coverage
 from bitymi_ns.bake.worthwhile_color import color_choices
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene

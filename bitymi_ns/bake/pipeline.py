@@ -19,7 +19,7 @@ from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.pages import moved_texels, tile_means
 from bitymi_ns.bake.photographed import photographed
 from bitymi_ns.bake.plan import Field, paper_texels
-from bitymi_ns.bake.quantise import EncodedAtlas, choose_range, decode_pages, encode
+from bitymi_ns.bake.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
 from bitymi_ns.bake.texel_codes import TexelCodes, pages
 from bitymi_ns.ops.view_kinds import kind_of
@@ -142,7 +142,10 @@ class Baked:
         """The same bake with its texels quantised and encoded, where that is not done."""
         if self.texels is None or self.atlas is not None:
             return self
-        atlas = _encode(self.texels, self.packing, self.options, progress)
+        return self.with_atlas(encoded_pages(self.texels, self.packing, self.options, progress))
+
+    def with_atlas(self, atlas: EncodedAtlas) -> Baked:
+        """The same bake with its texels as they are encoded."""
         return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=_cost(self.packing, atlas)))
 
     def with_texel_codes(self, codes: TexelCodes) -> Baked:
@@ -308,7 +311,7 @@ def _textured(
     atlas = error = None
     counts = plan.texels if method.final else plan.texels.but(polished=packing.texels)
     if method.final:
-        atlas = None if tiles.texels is None else _encode(tiles.texels, packing, options, progress)
+        atlas = None if tiles.texels is None else encoded_pages(tiles.texels, packing, options, progress)
         stored = None if atlas is None else atlas.decoded()
         errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
         error = errors.summary(options.tolerance)
@@ -325,9 +328,16 @@ def _textured(
     )
 
 
-def _encode(texels: Tensor, packing: Packing, options: BakeOptions, progress: Progress) -> EncodedAtlas:
-    value_range = None
-    if options.format != "fp16":
+def encoded_pages(
+    texels: Tensor,
+    packing: Packing,
+    options: BakeOptions,
+    progress: Progress = no_progress,
+    value_range: Range | None = None,
+) -> EncodedAtlas:
+    """Pages [layers, height, width, 3] as the options say, in a range of values that is not theirs to choose where one
+    is given."""
+    if options.format != "fp16" and value_range is None:
         value_range = choose_range(texels.numpy(), packing, options.range, options.range_samples, options.seed)
     return encode(texels.numpy(), packing, options.format, value_range, options.bc7_profile, progress=progress)
 

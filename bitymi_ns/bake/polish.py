@@ -11,10 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.looks import Looks, gain, look, set_aside
+from bitymi_ns.bake.looks import FEWEST_VIEWS, Looks, gain, look, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
-from bitymi_ns.bake.tune import FEWEST_VIEWS, TexelScene, TexelViews, TuneOptions, coverage
+from bitymi_ns.bake.texel_scene import TexelScene, TexelViews, coverage
+from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.config import SceneConfig

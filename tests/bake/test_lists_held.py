@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.tune import TexelScene
+from bitymi_ns.bake.texel_scene import TexelScene
 from bitymi_ns.ops import Fragments, trace_cpu
 from bitymi_ns.ops import bands as bands_module
 from bitymi_ns.ops import trace as whole_trace

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from statistics import fmean
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
-from bitymi_ns.bake.tune import TexelScene, TexelView, TexelViews, coverage
+from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews, coverage
 from bitymi_ns.ops import fitting_lists, project, trace_cpu
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
@@ -19,7 +20,7 @@ from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
-OPTIONS = TuneOptions(steps=60, rate=0.3, held_in_every=4)
+OPTIONS = TuneOptions(steps=60, rate=0.3, held_in_every=4, coded_steps=0)
 
 
 def cameras() -> list[Camera]:
@@ -147,6 +148,7 @@ def test_the_texels_kept_are_those_of_the_best_look(
     monkeypatch.setattr(TexelViews, "psnr", noted)
     monkeypatch.setattr("math.cos", lambda angle: 20.0 * angle**6 - 0.9)
     tuned = tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, patience=99))
+    del seen[-1]  # of what is stored
     best = max(range(len(seen)), key=lambda i: seen[i][0])
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5
     assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
@@ -277,9 +279,42 @@ def test_an_interruption_leaves_the_bake_as_it_was(wrong: Baked, views: list[Vie
 
 
 @pytest.mark.parametrize(
-    "bad", [{"steps": 0}, {"held_in_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}]
+    "bad", [{"steps": -1}, {"held_in_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}]
 )
 def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
     tune = partial(tune_atlas, wrong, views, BACKGROUND)
     with pytest.raises(ValueError, match=f"{next(iter(bad))}.*fine-tuning|fine-tuning.*{next(iter(bad))[:4]}|SSIM"):
         tune(replace(TuneOptions(), **bad))
+
+
+def error(baked: Baked, views: list[View]) -> float:
+    """Mean square error of the stored scene."""
+    scene = baked.stored()
+    return fmean(float((scene.render(v.camera, BACKGROUND).rgb - v.image).square().mean()) for v in views)
+
+
+@pytest.mark.parametrize("format", ["bc7", "uint8"])
+def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], format: str) -> None:
+    """Texels whose blocks cannot hold them: the picture of what is stored gets better, with views set aside or none."""
+    options = replace(truth.options, format=format)
+    generator = torch.Generator().manual_seed(3)
+    noise = 0.2 * torch.randn(truth.texels.shape, generator=generator)
+    noisy = replace(truth, options=options).with_texels(truth.texels + noise)
+    plain = noisy.encoded()
+    for held_in_every in (0, 4):
+        steps = TuneOptions(steps=0, coded_steps=40, coded_rate=0.3, held_in_every=held_in_every)
+        tuned = tune_atlas(noisy, views, BACKGROUND, steps)
+        assert error(tuned, views) < 0.8 * error(plain, views)
+        assert tuned.statistics.finetune.steps == 40
+        decoded = torch.from_numpy(tuned.atlas.decoded())
+        assert float((decoded - tuned.texels).abs().max()) < 0.5  # what is stored is of these texels
+    few = tune_atlas(noisy, views[:1], BACKGROUND, TuneOptions.of_learned(5))
+    assert few.atlas is not None and few.statistics.finetune.psnr_held_in is None
+
+
+def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: Baked) -> None:
+    """Photographs of the scene itself: the steps do not walk away from it."""
+    scene = replace(truth, options=replace(truth.options, format="fp16"))
+    views = photographs(scene)
+    tuned = tune_atlas(scene, views, BACKGROUND, TuneOptions.of_learned(20))
+    assert error(tuned, views) < 2e-6

@@ -1,0 +1,107 @@
+"""What is stored of texels, as their last steps see it: pages of BC7 blocks, say, or the integers of a compact
+bundle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.pages import listed_texels, paged_texels
+from bitymi_ns.bake.pipeline import Baked, encoded_pages
+from bitymi_ns.bake.quantise import EncodedAtlas
+from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
+
+TO_START = 0.93
+"""Share of the bytes that coded texels may have before their last steps, in which they grow a little."""
+
+
+class Coded(Protocol):
+    """Texels as they are stored."""
+
+    def texels(self) -> Tensor:
+        """[T, 3] as they are drawn, in the order of `TexelTiles`."""
+        ...
+
+
+C = TypeVar("C", bound=Coded)
+
+
+class Coding(Protocol[C]):
+    """A way to store texels."""
+
+    def first(self, texels: Tensor) -> C:
+        """Of texels [T, 3], before the steps."""
+        ...
+
+    def again(self, texels: Tensor) -> C:
+        """The same on the way, quickly."""
+        ...
+
+    def last(self, coded: C) -> C:
+        """What is stored of the best that was found."""
+        ...
+
+
+class Cosines:
+    """The codes of a compact bundle, of no more bytes than the options say."""
+
+    def __init__(self, coder: TexelCoder, options: TexelCodeOptions) -> None:
+        self._coder, self._most = coder, options.most_bytes
+
+    def first(self, texels: Tensor) -> TexelCodes:
+        return self._coder.code(texels) if self._most is None else self._coder.fit(texels, self._most * TO_START)
+
+    def again(self, texels: Tensor) -> TexelCodes:
+        return self._coder.code(texels, rounds=0)
+
+    def last(self, coded: TexelCodes) -> TexelCodes:
+        if self._most is None or coded.nbytes() <= self._most:
+            return coded
+        return self._coder.fit(coded.texels(), self._most, rounds=1)
+
+
+@dataclass(frozen=True)
+class PageTexels:
+    """Texels in the pages of an atlas.
+
+    Attributes:
+        listed: [T, 3] what was encoded.
+        atlas: as it is stored.
+        drawn: [T, 3] as they are drawn: decoded, but for the constants of surfels without a tile.
+    """
+
+    listed: Tensor
+    atlas: EncodedAtlas
+    drawn: Tensor
+
+    def texels(self) -> Tensor:
+        return self.drawn
+
+
+class Pages:
+    """An atlas in the format of the bake's options, in the range of values of the texels that come first."""
+
+    def __init__(self, baked: Baked) -> None:
+        assert baked.texels is not None
+        self._pages, self._packing, self._options = baked.texels, baked.packing, baked.options
+        area = torch.from_numpy(self._packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
+        self._first = area.cumsum(0) - area  # [N]
+        self._range = None
+
+    def first(self, texels: Tensor) -> PageTexels:
+        self._range = None
+        coded = self.again(texels)
+        self._range = coded.atlas.range
+        return coded
+
+    def again(self, texels: Tensor) -> PageTexels:
+        pages = paged_texels(texels, self._packing, self._pages)
+        atlas = encoded_pages(pages, self._packing, self._options, value_range=self._range)
+        drawn = listed_texels(torch.from_numpy(atlas.decoded()), self._packing, texels[self._first])
+        return PageTexels(texels.clone(), atlas, drawn)
+
+    def last(self, coded: PageTexels) -> PageTexels:
+        return coded

@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, baked_and_reduced, tune_atlas
 from bitymi_ns.bake.compact import Coder, Compact
 from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.export import STEPS_AFTER_POLISH, load_trained
+from bitymi_ns.host.export import STEPS_AFTER_LEARNING, STEPS_AFTER_POLISH, load_trained
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
@@ -50,7 +50,8 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
     background, has_learned = model.background.cpu(), isinstance(model.scene.field, TexelField)
     learning = Learning(None if has_learned else PolishOptions(steps=steps), train=model.train_config)
     baked = baked_and_reduced(model.scene, views, photographs, background, BakeOptions(), learning)
-    return {"baked": baked, "views": photographs, "held": list(data.eval_views), "background": background}
+    found = {"baked": baked, "views": photographs, "held": list(data.eval_views), "background": background}
+    return {**found, "learned": has_learned}
 
 
 def held_out(scene: BakedScene, views: list[View], background: torch.Tensor) -> float:
@@ -104,7 +105,8 @@ def main() -> int:
         surfels = priced.baked.codes.surfels
         shown, tuned = held_out(priced.shown, held, background), None
         if options.tune:
-            steps = TuneOptions(steps=STEPS_AFTER_POLISH)
+            learned = found.get("learned", False)
+            steps = TuneOptions.of_learned(STEPS_AFTER_LEARNING) if learned else TuneOptions(steps=STEPS_AFTER_POLISH)
             tuned = held_out(
                 tune_atlas(priced.baked, views, background, steps, coding=priced.coding).stored(), held, background
             )

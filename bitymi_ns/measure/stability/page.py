@@ -83,7 +83,7 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
     tell = progress or (lambda text: None)
     check_writable(path)
     named: dict[str, list[Row]] = {}
-    for way in (PLAIN, *(way for way in WAYS if way.runs_on(backend))):
+    for way in (PLAIN, *WAYS):
         named[way.name] = []
         for case in cases(way):
             tell(f"case {case.name}, {way.name}")

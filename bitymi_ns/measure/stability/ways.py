@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.measure.stability.backends import Backend
 from bitymi_ns.measure.stability.scenes import SceneCase
 from bitymi_ns.ops import TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
@@ -30,7 +29,6 @@ class Way:
         name: short, for tables and tests.
         texels: every surfel has a tile of random texels; the gradient reaches them and, through the fetch, u and v.
         through_pixel: the kernel is seen through a pixel (`prefilter: pixel`).
-        cpu_only: its operations have no kernels elsewhere.
         rim: bound of the derivative at the rim on both sides, `Scene.rim`. Through a pixel the bound is another
             one, that of the kernel averaged over the pixel, which the reference does not have: 0 turns it off.
     """
@@ -38,7 +36,6 @@ class Way:
     name: str
     texels: bool = False
     through_pixel: bool = False
-    cpu_only: bool = False
     rim: float = RIM
 
     def of(self, case: SceneCase) -> SceneCase:
@@ -49,13 +46,9 @@ class Way:
         random = torch.randn(n * TILE[0] * TILE[1], 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
         return replace(case, params={**case.params, TEXELS: 0.2 * random})
 
-    def runs_on(self, backend: Backend) -> bool:
-        """Whether that backend has its operations."""
-        return not self.cpu_only or backend.name == "cpu"
-
 
 PLAIN = Way("plain")
-WAYS = (Way(TEXELS, texels=True, cpu_only=True), Way("pixel", through_pixel=True, rim=0.0))
+WAYS = (Way(TEXELS, texels=True), Way("pixel", through_pixel=True, rim=0.0))
 """Those beside the plain one."""
 
 

@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, baked_and_reduced, tune_atlas
 from bitymi_ns.bake.compact import Coder, Compact
 from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.export import STEPS_AFTER_LEARNING, STEPS_AFTER_POLISH, load_trained
+from bitymi_ns.host.export import STEPS_AFTER_LEARNING, load_trained
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
@@ -106,7 +106,7 @@ def main() -> int:
         shown, tuned = held_out(priced.shown, held, background), None
         if options.tune:
             learned = found.get("learned", False)
-            steps = TuneOptions.of_learned(STEPS_AFTER_LEARNING) if learned else TuneOptions(steps=STEPS_AFTER_POLISH)
+            steps = (TuneOptions.of_learned if learned else TuneOptions)(steps=STEPS_AFTER_LEARNING)
             tuned = held_out(
                 tune_atlas(priced.baked, views, background, steps, coding=priced.coding).stored(), held, background
             )

@@ -53,8 +53,8 @@ class TuneOptions(TexelSteps):
     @classmethod
     def of_learned(cls, steps: int, cache_bytes: int = cache_bytes) -> TuneOptions:
         """For texels that have learned in training, from all views: these go on teaching them, and all steps see what
-        is stored."""
-        return cls(steps=0, coded_steps=steps, coded_rate=cls.rate, held_in_every=0, cache_bytes=cache_bytes)
+        is stored. With half of the rate it takes twice the steps."""
+        return cls(steps=0, coded_steps=steps, coded_rate=2 * cls.rate, held_in_every=0, cache_bytes=cache_bytes)
 
     def check(self) -> None:
         """Refuses values that make no sense."""

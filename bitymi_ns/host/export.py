@@ -52,10 +52,9 @@ from bitymi_ns.train.losses import cc_psnr, psnr
 INTERRUPTED = 130
 FEWEST_PASSES = 4
 """Steps of polish or fine-tuning per photograph; with fewer than this a line says that more may gain."""
-STEPS_AFTER_POLISH = 100
-"""Of the fine-tuning: what is left to learn is what the reduction of tiles and view colours changed."""
-STEPS_AFTER_LEARNING = 200
-"""The same of texels that learned in training; all of them see what is stored."""
+STEPS_AFTER_LEARNING = 100
+"""Of the fine-tuning of texels that learned in training or in the polish: what is left to learn is what the reduction
+of tiles and view colours changed."""
 
 
 @dataclass(kw_only=True)
@@ -82,7 +81,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     photograph where that is more."""
     finetune_steps: int | None = None
     """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 where nothing but a field has learned
-    yet, 100 after a polish, both with 120 further ones that see what is stored of the texels; 200 that do so where
+    yet, 100 after a polish, both with 120 further ones that see what is stored of the texels; 100 that do so where
     texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
     """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
@@ -141,8 +140,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         polish = PolishOptions(steps=steps) if steps and textured else None
         steps = self.finetune_steps
         if steps is None:
-            steps = TuneOptions.steps if polish is None else STEPS_AFTER_POLISH
-            steps = STEPS_AFTER_LEARNING if has_learned else steps
+            steps = TuneOptions.steps if polish is None and not has_learned else STEPS_AFTER_LEARNING
         tune = None
         if textured and steps:
             options = TuneOptions.of_learned if has_learned else TuneOptions

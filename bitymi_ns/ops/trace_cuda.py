@@ -1,7 +1,7 @@
 """The fragment list by the CUDA kernels (csrc/cuda/pairs.h describes it).
 
 Two numbers decide how much memory is needed, so the host waits for the device twice per view: for the number of pairs
-of surfel and tile, and for the number of fragments. Nothing else in a training step has to wait.
+of surfel and tile, and for the number of fragments.
 """
 
 from __future__ import annotations

@@ -3,10 +3,11 @@
 // Work, single precision. For each fragment the forward pass reads 8 bytes of the list and 32 of its surfel, which its
 // neighbours share, and writes 12; for a textured one it also reads 8 bytes of the list and four texels of 12. The
 // backward pass reads 32 bytes of the list and of colours, for a textured fragment what the forward pass does, and
-// writes 8. A textured fragment adds to four texels, one vector reduction of 16 bytes each, after sums over neighbours
-// between the same four: in a close view many fragments lie there, and all of a tile of one texel do. Every texel is
-// cleared (16 bytes) and looked at (16), and those that were seen move (28). A look-up is about 50 operations, with its
-// derivatives 75: memory and additions are the limit. The backward kernel takes 48 registers on compute capability 9.0.
+// writes 8. A textured fragment adds to four texels, one vector reduction of 16 bytes each (four atomics before compute
+// capability 9.0), after sums over neighbours between the same four: in a close view many fragments lie there, and all
+// of a tile of one texel do. Every texel is cleared (16 bytes) and looked at (16), and those that were seen move (28).
+// A look-up is about 50 operations, with its derivatives 75: memory and additions are the limit. The backward kernel
+// takes 48 registers on compute capability 9.0.
 #include "cuda/field_device.h"
 #include "cuda/kernels.h"
 #include "cuda/warp.h"

@@ -44,6 +44,9 @@ class PolishOptions(TuneOptions):
     def check(self) -> None:
         """Refuses values that make no sense."""
         super().check()
+        for name, least in (("steps", 1), ("held_in_every", 2)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} of the polish must be at least {least}, not {getattr(self, name)}")
         for name in ("share", "pixels_per_texel"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} of the polish must be positive, not {getattr(self, name)}")

@@ -62,7 +62,7 @@ def db(baked: Baked, views: list[View]) -> float:
 
 def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
-    tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, held_in_every=4))
+    tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, held_in_every=4, coded_steps=0))
     told = polished.statistics.polish
     assert (told.views, told.held_in_views, told.steps) == (7, 3, 40)
     assert told.psnr_held_in.after > told.psnr_held_in.before + 3 and told.error_before == wrong.statistics.error
@@ -86,7 +86,7 @@ def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Baked, view
     assert (left.kept, left.left_out.transparent, left.left_out.unseen) == (58, 1, 1)
     assert lean.rows.tolist() == [i for i in range(60) if i not in (5, 59)] and lean.atlas is None
     assert db(lean, views[10:]) == pytest.approx(db(polished, views[10:]), abs=0.1)
-    again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8))
+    again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0))
     assert again.statistics.polish == polished.statistics.polish and again.statistics.finetune.steps == 8
     with pytest.raises(ValueError, match="reduced already"):
         polish_scene(lean, views, BACKGROUND, OPTIONS)

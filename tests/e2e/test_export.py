@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,10 +14,9 @@ import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.bake import BakeOptions, TuneOptions
+from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
-from bitymi_ns.host import export as host_export
 from bitymi_ns.host import target
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.export import default_export
@@ -143,19 +141,6 @@ def test_a_run_without_texture_is_not_given_one(start: Callable[..., BitymiTrain
     ns_train.main(config)
     run_export(config, tmp_path / "b", polish_steps=None)
     assert not (tmp_path / "b" / "atlas.ktx2").exists()
-
-
-def test_a_fine_tuning_that_ends_early_says_so(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wild = partial(TuneOptions, rate=50.0, patience=2)
-    monkeypatch.setattr(host_export, "TuneOptions", wild)
-    run_export(trained, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=40, compare=False)
-    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    steps = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]["steps"]
-    assert steps < 40
-    assert f"stopped early at step {steps} of 40: no gain on the set-aside training views for" in out
-    assert "tuning texels ━" in out and "100%" in out.split("tuning texels")[-1][:80]
 
 
 def test_a_run_is_found_beside_its_configuration(

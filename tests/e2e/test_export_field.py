@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from bitymi_ns.bake import TuneOptions
 from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
+from bitymi_ns.host import export as host_export
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.verify import check_run
@@ -24,7 +27,11 @@ def test_the_texels_are_fine_tuned(
     run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=30)
     statistics = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]
     tuned = statistics["finetune"]
-    assert tuned["steps"] <= 30 and tuned["views"] + tuned["held_in_views"] == 10 and tuned["cpu_seconds"] > 0
+    assert (
+        tuned["steps"] <= 30 + TuneOptions.coded_steps
+        and tuned["views"] + tuned["held_in_views"] == 10
+        and tuned["cpu_seconds"] > 0
+    )
     held_in, held_out = tuned["psnr_held_in"], tuned["psnr_held_out"]
     assert held_in["after"] == max(psnr for _, psnr in tuned["curve"])
     assert held_out["before"] == pytest.approx(statistics["held_out"]["psnr_neural_against_photos"], abs=0.2)
@@ -77,6 +84,19 @@ def test_fine_tuning_mends_an_atlas_that_is_too_dark(
     assert held_in["after"] > held_in["before"] + 0.5 and held_out["after"] > held_out["before"] + 0.5
     stored = evaluate(tmp_path / "b" / "config.yml", tmp_path / "tuned.json")["psnr"]
     assert stored == pytest.approx(held_out["after"], abs=0.1)
+
+
+def test_a_fine_tuning_that_ends_early_says_so(
+    field_run: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wild = partial(TuneOptions, rate=50.0, patience=2, coded_steps=0)
+    monkeypatch.setattr(host_export, "TuneOptions", wild)
+    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=40, compare=False)
+    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    steps = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]["steps"]
+    assert steps < 40
+    assert f"stopped early at step {steps} of 40: no gain on the set-aside training views for" in out
+    assert "tuning texels ━" in out and "100%" in out.split("tuning texels")[-1][:80]
 
 
 def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(

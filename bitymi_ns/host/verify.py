@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import torch
@@ -34,7 +35,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     checks = [check_view_color(bundle, model.scene.surfels, train)]
     if isinstance(model.scene.field, HashField):
-        checks.append(check_field(bundle, model.scene.field.cpu(), train))
+        checks.append(check_field(bundle, copy.deepcopy(model.scene.field).cpu(), train))
     if len(datamanager.eval_dataset):
         scene, background = bundle.scene, model.background.cpu()
         rows = held_out_psnr(model, datamanager, lambda c: scene.render(c, background=background).rgb, views)

@@ -172,8 +172,12 @@ class Guard:
         if math.isfinite(old) and math.isfinite(new) and old > 0.0:
             self._best, self._sum = self._best * new / old, self._sum * (new / old)
 
-    def failed(self, step: int, error: TrainingDiverged) -> None:
-        """Call when a step could not be done because its loss is not finite; then do it again.
+    def failed(self, step: int, error: TrainingDiverged) -> dict[str, float]:
+        """Call when a step could not be done because its loss is not finite, and then do it again; or when the scene
+        broke in it.
+
+        Returns:
+            What was done, by name.
 
         Raises:
             TrainingDiverged: nothing can be restored, or it has been tried too often.
@@ -182,9 +186,8 @@ class Guard:
         if not self.on or not cause:
             raise error
         if self.strategy.broken_share(self.scene) <= BROKEN_SHARE and self._field_is_finite():
-            self._drop(step)
-        else:
-            self._go_back(step, cause)
+            return self._drop(step)
+        return self._go_back(step, cause)
 
     def after(self, step: int, loss: Tensor, broken: Tensor) -> dict[str, float]:
         """Call after each step, when optimisers and strategy are done with it.

@@ -182,10 +182,14 @@ class Training:
         broken = output.projection.broken
         del output  # with its fragments, before the strategy draws views of its own
         factor = self.schedule.resolution_factor(step)
-        report = self.strategy.step(
-            step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
-        )
-        report |= self.guard.after(step, self._photometric, broken)
+        try:
+            report = self.strategy.step(
+                step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
+            )
+        except TrainingDiverged as error:  # the optimisers broke the field or all surfels; no loss has shown it yet
+            report = self.guard.failed(step, error)
+        else:
+            report |= self.guard.after(step, self._photometric, broken)
         if "rolled_back" in report:
             self.watch.forget()
         self.clock.stop()

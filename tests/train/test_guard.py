@@ -75,6 +75,31 @@ def test_a_field_that_breaks_on_the_way_is_restored(make_scene, views):
     assert evaluate(scene, views, trainer.config)[0] > 15
 
 
+def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
+    """The prune finds it, not the next loss."""
+    scene = make_scene()
+    trainer = Trainer(scene, views, config_of(), 120)
+    schedule = trainer.training.schedule
+    prune = next(
+        step for step in range(50, 120) if schedule.is_densify_step(step) or schedule.is_final_prune_step(step)
+    )
+    run(trainer, prune)
+    step = trainer.training.strategy.step
+
+    def broken(*arguments):
+        with torch.no_grad():
+            scene.field.field_w3[4] = math.nan
+        trainer.training.strategy.step = step
+        return step(*arguments)
+
+    trainer.training.strategy.step = broken
+    with pytest.warns(UserWarning, match=f"step {prune}: training diverged .*field_w3 is not finite"):
+        _, _, report = trainer.advance()
+    assert report["rolled_back"] > 0 and trainer.training.guard.rollbacks == 1 and not describe_broken(scene)
+    run(trainer, 20)
+    assert trainer.training.guard.rollbacks == 1
+
+
 def test_views_drawn_worse_than_before_take_the_run_back(make_scene, views):
     scene = make_scene()
     trainer = Trainer(scene, views, config_of(), 120)

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -138,9 +139,14 @@ def test_a_bundle_in_one_file_is_sent_and_exported_as_its_parts(bundle: Path, tm
 
 def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
     command = [sys.executable, "-m", "bitymi_ns.cli", "view", str(bundle), "--no-open-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    # a shell's background jobs, and what they start, ignore Ctrl-C
+    heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heeds) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert "http://127.0.0.1:" in line and str(bundle) in line
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
+        try:
+            assert process.wait(timeout=60) == 0
+        finally:
+            process.kill()  # else leaving the block waits for ever

@@ -166,7 +166,7 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     neural, fragments, _ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
-        learning = Learning(tune=TuneOptions(steps=settings.tuning), train=config)
+        learning = Learning(tune=TuneOptions.of_learned(settings.tuning), train=config)
         aside = calibration.every(10)
         return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(), learning, aside)
 

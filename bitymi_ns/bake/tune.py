@@ -94,7 +94,7 @@ def tune_atlas(
         background: [3] colour behind the scene.
         options: see `TuneOptions`.
         progress: called after every step.
-        eval_views: views of which the gain is stated; they decide nothing.
+        eval_views: views of which the gain is stated, of what is stored; they decide nothing.
         coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
             the coding makes of the texels, and the codes that show the set-aside views best are kept.
 
@@ -119,13 +119,14 @@ def tune_atlas(
     _descend(scene, tuned, held_in, share, looks, options, progress)
     held_out = TexelViews(scene, eval_views, MemoryBudget(0))
     coder = _coding(baked, scene, tuned, coding or TexelCodeOptions(), progress)
+    untuned = held_out.psnr(coder.first(scene.texels).texels()) if eval_views else None
     coded = _coded(scene, tuned, held_in, share, looks.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = looks.statistics(len(tuned), len(held_in), *spent).but(
         steps=looks.done + options.coded_steps,
         steps_asked=options.steps + options.coded_steps,
         error_before=baked.statistics.error,
-        psnr_held_out=gain(held_out.psnr(scene.texels), held_out.psnr(coded.texels())) if eval_views else None,
+        psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels())),
     )
     if isinstance(coded, TexelCodes):
         result = baked.with_texel_codes(coded)

@@ -13,6 +13,7 @@ from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked, encoded_pages
 from bitymi_ns.bake.quantise import EncodedAtlas
 from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
+from bitymi_ns.ops import TexelTiles
 
 TO_START = 0.93
 """Share of the bytes that coded texels may have before their last steps, in which they grow a little."""
@@ -84,12 +85,10 @@ class PageTexels:
 class Pages:
     """An atlas in the format of the bake's options, in the range of values of the texels that come first."""
 
-    def __init__(self, baked: Baked) -> None:
+    def __init__(self, baked: Baked, tiles: TexelTiles) -> None:
         assert baked.texels is not None
         self._pages, self._packing, self._options = baked.texels, baked.packing, baked.options
-        area = torch.from_numpy(self._packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
-        self._first = area.cumsum(0) - area  # [N]
-        self._range = None
+        self._first, self._range = tiles.first, None
 
     def first(self, texels: Tensor) -> PageTexels:
         self._range = None

@@ -142,7 +142,7 @@ def _coding(
     if baked.codes is not None:
         weights = coverage(scene, views, progress, squared=True)[:, 0]
         return Cosines(TexelCoder(scene.sizes, weights, options), options)
-    return Pages(baked)
+    return Pages(baked, scene.tiles)
 
 
 def _descend(

@@ -19,11 +19,11 @@ Mlp<S, Pack<S>> load_mlp(const FieldArrays<S>& field) {
   for (int i = 0; i < kWidth; ++i) m.w2[i] = load(field.w2 + i * kWidth);
   for (int o = 0; o < kWidth; ++o)
     for (int i = 0; i < kWidth; ++i) {
-      m.w1t[o].v[i] = i < inputs ? field.w1[i * kWidth + o] : S(0);
-      m.w2t[o].v[i] = field.w2[i * kWidth + o];
+      m.w1t[o].set(i, i < inputs ? field.w1[i * kWidth + o] : S(0));
+      m.w2t[o].set(i, field.w2[i * kWidth + o]);
     }
   for (int c = 0; c < 3; ++c)
-    for (int i = 0; i < kWidth; ++i) m.w3[c].v[i] = field.w3[i * 3 + c];
+    for (int i = 0; i < kWidth; ++i) m.w3[c].set(i, field.w3[i * 3 + c]);
   return m;
 }
 template <class S>
@@ -61,7 +61,7 @@ struct Encoder {
         for (int k = 0; k < 8; ++k) {
           Quad<S> entry;
           std::memcpy(&entry, table + int64_t(at[l].index[k][p]) * kFeatures, sizeof entry);
-          sum += at[l].weight[k].v[p] * entry;
+          sum += at[l].weight[k][p] * entry;
         }
         std::memcpy(features[p] + l * kFeatures, &sum, sizeof sum);
       }
@@ -122,7 +122,7 @@ struct TableScatter {
             S* entry = table + int64_t(b.index[l][k][p]) * kFeatures;
             Quad<S> e;
             std::memcpy(&e, entry, sizeof e);
-            e += b.weight[l][k].v[p] * d;
+            e += b.weight[l][k][p] * d;
             std::memcpy(entry, &e, sizeof e);
           }
         }
@@ -135,10 +135,10 @@ template <class S>
 void add_mlp_gradient(const std::vector<Mlp<S, Pack<S>>>& parts, int count, int inputs, const FieldGradients<S>& out) {
   for (int p = 0; p < count; ++p) {
     for (int i = 0; i < inputs; ++i)
-      for (int o = 0; o < kWidth; ++o) out.w1[i * kWidth + o] += parts[p].w1[i].v[o];
+      for (int o = 0; o < kWidth; ++o) out.w1[i * kWidth + o] += parts[p].w1[i][o];
     for (int i = 0; i < kWidth; ++i) {
-      for (int o = 0; o < kWidth; ++o) out.w2[i * kWidth + o] += parts[p].w2[i].v[o];
-      for (int c = 0; c < 3; ++c) out.w3[i * 3 + c] += parts[p].w3[c].v[i];
+      for (int o = 0; o < kWidth; ++o) out.w2[i * kWidth + o] += parts[p].w2[i][o];
+      for (int c = 0; c < 3; ++c) out.w3[i * 3 + c] += parts[p].w3[c][i];
     }
   }
 }

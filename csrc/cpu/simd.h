@@ -6,14 +6,9 @@
 
 #include "core/common.h"
 #include "core/field.h"
-
-#if defined(__AVX2__)
-#include <immintrin.h>
-#endif
+#include "cpu/wide.h"
 
 namespace bt {
-
-constexpr int kLanes = 16;
 
 template <class S>
 struct Pack;
@@ -23,15 +18,15 @@ template <class S>
 struct LaneTypes;
 template <>
 struct LaneTypes<float> {
-  typedef float V __attribute__((vector_size(64)));
-  typedef int32_t M __attribute__((vector_size(64)));  // lanes of 0 or -1
+  using M = Wide<int32_t>;  // lanes of 0 or -1
+  using U = Wide<uint32_t>;
   typedef float O __attribute__((vector_size(32)));
   typedef float Q __attribute__((vector_size(16)));
 };
 template <>
 struct LaneTypes<double> {
-  typedef double V __attribute__((vector_size(128)));
-  typedef int64_t M __attribute__((vector_size(128)));
+  using M = Wide<int64_t>;
+  using U = Wide<uint64_t>;
   typedef double O __attribute__((vector_size(64)));
   typedef double Q __attribute__((vector_size(32)));
 };
@@ -46,26 +41,23 @@ BT_HD Quad<S> relu_quad(Quad<S> a) {
   return a < S(0) ? Quad<S>{} : a;
 }
 
-template <>
-struct IndexOf<Pack<float>> {
-  typedef uint32_t type __attribute__((vector_size(64)));
-};
-template <>
-struct IndexOf<Pack<double>> {
-  typedef uint64_t type __attribute__((vector_size(128)));
+template <class S>
+struct IndexOf<Pack<S>> {
+  using type = typename LaneTypes<S>::U;
 };
 
 template <class S>
 struct Pack {
-  using V = typename LaneTypes<S>::V;
+  using V = Wide<S>;
   using M = typename LaneTypes<S>::M;
   V v;
   Pack() = default;
-  BT_HD Pack(V value) : v(value) {}
-  BT_HD explicit Pack(S value) : v(value - V{}) {}
+  BT_HD Pack(const V& value) : v(value) {}
+  BT_HD explicit Pack(S value) : v(all_lanes<V>(value)) {}
   template <class F, class = std::enable_if_t<std::is_floating_point_v<F> && !std::is_same_v<F, S>>>
   BT_HD explicit Pack(F value) : Pack(S(value)) {}
   BT_HD S operator[](int i) const { return v[i]; }
+  BT_HD void set(int i, S value) { set_lane(v, i, value); }
 };
 
 template <class S>
@@ -90,12 +82,12 @@ BT_HD Pack<S> operator/(Pack<S> a, Pack<S> b) {
 }
 template <class S>
 BT_HD Pack<S>& operator+=(Pack<S>& a, Pack<S> b) {
-  a.v += b.v;
+  a.v = a.v + b.v;
   return a;
 }
 template <class S>
 BT_HD Pack<S>& operator-=(Pack<S>& a, Pack<S> b) {
-  a.v -= b.v;
+  a.v = a.v - b.v;
   return a;
 }
 // Comparisons give lane masks, which combine with & | ~.
@@ -113,15 +105,15 @@ BT_HD typename Pack<S>::M operator>=(Pack<S> a, Pack<S> b) {
 }
 template <class S>
 BT_HD Pack<S> select(typename Pack<S>::M m, Pack<S> yes, Pack<S> no) {
-  return m ? yes.v : no.v;
+  return choose(m, yes.v, no.v);
 }
 template <class S>
 BT_HD Pack<S> max_(Pack<S> a, Pack<S> b) {
-  return a.v > b.v ? a.v : b.v;
+  return choose(a.v > b.v, a.v, b.v);
 }
 template <class S>
 BT_HD Pack<S> min_(Pack<S> a, Pack<S> b) {
-  return a.v < b.v ? a.v : b.v;
+  return choose(a.v < b.v, a.v, b.v);
 }
 
 // exp and log of floats: Cody-Waite reduction and a polynomial, below 2 ulp over the normal range.
@@ -139,22 +131,17 @@ BT_HD Pack<float> exp_(Pack<float> x) {
   p = p * f + 0.5f;
   p = p * f + 1.0f;
   p = p * f + 1.0f;
-  const M e = (__builtin_convertvector(n, M) + 127) << 23;
-  V two_n;
-  std::memcpy(&two_n, &e, sizeof e);
-  return x.v < -87.0f ? V{} : p * two_n;
+  const V two_n = same_bits<V>((convert<M>(n) + 127) << 23);
+  return choose(x.v < -87.0f, V{}, p * two_n);
 }
 BT_HD Pack<float> log_(Pack<float> x) {
   using V = Pack<float>::V;
   using M = Pack<float>::M;
-  M bits;
-  std::memcpy(&bits, &x.v, sizeof bits);
+  const M bits = same_bits<M>(x.v);
   // mantissa in [sqrt(1/2), sqrt(2)), so that the logarithm keeps its relative accuracy near 1
   const M shifted = bits - 0x3f3504f3;
   const M e = shifted >> 23;
-  const M m_bits = (shifted & 0x007fffff) + 0x3f3504f3;
-  V m;
-  std::memcpy(&m, &m_bits, sizeof m);
+  const V m = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3);
   const V f = m - 1.0f;
   const V s = f / (2.0f + f), s2 = s * s;
   // log(1+f) = 2 atanh(s)
@@ -162,33 +149,17 @@ BT_HD Pack<float> log_(Pack<float> x) {
   p = p * s2 + 0.4f;
   p = p * s2 + 0.666666667f;
   const V r = s * s2 * p + 2.0f * s;
-  const V n = __builtin_convertvector(e, V);
+  const V n = convert<V>(e);
   return (r + n * 1.42860677e-6f) + n * 0.693145752f;
 }
 BT_HD Pack<double> exp_(Pack<double> x) {
   Pack<double> r;
-  for (int i = 0; i < kLanes; ++i) r.v[i] = std::exp(x.v[i]);
+  for (int i = 0; i < kLanes; ++i) r.set(i, std::exp(x[i]));
   return r;
 }
 BT_HD Pack<double> log_(Pack<double> x) {
   Pack<double> r;
-  for (int i = 0; i < kLanes; ++i) r.v[i] = std::log(x.v[i]);
-  return r;
-}
-
-// One bit per lane.
-BT_HD uint32_t bits(Pack<float>::M m) {
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-  return _mm512_movepi32_mask((__m512i)m);
-#else
-  uint32_t r = 0;
-  for (int i = 0; i < kLanes; ++i) r |= uint32_t(m[i] & 1) << i;
-  return r;
-#endif
-}
-BT_HD uint32_t bits(Pack<double>::M m) {
-  uint32_t r = 0;
-  for (int i = 0; i < kLanes; ++i) r |= uint32_t(m[i] & 1) << i;
+  for (int i = 0; i < kLanes; ++i) r.set(i, std::log(x[i]));
   return r;
 }
 
@@ -197,22 +168,15 @@ template <class S>
 BT_HD typename Pack<S>::M mask_of(uint32_t b) {
   using M = typename Pack<S>::M;
   M number;
-  for (int i = 0; i < kLanes; ++i) number[i] = 1 << i;
+  for (int i = 0; i < kLanes; ++i) set_lane(number, i, std::decay_t<decltype(number[0])>(1 << i));
   return (number & int(b)) != 0;
 }
 
 // The lanes named by `keep`, next to each other; `to` has room for a whole pack.
 template <class S>
 BT_HD void compress(S* to, Pack<S> a, uint32_t keep) {
-  int n = 0;
-  for (uint32_t k = keep; k; k &= k - 1) to[n++] = a.v[__builtin_ctz(k)];
+  compress_lanes(to, a.v, keep);
 }
-#if defined(__AVX512F__)
-template <>
-BT_HD void compress(float* to, Pack<float> a, uint32_t keep) {
-  _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(keep), (__m512)a.v));
-}
-#endif
 
 template <class S>
 BT_HD Pack<S> load(const S* p) {
@@ -226,20 +190,18 @@ BT_HD void store(S* p, Pack<S> a) {
 }
 template <class S>
 BT_HD Pack<S> sqrt_(Pack<S> a) {
-  Pack<S> r;
-  for (int i = 0; i < kLanes; ++i) r.v[i] = bt::sqrt_(a.v[i]);
-  return r;
+  return square_root(a.v);
 }
 template <class S>
 BT_HD Pack<S> floor_(Pack<S> a) {
   // truncation, then one less where that went up; exact below 2^31
-  const typename Pack<S>::V t =
-      __builtin_convertvector(__builtin_convertvector(a.v, typename Pack<S>::M), typename Pack<S>::V);
-  return t - (t > a.v ? Pack<S>(S(1)).v : typename Pack<S>::V{});
+  using V = typename Pack<S>::V;
+  const V t = convert<V>(convert<typename Pack<S>::M>(a.v));
+  return t - choose(t > a.v, Pack<S>(S(1)).v, V{});
 }
 template <class S>
 BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
-  return (typename IndexOf<Pack<S>>::type) __builtin_convertvector(a.v, typename Pack<S>::M);
+  return same_bits<typename IndexOf<Pack<S>>::type>(convert<typename Pack<S>::M>(a.v));
 }
 // Half of a vector: the lower one (0) or the upper one (1). GCC has the shuffle from version 12 on.
 template <int which, class Half, class V>
@@ -257,10 +219,21 @@ BT_HD Half half(V v) {
   return r;
 #endif
 }
+// The lanes added to four: halves to halves.
+template <class S, class V>
+BT_HD Quad<S> folded(const V& v) {
+  if constexpr (std::is_same_v<V, Quad<S>>)
+    return v;
+  else if constexpr (is_two<V>)
+    return folded<S>(v.low + v.high);
+  else if constexpr (std::is_same_v<V, Oct<S>>)
+    return half<0, Quad<S>>(v) + half<1, Quad<S>>(v);
+  else
+    return folded<S>(half<0, Oct<S>>(v) + half<1, Oct<S>>(v));
+}
 template <class S>
 BT_HD S sum(Pack<S> a) {
-  const Oct<S> h = half<0, Oct<S>>(a.v) + half<1, Oct<S>>(a.v);
-  const Quad<S> q = half<0, Quad<S>>(h) + half<1, Quad<S>>(h);
+  const Quad<S> q = folded<S>(a.v);
   return (q[0] + q[2]) + (q[1] + q[3]);
 }
 

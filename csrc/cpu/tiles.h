@@ -28,8 +28,8 @@ struct TileState {
   TileState(int tile_x, int tile_y, int width, int height, S stop = S(kTransmittanceMin)) : stop(stop) {
     x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
     for (int i = 0; i < kLanes; ++i) {
-      lane_x.v[i] = pixel_centre<S>(i % kPackSide);
-      lane_y.v[i] = pixel_centre<S>(i / kPackSide);
+      lane_x.set(i, pixel_centre<S>(i % kPackSide));
+      lane_y.set(i, pixel_centre<S>(i / kPackSide));
     }
     for (int p = 0; p < kPacks; ++p) {
       transmittance[p] = P(S(1));

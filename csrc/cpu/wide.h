@@ -1,0 +1,222 @@
+// Vectors of 16 lanes: as many of the processor's own vectors as that takes, side by side, with the operators of one.
+// The compiler takes a vector that is wider than a register apart lane by lane where it compares and selects.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+
+#include "core/common.h"
+
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace bt {
+
+constexpr int kLanes = 16;
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+constexpr int kVectorBytes = 64;
+#else
+constexpr int kVectorBytes = 32;
+#endif
+
+// Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
+template <class T>
+struct VectorOf;
+#define BT_VECTOR(T)                                           \
+  template <>                                                  \
+  struct VectorOf<T> {                                         \
+    typedef T type __attribute__((vector_size(kVectorBytes))); \
+  };
+BT_VECTOR(float)
+BT_VECTOR(double)
+BT_VECTOR(int32_t)
+BT_VECTOR(int64_t)
+BT_VECTOR(uint32_t)
+BT_VECTOR(uint64_t)
+#undef BT_VECTOR
+template <class T>
+using Vector = typename VectorOf<T>::type;
+
+// Two of them, or two pairs; lanes lie in memory as in one vector.
+template <class H>
+struct Two {
+  H low, high;
+  using Lane = std::remove_const_t<std::remove_reference_t<decltype(std::declval<const H&>()[0])>>;
+  BT_HD Lane operator[](int i) const {
+    Lane r;
+    std::memcpy(&r, reinterpret_cast<const char*>(this) + i * sizeof r, sizeof r);
+    return r;
+  }
+};
+template <class V>
+constexpr bool is_two = false;
+template <class H>
+constexpr bool is_two<Two<H>> = true;
+
+template <class T, int bytes>
+struct WideOf {
+  using type = Two<typename WideOf<T, bytes / 2>::type>;
+};
+template <class T>
+struct WideOf<T, kVectorBytes> {
+  using type = Vector<T>;
+};
+template <class T>
+using Wide = typename WideOf<T, kLanes* int(sizeof(T))>::type;
+
+#define BT_BINARY(op)                                                            \
+  template <class H>                                                             \
+  BT_HD auto operator op(const Two<H>& a, const Two<H>& b) {                     \
+    return Two<decltype(a.low op b.low)>{a.low op b.low, a.high op b.high};      \
+  }                                                                              \
+  template <class H, class A, class = std::enable_if_t<std::is_arithmetic_v<A>>> \
+  BT_HD auto operator op(const Two<H>& a, A b) {                                 \
+    return Two<decltype(a.low op b)>{a.low op b, a.high op b};                   \
+  }                                                                              \
+  template <class H, class A, class = std::enable_if_t<std::is_arithmetic_v<A>>> \
+  BT_HD auto operator op(A a, const Two<H>& b) {                                 \
+    return Two<decltype(a op b.low)>{a op b.low, a op b.high};                   \
+  }
+BT_BINARY(+)
+BT_BINARY(-)
+BT_BINARY(*)
+BT_BINARY(/)
+BT_BINARY(&)
+BT_BINARY(|)
+BT_BINARY(^)
+BT_BINARY(<<)
+BT_BINARY(>>)
+BT_BINARY(<)
+BT_BINARY(>)
+BT_BINARY(>=)
+BT_BINARY(!=)
+#undef BT_BINARY
+template <class H>
+BT_HD Two<H> operator-(const Two<H>& a) {
+  return {-a.low, -a.high};
+}
+template <class H>
+BT_HD Two<H> operator~(const Two<H>& a) {
+  return {~a.low, ~a.high};
+}
+
+// Lane by lane: yes where the mask is set, else no.
+template <class M, class V>
+BT_HD V choose(const M& m, const V& yes, const V& no) {
+  if constexpr (is_two<V>)
+    return {choose(m.low, yes.low, no.low), choose(m.high, yes.high, no.high)};
+  else
+    return m ? yes : no;
+}
+// Numbers to numbers of another type, as wide.
+template <class To, class V>
+BT_HD To convert(const V& v) {
+  if constexpr (is_two<V>)
+    return {convert<decltype(To::low)>(v.low), convert<decltype(To::high)>(v.high)};
+  else
+    return __builtin_convertvector(v, To);
+}
+template <class To, class V>
+BT_HD To same_bits(const V& v) {
+  static_assert(sizeof(To) == sizeof(V));
+  To r;
+  std::memcpy(&r, &v, sizeof r);
+  return r;
+}
+template <class V, class T>
+BT_HD V all_lanes(T value) {
+  if constexpr (is_two<V>) {
+    const auto half = all_lanes<decltype(V::low)>(value);
+    return {half, half};
+  } else {
+    return value - V{};
+  }
+}
+template <class V, class T>
+BT_HD void set_lane(V& v, int i, T value) {
+  if constexpr (is_two<V>)
+    std::memcpy(reinterpret_cast<char*>(&v) + i * sizeof value, &value, sizeof value);
+  else
+    v[i] = value;
+}
+
+// One bit per lane of a mask.
+BT_HD uint32_t bits(const Vector<int32_t>& m) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  return _mm512_movepi32_mask((__m512i)m);
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps((__m256)m);
+#else
+  uint32_t r = 0;
+  for (int i = 0; i < kVectorBytes / 4; ++i) r |= uint32_t(m[i] & 1) << i;
+  return r;
+#endif
+}
+BT_HD uint32_t bits(const Vector<int64_t>& m) {
+  uint32_t r = 0;
+  for (int i = 0; i < kVectorBytes / 8; ++i) r |= uint32_t(m[i] & 1) << i;
+  return r;
+}
+template <class H>
+BT_HD uint32_t bits(const Two<H>& m) {
+  return bits(m.low) | bits(m.high) << (sizeof(H) / sizeof(m[0]));
+}
+
+BT_HD Vector<float> square_root(const Vector<float>& a) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  return (Vector<float>)_mm512_maskz_sqrt_ps(__mmask16(0xffff), (__m512)a);
+#elif defined(__AVX2__)
+  return (Vector<float>)_mm256_sqrt_ps((__m256)a);
+#else
+  Vector<float> r;
+  for (int i = 0; i < kVectorBytes / 4; ++i) r[i] = sqrt_(a[i]);
+  return r;
+#endif
+}
+BT_HD Vector<double> square_root(const Vector<double>& a) {
+  Vector<double> r;
+  for (int i = 0; i < kVectorBytes / 8; ++i) r[i] = sqrt_(a[i]);
+  return r;
+}
+template <class H>
+BT_HD Two<H> square_root(const Two<H>& a) {
+  return {square_root(a.low), square_root(a.high)};
+}
+
+// The lanes named by `keep`, next to each other; `to` has room for all lanes of `a`.
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t keep) {
+  _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(keep), (__m512)a));
+}
+#elif defined(__AVX2__)
+// For every set of eight lanes their numbers in order, a byte each.
+constexpr std::array<uint64_t, 256> lanes_in_order() {
+  std::array<uint64_t, 256> order{};
+  for (int set = 0; set < 256; ++set)
+    for (int lane = 0, n = 0; lane < 8; ++lane)
+      if (set >> lane & 1) order[set] |= uint64_t(lane) << 8 * n++;
+  return order;
+}
+inline constexpr std::array<uint64_t, 256> kLanesInOrder = lanes_in_order();
+BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t keep) {
+  const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(int64_t(kLanesInOrder[keep])));
+  _mm256_storeu_ps(to, _mm256_permutevar8x32_ps((__m256)a, order));
+}
+#endif
+template <class T, class V>
+BT_HD void compress_lanes(T* to, const V& a, uint32_t keep) {
+  if constexpr (is_two<V>) {
+    constexpr int n = sizeof(a.low) / sizeof(T);
+    const uint32_t low = keep & ((1u << n) - 1u);
+    compress_lanes(to, a.low, low);
+    compress_lanes(to + __builtin_popcount(low), a.high, keep >> n);
+  } else {
+    int n = 0;
+    for (uint32_t k = keep; k; k &= k - 1) to[n++] = a[__builtin_ctz(k)];
+  }
+}
+
+}  // namespace bt

@@ -16,7 +16,14 @@ namespace bt {
 namespace {
 using namespace nb::literals;
 
-const Device kHost = {nb::device::cpu::value, "the CPU", false};
+// Blocks of this size come from the system, whatever is set (glibc), and go back to it.
+constexpr size_t kFromSystem = size_t(32) << 20;
+
+void prepare(void* at, size_t bytes) {
+  if (bytes >= kFromSystem) use_large_pages(at, bytes);
+}
+
+const Device kHost = {nb::device::cpu::value, "the CPU", false, prepare};
 
 // Settings of the whole process that the kernels are fast with. Not made on import: who only reads a constant keeps his
 // threads and his memory as they are.
@@ -24,7 +31,7 @@ void set_up_process() {
 #if defined(__GLIBC__)
   // Every view allocates and frees the same tens of megabytes. Given back to the system in between, they cost more in
   // page faults than what is computed in them.
-  mallopt(M_MMAP_THRESHOLD, 32 << 20);
+  mallopt(M_MMAP_THRESHOLD, kFromSystem);
   mallopt(M_TRIM_THRESHOLD, 1 << 30);
   mallopt(M_TOP_PAD, 64 << 20);
 #endif

@@ -23,9 +23,10 @@ namespace nb = nanobind;
 
 // What the kernels of a module run on.
 struct Device {
-  int32_t type;      // of DLPack
-  const char* name;  // in messages
-  bool cuda;         // they take working memory, and read rows 16 bytes at a time
+  int32_t type;                                       // of DLPack
+  const char* name;                                   // in messages
+  bool cuda;                                          // they take working memory, and read rows 16 bytes at a time
+  void (*prepare)(void* at, size_t bytes) = nullptr;  // memory that is going to be written, if there is anything to do
 };
 
 // What an object of Python points into.
@@ -249,6 +250,8 @@ class Reader {
     }
     if (reinterpret_cast<uintptr_t>(at) % alignment)
       refuse(std::string(name) + " must start at a multiple of " + std::to_string(alignment) + " bytes");
+    if constexpr (!std::is_const_v<T>)
+      if (device_.prepare) device_.prepare(at, size_t(size) * sizeof(T));
     return static_cast<T*>(at);
   }
   template <class T>

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <cstdlib>
 #include <memory>
 #include <new>
@@ -17,18 +18,26 @@ struct FreeMemory {
 };
 using Memory = std::unique_ptr<unsigned char, FreeMemory>;
 
-// Memory that is not cleared. What is not written to takes none; with large pages (2 MB, where the system has them)
-// writing for the first time costs far less time.
-inline Memory allocate(size_t bytes, bool large_pages) {
-  constexpr size_t kPage = size_t(1) << 21;
-  bytes = (bytes + kPage - 1) / kPage * kPage;
-  Memory memory(static_cast<unsigned char*>(std::aligned_alloc(kPage, bytes)));
-  if (!memory) throw std::bad_alloc();
+constexpr size_t kLargePage = size_t(1) << 21;
+
+// Asks for large pages (2 MB, where the system has them) for what lies between: writing there for the first time then
+// costs a sixth of the time.
+inline void use_large_pages(void* at, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-  if (large_pages) madvise(memory.get(), bytes, MADV_HUGEPAGE);
+  const uintptr_t from = (reinterpret_cast<uintptr_t>(at) + kLargePage - 1) / kLargePage * kLargePage;
+  const uintptr_t to = (reinterpret_cast<uintptr_t>(at) + bytes) / kLargePage * kLargePage;
+  if (from < to) madvise(reinterpret_cast<void*>(from), to - from, MADV_HUGEPAGE);
 #else
-  (void)large_pages;
+  (void)at, (void)bytes;
 #endif
+}
+
+// Memory that is not cleared. What is not written to takes none.
+inline Memory allocate(size_t bytes, bool large_pages) {
+  bytes = (bytes + kLargePage - 1) / kLargePage * kLargePage;
+  Memory memory(static_cast<unsigned char*>(std::aligned_alloc(kLargePage, bytes)));
+  if (!memory) throw std::bad_alloc();
+  if (large_pages) use_large_pages(memory.get(), bytes);
   return memory;
 }
 

@@ -18,14 +18,14 @@ template <class S>
 struct LaneTypes;
 template <>
 struct LaneTypes<float> {
-  using M = Wide<int32_t>;  // lanes of 0 or -1
+  using M = decltype(Wide<float>{} > Wide<float>{});  // lanes of 0 or -1
   using U = Wide<uint32_t>;
   typedef float O __attribute__((vector_size(32)));
   typedef float Q __attribute__((vector_size(16)));
 };
 template <>
 struct LaneTypes<double> {
-  using M = Wide<int64_t>;
+  using M = decltype(Wide<double>{} > Wide<double>{});
   using U = Wide<uint64_t>;
   typedef double O __attribute__((vector_size(64)));
   typedef double Q __attribute__((vector_size(32)));

@@ -40,6 +40,10 @@ BT_VECTOR(uint64_t)
 template <class T>
 using Vector = typename VectorOf<T>::type;
 
+// Lanes of 0 or -1, as the compiler makes them: which of its 64-bit integers they are differs.
+using MaskOfFloats = decltype(Vector<float>{} > Vector<float>{});
+using MaskOfDoubles = decltype(Vector<double>{} > Vector<double>{});
+
 // Two of them, or two pairs; lanes lie in memory as in one vector.
 template <class H>
 struct Two {
@@ -144,7 +148,7 @@ BT_HD void set_lane(V& v, int i, T value) {
 }
 
 // One bit per lane of a mask.
-BT_HD uint32_t bits(const Vector<int32_t>& m) {
+BT_HD uint32_t bits(const MaskOfFloats& m) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
   return _mm512_movepi32_mask((__m512i)m);
 #elif defined(__AVX2__)
@@ -155,7 +159,7 @@ BT_HD uint32_t bits(const Vector<int32_t>& m) {
   return r;
 #endif
 }
-BT_HD uint32_t bits(const Vector<int64_t>& m) {
+BT_HD uint32_t bits(const MaskOfDoubles& m) {
   uint32_t r = 0;
   for (int i = 0; i < kVectorBytes / 8; ++i) r |= uint32_t(m[i] & 1) << i;
   return r;

@@ -32,6 +32,8 @@ def drive(
     viewport: tuple[int, int] = (320, 240),
     touch: bool = False,
     scheme: str = "light",
+    ratio: float = 1.0,
+    patience: float = 90.0,
 ) -> Outcome:
     """Runs steps of drive.mjs; skips the test where there is no browser."""
     node, chromium = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
@@ -44,9 +46,13 @@ def drive(
         "viewport": {"width": viewport[0], "height": viewport[1]},
         "touch": touch,
         "scheme": scheme,
+        "ratio": ratio,
+        "patience": patience,
     }
     command = [node, str(HERE / "drive.mjs"), str(MODULES), chromium]
-    done = subprocess.run(command, input=json.dumps(job), capture_output=True, text=True, timeout=400, check=False)
+    done = subprocess.run(
+        command, input=json.dumps(job), capture_output=True, text=True, timeout=max(400, 3 * patience), check=False
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     return Outcome(found["results"], found["problems"])

@@ -4,7 +4,7 @@ import { createRequire } from 'node:module';
 
 const [modules, chromium] = process.argv.slice(2);
 const playwright = createRequire(`${modules}/`)('playwright-core');
-const { steps, viewport, touch, scheme } = JSON.parse(readFileSync(0, 'utf8'));
+const { steps, viewport, touch, scheme, ratio, patience } = JSON.parse(readFileSync(0, 'utf8'));
 const browser = await playwright.chromium.launch({
   executablePath: chromium,
   args: [
@@ -12,8 +12,11 @@ const browser = await playwright.chromium.launch({
     ...['--disable-background-networking', '--disable-component-update', '--disable-sync'],
   ],
 });
-const context = await browser.newContext({ viewport, hasTouch: touch, isMobile: touch, colorScheme: scheme });
-context.setDefaultTimeout(90_000);
+const context = await browser.newContext({
+  ...{ viewport, hasTouch: touch, isMobile: touch },
+  ...{ colorScheme: scheme, deviceScaleFactor: ratio },
+});
+context.setDefaultTimeout(1000 * patience);
 const page = await context.newPage();
 const problems = [];
 page.on('console', (message) => message.type() === 'error' && problems.push(message.text()));
@@ -27,6 +30,13 @@ const settled = () => {
 
 const press = (selector) => document.querySelector(selector).click();
 
+// Keeps what is downloaded after something was done; its name.
+const saved = async (done, path) => {
+  const [download] = await Promise.all([page.waitForEvent('download'), done]);
+  await download.saveAs(path);
+  return download.suggestedFilename();
+};
+
 const actions = {
   init: ([script]) => page.addInitScript(script),
   goto: async ([url]) => {
@@ -37,23 +47,25 @@ const actions = {
   settle: () => page.waitForFunction(settled, null, { polling: 200 }),
   // until a picture is there without its texture
   first: () => page.waitForFunction(() => document.documentElement.dataset.frame === 'first', null, { polling: 100 }),
-  stir: () => page.evaluate(() => void (document.documentElement.dataset.frame = 'moving')),
+  loaded: ([selector]) => page.waitForFunction((s) => document.querySelector(s).naturalWidth > 0, selector),
   click: ([selector]) => page.click(selector),
   press: ([selector]) => page.evaluate(press, selector), // also where the screen is too small to show it
   key: ([key, held]) => page.keyboard.press(key, { delay: held ?? 0 }),
+  hold: ([key]) => page.keyboard.down(key),
+  release: ([key]) => page.keyboard.up(key),
   select: ([selector, value]) => page.selectOption(selector, value),
   wheel: async ([at, by]) => {
     await page.mouse.move(...at);
     await page.mouse.wheel(0, by);
   },
-  drag: async ([from, to]) => {
+  drag: async ([from, to, button]) => {
     await page.mouse.move(...from);
-    await page.mouse.down();
+    await page.mouse.down({ button });
     await page.mouse.move(...to, { steps: 4 });
-    await page.mouse.up();
+    await page.mouse.up({ button });
   },
-  // two fingers that move apart
-  pinch: async ([from, to]) => {
+  // fingers, one or more
+  fingers: async ([from, to]) => {
     const session = await context.newCDPSession(page);
     const send = (type, points) =>
       session.send('Input.dispatchTouchEvent', { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
@@ -63,11 +75,9 @@ const actions = {
     }
     await send('touchEnd', []);
   },
-  save: async ([selector, path]) => {
-    const [download] = await Promise.all([page.waitForEvent('download'), page.evaluate(press, selector)]);
-    await download.saveAs(path);
-  },
-  shot: ([path]) => page.screenshot({ path }),
+  save: async ([selector, path]) => saved(page.evaluate(press, selector), path),
+  'save by key': async ([key, path]) => saved(page.keyboard.press(key), path),
+  shot: async ([path]) => void (await page.screenshot({ path })),
   ask: ([expression]) => page.evaluate(expression),
 };
 

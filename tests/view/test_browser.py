@@ -31,7 +31,6 @@ SCREEN = (WIDTH, HEIGHT)
 MEAN = 1 / 255
 """Largest mean difference of colours; the largest of a single pixel is stated in docs/viewer.md."""
 STATE = "document.documentElement.dataset.state"
-LINK = "location.hash"
 
 
 def difference(path: Path, bundle: Path | BakedScene, share: float = 1.0) -> tuple[float, float]:
@@ -112,58 +111,6 @@ def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: 
     assert "damaged" in found.results[-1] and "Zstandard frame" in found.results[-1]
 
 
-def test_every_control(bundle: Path, tmp_path: Path) -> None:
-    """Each changes what it names: the view, as its link tells, or the picture."""
-    shots = iter(range(100))
-    names: list[Path] = []
-
-    def shot() -> list:
-        names.append(tmp_path / f"{next(shots)}.png")
-        return ["save", "#screenshot", names[-1]]
-
-    def link() -> list:
-        return [["click", "#share"], ["ask", LINK]]
-
-    steps: list = [["goto", "@"], ["settle"], *link(), shot()]  # 0
-    steps += [["drag", [300, 200], [380, 240]], *link()]  # orbit
-    steps += [["wheel", [300, 200], -400], *link()]
-    steps += [["click", "#home"], *link()]
-    steps += [["click", "#fly"], ["drag", [300, 200], [380, 240]], *link()]
-    steps += [["click", "#canvas"], ["key", "w", 300], *link()]
-    steps += [["key", "h"], ["key", "ArrowLeft", 300], *link()]
-    steps += [["click", "#next"], *link(), ["ask", "document.getElementById('camera').value"]]
-    steps += [["select", "#camera", "0"], *link()]
-    steps += [["click", "#texture"], *link(), shot(), ["click", "#texture"]]  # 1
-    for show in ("residual", "depth", "normal", "overdraw"):  # 2 to 5
-        steps += [["select", "#show", show], shot()]
-    steps += [["select", "#show", "color"], ["click", "#colors"], ["click", "#next"], shot()]  # 6: held colours
-    steps += [["click", "#colors"], shot(), ["click", "#previous"]]  # 7
-    steps += [["click", "#beside"], ["ask", "document.getElementById('photograph-image').naturalWidth > -1"]]
-    steps += [["ask", "document.getElementById('photograph').hidden"], ["click", "#beside"]]
-    steps += [
-        ["select", "#resolution", "0.25"],
-        ["stir"],
-        ["settle"],
-        ["ask", "document.getElementById('status').textContent"],
-    ]
-    steps += [["click", "#theme"], ["click", "#theme"], ["ask", "document.documentElement.dataset.theme"]]
-    with served(site_of(bundle)) as address:
-        steps[0][1] = address
-        found = drive(steps, (800, 500))
-    assert not found.problems
-    links = [r for r in found.results if isinstance(r, str) and r.startswith("#p=")]
-    first, orbited, nearer, home, turned, walked, looked, second, again, plain = links
-    assert home == first == again and len({first, orbited, nearer, turned, walked, looked, second}) == 7
-    assert plain.endswith("texture=off")
-    pictures = [np.asarray(Image.open(name).convert("RGB"), np.float32) for name in names]
-    for i, picture in enumerate(pictures[1:6], 1):
-        assert np.abs(picture - pictures[0]).mean() > 0.2, i
-    assert np.abs(pictures[6] - pictures[7]).mean() > 0.02
-    answers = [r for r in found.results if not (isinstance(r, str) and r.startswith("#"))]
-    assert "1" in answers and False in answers and "dark" in answers
-    assert any(isinstance(r, str) and "25 %" in r for r in answers)
-
-
 def test_a_shared_link_brings_the_same_picture(bundle: Path, tmp_path: Path) -> None:
     with served(site_of(bundle)) as address:
         first = drive(
@@ -176,22 +123,6 @@ def test_a_shared_link_brings_the_same_picture(bundle: Path, tmp_path: Path) -> 
         href = next(r for r in first.results if isinstance(r, str))
         drive([["goto", href], ["settle"], ["save", "#screenshot", tmp_path / "b.png"]], SCREEN)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-
-def test_fingers_on_a_phone(bundle: Path) -> None:
-    ask = [["click", "#share"], ["ask", LINK]]
-    with served(site_of(bundle)) as address:
-        found = drive(
-            [
-                *(["goto", address], ["settle"], ["click", "#menu"], *ask, ["click", "#menu"]),
-                *(["pinch", [[150, 200], [200, 300]], [[120, 150], [240, 380]]], ["click", "#menu"], *ask),
-                *(["click", "#menu"], ["pinch", [[150, 200]], [[190, 260]]], ["click", "#menu"], *ask),
-            ],
-            (360, 640),
-            touch=True,
-        )
-    links = [r for r in found.results if isinstance(r, str)]
-    assert len(set(links)) == 3 and not found.problems
 
 
 def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None:

@@ -89,6 +89,7 @@ export class App {
     this.dirty = true;
     this.still = false;
     this.movedAt = performance.now();
+    document.documentElement.dataset.frame = 'moving';
   }
 
   private look(still: boolean): Look {
@@ -133,10 +134,10 @@ export class App {
       }
       const took = performance.now() - begin;
       if (!still && chosen === 'auto') this.pace.took(took);
-      this.still = still;
+      this.still = still && !this.dirty;
       this.report(took, scale);
       const { complete } = this.renderer.scene;
-      document.documentElement.dataset.frame = !complete ? 'first' : still ? 'still' : 'moving';
+      document.documentElement.dataset.frame = !complete ? 'first' : this.still ? 'still' : 'moving';
     }
     this.drawing = false;
   }

@@ -4,6 +4,7 @@ import { commonTarget, parseCameras } from '../src/view/cameras';
 import { Pace } from '../src/view/pace';
 import { DEFAULT_LENS, View, look, lookAt, orbit } from '../src/view/pose';
 import { fromHash, toHash } from '../src/view/share';
+import { firstPose } from '../src/view/start';
 import { samplingOf, sizeOf } from '../src/view/size';
 import { dot, length, subtract } from '../src/view/vector';
 
@@ -21,6 +22,16 @@ describe('poses', () => {
     expect(length(next.position)).toBeCloseTo(length(pose.position));
     expect(dot(next.forward, next.position) / length(next.position)).toBeCloseTo(-1);
     expect(dot(next.right, UP)).toBeCloseTo(0);
+  });
+  it('start on the side of the cameras, which are around the origin', () => {
+    const aside = firstPose([0, 2, 0], 2, UP);
+    expect(length(subtract(aside.position, [0, 1, 0]))).toBeLessThan(1e-9);
+    expect(length(subtract(aside.forward, [0, 1, 0]))).toBeLessThan(1e-9);
+    const around = firstPose([0.1, 0, 0], 2, UP);
+    expect(length(subtract(around.position, [0.1, 0, 0]))).toBeCloseTo(1);
+    expect(around.position[2]).toBeGreaterThan(0.2);
+    expect(length(firstPose([0, 0, 0], 100, UP).position)).toBeCloseTo(50); // another frame
+    expect(length(firstPose([0, 0, 0], 0.1, UP).position)).toBeCloseTo(0.16);
   });
   it('do not tilt beyond the vertical', () => {
     let p = pose;

@@ -74,10 +74,10 @@ export class Controls {
     }
   }
 
-  // Turns by angles, as if the scene were dragged.
-  turn(across: number, downwards: number): void {
+  // Turns by angles, as if the scene were dragged: in orbit what is nearer than the target goes with the pointer.
+  private turn(across: number, downwards: number): void {
     if (this.mode === 'orbit') {
-      this.pose = orbit(this.pose, this.target, this.up, -across, -downwards);
+      this.pose = orbit(this.pose, this.target, this.up, across, -downwards);
     } else {
       this.lookBy(-across / 2, -downwards / 2);
     }
@@ -112,8 +112,9 @@ export class Controls {
 
   // Moves on by the keys that are held; whether any is.
   advance(now: number): boolean {
-    const seconds = Math.min(0.1, (now - this.last) / 1000);
-    this.last = now;
+    // a frame may have begun before the key that is drawn in it was pressed
+    const seconds = Math.min(0.1, Math.max(0, now - this.last) / 1000);
+    this.last = Math.max(now, this.last);
     if (!this.held.size) return false;
     const fast = this.held.has('ShiftLeft') || this.held.has('ShiftRight') ? 4 : 1;
     for (const code of this.held) {

@@ -21,8 +21,12 @@ export function extentOf(surfels: Surfels): { middle: Vec3; size: number } {
   return { middle: add(middle, surfels.origin), size: Math.max(2 * size, 1e-6) };
 }
 
+// Captures are brought into a frame whose origin is the mean of their cameras, the farthest of which is about 1 from
+// it. So what is seen from one side alone is looked at from the origin's side, and what is around the origin from aside.
 export function firstPose(middle: Vec3, size: number, up: Vec3): Pose {
-  const aside = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
-  const position = add(middle, add(times(1.6 * size, aside), times(0.5 * size, up)));
-  return lookAt(position, middle, up);
+  const distance = Math.min(Math.max(1, 0.5 * size), 1.6 * size);
+  const across = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  const aside = unit(add(across, times(0.3, up)));
+  const away = length(middle) > 0.5 * distance ? unit(times(-1, middle)) : aside;
+  return lookAt(add(middle, times(distance, away)), middle, up);
 }

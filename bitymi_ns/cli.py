@@ -267,6 +267,8 @@ class View:
     """Folder of the bundle, or its one file."""
     export: Path | None = None
     """Folder to write the page and the bundle to; none = show it now."""
+    one_file: Flag = False
+    """With --export: write the bundle as one file, which the page reads in ranges."""
     overwrite: Flag = False
     """Replace a page that was exported there before."""
     host: str = "127.0.0.1"
@@ -283,7 +285,9 @@ class View:
         from bitymi_ns import view
         from bitymi_ns.files import size_text
 
-        site = view.site_of(self.bundle)
+        if self.one_file and self.export is None:
+            raise ValueError("--one-file is for --export: say where to")
+        site = view.single_site(self.bundle) if self.one_file else view.site_of(self.bundle)
         if self.export is not None:
             with explained(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)

@@ -77,6 +77,9 @@ fi
 say "Writing the report"
 bitymi report "$out/eval-neural.json" "$out/eval-baked.json" "$run" "$out/renders" --output-dir "$out/report"
 
+view=bitymi
+[ ! -x .venv/bin/bitymi ] || view=.venv/bin/bitymi
+
 cat <<END
 
 Done in $SECONDS s.
@@ -85,5 +88,6 @@ Done in $SECONDS s.
   renders   $out/renders            held-out views, of the trained model and of the bundle
   model     $run
 
-Look at it in the browser:  bitymi view $out/bundle        (.venv/bin/bitymi after make demo)
+Look at it in the browser:   $view view $out/bundle
+A page for any web server:   $view view $out/bundle --export $out/page
 END

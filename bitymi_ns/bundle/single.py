@@ -31,7 +31,18 @@ def write_single(folder: str | Path, path: str | Path) -> tuple[int, int]:
     Raises:
         BundleError: the folder is not a bundle, or a file is missing or altered.
     """
-    folder = Path(folder)
+    data, first = _joined(Path(folder))
+    write_file(Path(path), data)
+    return first, len(data)
+
+
+def single_bytes(folder: Path) -> bytes:
+    """What `write_single` writes; raises as it does."""
+    return _joined(folder)[0]
+
+
+def _joined(folder: Path) -> tuple[bytes, int]:
+    """The file, and its bytes from the start to the end of the surfels."""
     info = read_manifest(folder)
     names, first = [MANIFEST, *info.files], 0
     buffer = io.BytesIO()
@@ -46,8 +57,7 @@ def write_single(folder: str | Path, path: str | Path) -> tuple[int, int]:
             archive.writestr(zipfile.ZipInfo(name, _DATE), data)
             if name == info.surfels.file:
                 first = buffer.tell()
-    write_file(Path(path), buffer.getvalue())
-    return first, len(buffer.getvalue())
+    return buffer.getvalue(), first
 
 
 def read_single(file: BinaryIO, textured: bool = True, verify: bool = True, source: str = "the bundle") -> Bundle:

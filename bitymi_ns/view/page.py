@@ -12,6 +12,7 @@ from pathlib import Path
 from bitymi_ns.bundle import archive
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
 from bitymi_ns.bundle.read import MANIFEST_LIMIT, read_manifest
+from bitymi_ns.bundle.single import single_bytes
 
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -29,6 +30,10 @@ POLICY = (
 )
 """Nothing of a bundle runs: scripts come from the page alone, and a bundle's files are never sent as such."""
 BUNDLE = "bundle/"
+SINGLE = "scene.bitymi"
+"""Name of the one file beside an exported page."""
+_ASKS = '<meta name="bundle" content="{}" />'
+"""Where the page reads which file it shows; empty = the folder beside it."""
 
 
 class PageError(ValueError):
@@ -98,9 +103,35 @@ def site_of(bundle: Path) -> Site:
             raise PageError(f"{path} is a link that leads out of the bundle: it is not shown")
         else:
             files[f"{BUNDLE}{name}"] = path
+    return Site(files, {**made, "view.json": _title(place)})
+
+
+def single_site(bundle: Path) -> Site:
+    """The page with a bundle as one file, of which it asks for ranges; of a server that knows none for the whole.
+
+    Raises:
+        PageError: the page was not built.
+        BundleError: there is no bundle, or it is damaged.
+    """
+    read_manifest(bundle)
+    place, files = bundle.resolve(), dict(page_files())
+    empty, named = (_ASKS.format(name).encode() for name in ("", SINGLE))
+    index = files.pop("index.html").read_bytes()
+    if empty not in index:
+        raise PageError("the viewer's page is of another version: in a checkout, build it with `make web`")
+    made: dict[str, Callable[[], bytes]] = {"index.html": lambda: index.replace(empty, named)}
+    if place.is_file():
+        files[SINGLE] = place
+    else:
+        made[SINGLE] = partial(single_bytes, place)
+    return Site(files, {**made, "view.json": _title(place)})
+
+
+def _title(place: Path) -> Callable[[], bytes]:
+    """What view.json says of a bundle."""
     title = place.stem if place.is_file() else place.parent.name if place.name == "bundle" else place.name
     text = json.dumps({"title": title}).encode()
-    return Site(files, {**made, "view.json": lambda: text})
+    return lambda: text
 
 
 def _part(file: Path, info: Manifest, name: str) -> bytes:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bitymi_ns.files import complete_folder
 
-from .page import PageError, Site
+from .page import SINGLE, PageError, Site
 
 
 def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
@@ -29,7 +29,8 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
     def check() -> None:
         if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
             return
-        ours = (folder / "index.html").is_file() and (folder / "bundle" / "bundle.json").is_file()
+        bundles = (folder / "bundle" / "bundle.json", folder / SINGLE)
+        ours = (folder / "index.html").is_file() and any(bundle.is_file() for bundle in bundles)
         if not ours:
             raise PageError(f"{folder} holds something else than an exported page: choose another folder")
         if not overwrite:

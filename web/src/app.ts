@@ -27,6 +27,7 @@ export class App {
   private first: { pose: Pose; target: Vec3; lens: Lens };
   private held: Vec3 | null = null;
   private show: Show = 'color';
+  private photograph: Promise<string> | null = null; // that is asked for
   private dirty = true;
   private still = false;
   private movedAt = 0;
@@ -262,9 +263,15 @@ export class App {
     element('photograph').hidden = !shown;
     if (!shown) return;
     const image = element<HTMLImageElement>('photograph-image');
-    if (camera.photograph) image.src = `bundle/${camera.photograph}`;
-    else image.removeAttribute('src');
+    image.removeAttribute('src');
     element('photograph-name').textContent = camera.photograph ? 'Photograph' : 'No photograph of this camera';
+    if (camera.photograph) {
+      const found = this.bundle.source.address(camera.photograph);
+      this.photograph = found;
+      found.then((address) => this.photograph === found && (image.src = address), showError);
+    } else {
+      this.photograph = null;
+    }
   }
 
   private turnTheme(): void {

@@ -2,6 +2,8 @@
 import './ui/style.css';
 import { App } from './app';
 import { loadBundle } from './bundle/load';
+import { Folder, SingleFile, type Source } from './bundle/source';
+import { ViewerError } from './errors';
 import { openDevice } from './render/device';
 import { Programs } from './render/programs';
 import { Renderer } from './render/renderer';
@@ -10,10 +12,22 @@ import { screenOf } from './render/screen';
 import { element } from './ui/dom';
 import { notify, showError, showProgress, showScene } from './ui/pages';
 
-const BUNDLE = 'bundle/';
+// The bundle beside the page: the file that the address asks for (?file=), the one that an export names, or a folder.
+async function source(): Promise<Source> {
+  const asked = new URLSearchParams(location.search).get('file');
+  const file = asked ?? document.querySelector<HTMLMetaElement>('meta[name=bundle]')?.content ?? '';
+  if (!file) return new Folder('bundle/');
+  if (!/^[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.bitymi$/.test(file)) {
+    const what = 'It must lie beside the page, and have letters, digits, dots and dashes before .bitymi.';
+    throw new ViewerError('This is not the name of a bundle in one file', what, 'Change the address.');
+  }
+  return SingleFile.open(file, showProgress);
+}
 
 // The scene's name, which the service and an export write beside the page.
 async function title(): Promise<string> {
+  const file = new URLSearchParams(location.search).get('file');
+  if (file) return file.replace(/\.bitymi$/, '');
   try {
     const found = (await (await fetch('view.json')).json()) as { title?: unknown };
     return typeof found.title === 'string' ? found.title.slice(0, 120) : 'Scene';
@@ -25,7 +39,7 @@ async function title(): Promise<string> {
 async function main(): Promise<void> {
   const graphics = await openDevice();
   const { device } = graphics;
-  const loading = loadBundle(BUNDLE, showProgress);
+  const loading = source().then((from) => loadBundle(from, showProgress));
   const programs = new Programs(device);
   const bundle = await loading;
   const scene = new SceneOnDevice(graphics, programs, bundle.info, bundle.surfels, bundle.pages);

@@ -1,0 +1,129 @@
+"""An exported page with its bundle as one file, on servers that know ranges and on those that do not."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from bitymi_ns.bundle import read_bundle
+from bitymi_ns.bundle.single import read_single, write_single
+from bitymi_ns.cli import main
+from bitymi_ns.view import single_site, write_static
+from tests.view.browser import drive
+from tests.view.conftest import HEIGHT, WIDTH, write
+from tests.view.test_browser import MEAN, STATE, difference
+
+SCREEN = (WIDTH, HEIGHT)
+NAME = "scene.bitymi"
+
+
+@contextmanager
+def plain_server(folder: Path, ranges: bool) -> Iterator[tuple[str, list[tuple[str, int]]]]:
+    """Address of a file server, and what it was asked of bundles in one file: the range and the bytes of the answer."""
+    asked: list[tuple[str, int]] = []
+
+    class Plain(http.server.SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            given = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range") or "")
+            path = Path(self.translate_path(self.path))
+            if path.suffix != ".bitymi" or not path.is_file():
+                super().do_GET()
+                return
+            data = path.read_bytes()
+            first, last = 0, len(data) - 1
+            if ranges and given:
+                first = int(given[1]) if given[1] else max(0, len(data) - int(given[2]))
+                last = min(int(given[2]), last) if given[1] and given[2] else last
+            asked.append((self.headers.get("Range") or "", last - first + 1))
+            self.send_response(206 if ranges and given else 200)
+            if ranges and given:
+                self.send_header("Content-Range", f"bytes {first}-{last}/{len(data)}")
+            self.send_header("Content-Length", str(last - first + 1))
+            self.end_headers()
+            self.wfile.write(data[first : last + 1])
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Says nothing."""
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Plain, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/", asked
+        server.shutdown()
+
+
+def test_the_command_writes_the_page_and_one_file(bundle: Path, tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "site"
+    assert main(["view", str(bundle), "--export", str(folder), "--one-file"]) == 0
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {"index.html", "index.js", "view.json", NAME} <= names and not any("/" in name for name in names)
+    assert f'name="bundle" content="{NAME}"' in (folder / "index.html").read_text()
+    assert json.loads((folder / "view.json").read_text()) == {"title": "little"}
+    with open(folder / NAME, "rb") as file:
+        assert len(read_single(file)) == len(read_bundle(bundle))
+    single = tmp_path / "little.bitymi"
+    write_single(bundle, single)
+    # a folder that was written so is replaced by one of its like, of either kind
+    assert main(["view", str(single), "--export", str(folder), "--one-file", "--overwrite"]) == 0
+    assert (folder / NAME).read_bytes() == single.read_bytes()
+    assert main(["view", str(single), "--export", str(folder), "--overwrite"]) == 0
+    assert not (folder / NAME).exists() and (folder / "bundle" / "bundle.json").is_file()
+    assert main(["view", str(bundle), "--one-file"]) == 1
+    assert "--export" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ranges", [True, False], ids=["ranges", "whole"])
+def test_one_file_is_shown(ranges: bool, tmp_path: Path) -> None:
+    bundle = write(tmp_path / "b", "uint8", compact=True)
+    write_static(single_site(bundle), tmp_path / "site")
+    picture, width = tmp_path / "p.png", "document.getElementById('photograph-image').naturalWidth"
+    steps = [["settle"], ["save", "#screenshot", picture], ["press", "#beside"], ["loaded", "#photograph-image"]]
+    with plain_server(tmp_path / "site", ranges) as (address, asked):
+        found = drive([["goto", address], *steps, ["ask", width]], SCREEN)
+    assert not found.problems
+    assert difference(picture, bundle)[0] < MEAN and found.results[-1] == WIDTH
+    size = (tmp_path / "site" / NAME).stat().st_size
+    if not ranges:
+        assert [count for _, count in asked] == [size]
+        return
+    # the end, bundle.json, cameras.json, surfels, texels and the photograph, each once, in the order of need
+    assert asked[0][0] == "bytes=-16384" and len(asked) == 6
+    texels = (bundle / "texels.bin").stat().st_size
+    assert [texels <= count <= texels + 200 for _, count in asked].index(True) == 4
+    assert sum(count for _, count in asked) < size + 16384 + 1000
+
+
+@pytest.mark.parametrize(
+    "query, words",
+    [
+        ("?file=cut.bitymi", "damaged"),
+        ("?file=altered.bitymi", "damaged"),
+        ("?file=none.bitymi", "There is no bundle"),
+        ("?file=../scene.bitymi", "not the name"),
+        ("?file=https://x/scene.bitymi", "not the name"),
+        ("?file=whole.bitymi", ""),
+    ],
+)
+def test_another_file_beside_the_page(query: str, words: str, bundle: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    write_static(single_site(bundle), site)
+    data = (site / NAME).read_bytes()
+    (site / "whole.bitymi").write_bytes(data)
+    (site / "cut.bitymi").write_bytes(data[:-100])
+    at = data.index(b"end_header") + 40  # in the rows of surfels.ply
+    (site / "altered.bitymi").write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    with plain_server(site, True) as (address, _):
+        ask = [["ask", STATE], ["ask", "document.body.innerText"], ["ask", "document.title"]]
+        found = drive([["goto", address + query], ["settle"], *ask], SCREEN)
+    state, text, title = found.results[-3:]
+    if words:
+        assert state == "error" and words in text
+    else:
+        assert state == "ready" and title == "whole"

@@ -1,0 +1,136 @@
+// Where the files of a bundle come from: a folder on the server, or one file of which ranges are asked for.
+import { DamagedBundle, ViewerError } from '../errors';
+import { type Entry, TAIL, entriesOf, partOf, placeOf } from './archive';
+
+export type Came = (bytes: number) => void;
+
+export interface Source {
+  // A file of so many bytes.
+  read(name: string, size: number, came: Came): Promise<ArrayBuffer>;
+  text(name: string): Promise<string>;
+  // What an image shows.
+  address(name: string): Promise<string>;
+}
+
+async function get(url: string, range?: string): Promise<Response> {
+  let response: Response;
+  try {
+    response = await fetch(url, range ? { headers: { Range: `bytes=${range}` } } : {});
+  } catch {
+    throw new ViewerError('The bundle cannot be reached', `${url} was not answered.`, 'Is the server still running?');
+  }
+  if (!response.ok) {
+    const name = url.split('/').pop() ?? url;
+    if (name === 'bundle.json' || name.endsWith('.bitymi')) {
+      throw new ViewerError('There is no bundle', `${url} is not there.`, 'Export the scene again with bitymi view.');
+    }
+    throw new DamagedBundle(`${name} is missing.`);
+  }
+  return response;
+}
+
+// The bytes of an answer, at most `most`; no memory is taken for what has not come.
+async function bytesOf(response: Response, name: string, most: number, came: Came): Promise<Uint8Array<ArrayBuffer>> {
+  const parts: Uint8Array[] = [];
+  let at = 0;
+  const body = response.body?.getReader();
+  while (body) {
+    const { done, value } = await body.read();
+    if (done) break;
+    if (at + value.length > most) throw new DamagedBundle(`${name} is longer than the ${most} bytes that are stated.`);
+    parts.push(value);
+    at += value.length;
+    came(value.length);
+  }
+  const data = new Uint8Array(at);
+  at = 0;
+  for (const part of parts) {
+    data.set(part, at);
+    at += part.length;
+  }
+  return data;
+}
+
+export class Folder implements Source {
+  constructor(private readonly url: string) {}
+
+  async read(name: string, size: number, came: Came): Promise<ArrayBuffer> {
+    const data = await bytesOf(await get(this.url + name), name, size, came);
+    if (data.length !== size) throw new DamagedBundle(`${name} is truncated: ${data.length} of ${size} bytes.`);
+    return data.buffer;
+  }
+
+  async text(name: string): Promise<string> {
+    return (await get(this.url + name)).text();
+  }
+
+  address(name: string): Promise<string> {
+    return Promise.resolve(this.url + name);
+  }
+}
+
+const LARGEST = 2 ** 32; // of a file without the extension for larger ones
+const nothing: Came = () => undefined;
+
+export class SingleFile implements Source {
+  private readonly addresses = new Map<string, Promise<string>>();
+
+  private constructor(
+    private readonly url: string,
+    private readonly entries: Map<string, Entry>,
+    private readonly whole: Uint8Array<ArrayBuffer> | null,
+  ) {}
+
+  // Asks for the end of the file, where its directory is; a server that knows no ranges sends all of it.
+  static async open(url: string, progress: (done: number, total: number) => void): Promise<SingleFile> {
+    const response = await get(url, `-${TAIL}`);
+    const name = url.split('/').pop() ?? url;
+    if (response.status !== 206) {
+      const total = Number(response.headers.get('Content-Length')) || 0;
+      let done = 0;
+      const whole = await bytesOf(response, name, LARGEST, (bytes) => progress((done += bytes), total));
+      const { begin, end, count } = placeOf(whole, whole.length);
+      return new SingleFile(url, entriesOf(whole.subarray(begin, end), begin, count), whole);
+    }
+    const size = Number(/\/(\d+)$/.exec(response.headers.get('Content-Range') ?? '')?.[1]);
+    if (!(size < LARGEST)) throw new DamagedBundle(`${name}: the server does not say how long it is.`);
+    const tail = await bytesOf(response, name, TAIL, nothing);
+    const { begin, end, count } = placeOf(tail, size);
+    const from = begin - (size - tail.length); // in the tail, if the directory is not longer than it
+    const directory =
+      from >= 0
+        ? tail.slice(from, from + end - begin)
+        : await bytesOf(await get(url, `${begin}-${end - 1}`), name, end - begin, nothing);
+    return new SingleFile(url, entriesOf(directory, begin, count), null);
+  }
+
+  private entry(name: string): Entry {
+    const found = this.entries.get(name);
+    if (!found) throw new DamagedBundle(`The bundle has no ${name}.`);
+    return found;
+  }
+
+  async read(name: string, size: number, came: Came): Promise<ArrayBuffer> {
+    const { begin, end, size: has } = this.entry(name);
+    if (has !== size) throw new DamagedBundle(`${name} has ${has} bytes, not ${size}.`);
+    if (this.whole) {
+      came(size);
+      return partOf(this.whole.subarray(begin, end), name, size);
+    }
+    const response = await get(this.url, `${begin}-${end - 1}`);
+    if (response.status !== 206) throw new DamagedBundle(`The server sends no ranges of ${this.url} any longer.`);
+    return partOf(await bytesOf(response, name, end - begin, came), name, size);
+  }
+
+  async text(name: string): Promise<string> {
+    return new TextDecoder().decode(await this.read(name, this.entry(name).size, nothing));
+  }
+
+  address(name: string): Promise<string> {
+    const made = async (): Promise<string> =>
+      URL.createObjectURL(new Blob([await this.read(name, this.entry(name).size, nothing)], { type: 'image/jpeg' }));
+    const found = this.addresses.get(name) ?? made();
+    this.addresses.set(name, found);
+    return found;
+  }
+}

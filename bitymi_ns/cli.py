@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -260,6 +260,49 @@ class Pack:
 
 
 @dataclass
+class Extras:
+    """Write a bundle for other programs into a folder beside it: as Gaussian splats, and as a textured mesh."""
+
+    bundle: tyro.conf.Positional[Path]
+    """Folder of the bundle, or its one file."""
+    kinds: tuple[Literal["gaussians", "mesh"], ...] = ("gaussians", "mesh")
+    """gaussians: gaussians.ply, as 3DGS writes it; mesh: mesh.glb, a textured quad for each surfel."""
+    frame: Literal["scene", "capture"] = "scene"
+    """Frame of the files: the scene's, or the capture's own."""
+    output: Path | None = None
+    """Folder to write; not given: beside the bundle, with its name and .extras."""
+    overwrite: Flag = False
+    """Replace a folder of extras that is there already."""
+
+    def run(self) -> int:
+        from bitymi_ns import interchange
+        from bitymi_ns.bundle import read_bundle
+        from bitymi_ns.progress import rich_progress
+
+        output = self.output or interchange.place_of(self.bundle)
+        interchange.check_extras(self.kinds, output, self.overwrite)
+        bundle = read_bundle(self.bundle)
+        given = interchange.given_with(self.bundle, bundle.info)
+        with rich_progress() as progress:
+            written = interchange.write_extras(
+                bundle,
+                output,
+                self.kinds,
+                frame=self.frame,
+                cameras=given.train,
+                held_out=given.held_out,
+                overwrite=self.overwrite,
+                progress=progress,
+            )
+        print(f"Wrote {output}")
+        for each in written.values():
+            print(interchange.described(each))
+        if not given.train:
+            print("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
+        return 0
+
+
+@dataclass
 class View:
     """Show a bundle in the browser; or write it with its page as a folder, which any web server can send."""
 
@@ -317,6 +360,7 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Verify, tyro.conf.subcommand(name="verify")]
     | Annotated[Pack, tyro.conf.subcommand(name="pack")]
+    | Annotated[Extras, tyro.conf.subcommand(name="extras")]
     | Annotated[View, tyro.conf.subcommand(name="view")]
 )
 

@@ -25,6 +25,7 @@ ELSEWHERE = {
     "--pipeline.model.train.first-surfels",
     "ns-export ... --compact",
     "ns-export ... --exact",
+    "ns-export ... --extras",
     "ns-export ... --finetune-steps",
     "ns-export ... --photographs",
     "ns-export ... --interchange",

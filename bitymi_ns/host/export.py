@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from bitymi_ns.bake import (
 )
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.statistics import HeldOut
-from bitymi_ns.bundle import BundleError, export, read_bundle
+from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
@@ -44,10 +44,12 @@ from bitymi_ns.host.export_summary import print_summary
 from bitymi_ns.host.memory import state_export
 from bitymi_ns.host.model import BitymiModel
 from bitymi_ns.host.target import bundle_place, bundle_version, check_room
+from bitymi_ns.interchange import Frame, Kind, check_extras, described, place_of, write_extras
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
@@ -89,6 +91,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
     compare: bool = True
     """Render the held-out views from the bundle and from the trained scene and state the difference."""
 
+    extras: tuple[Kind, ...] = ()
+    """Also write the scene for other programs, into a folder beside the bundle with its name and .extras: gaussians (a
+    preview as Gaussian splats), mesh (textured quads). `bitymi extras BUNDLE` does so later."""
+    extras_frame: Frame = "scene"
+    """Frame of these files: the scene's, or the capture's own."""
     photographs: bool = False
     """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders; who is given the
     bundle is given them."""
@@ -100,6 +107,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         try:
             with bundle_place(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
+                if self.extras:
+                    check_extras(self.extras, place_of(self.output_dir), self.overwrite)
                 check_room(self.output_dir, self.load_config, self, self.exact)
                 self._run(bake_options)
         except KeyboardInterrupt:
@@ -201,6 +210,25 @@ class ExportAtlas(BakeOptions, CompactOptions):
             bundle.info.statistics.held_out = held_out
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
+        if self.extras:
+            self._write_extras(bundle, views, datamanager.eval_views)
+
+    def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
+        """Beside the bundle, which is complete already; says what was written."""
+        folder = place_of(self.output_dir)
+        with rich_progress() as progress:
+            written = write_extras(
+                bundle,
+                folder,
+                self.extras,
+                frame=self.extras_frame,
+                cameras=[camera.to("cpu") for camera in cameras],
+                held_out=held_out if self.compare else (),
+                overwrite=self.overwrite,
+                progress=progress,
+            )
+        for each in written.values():
+            say(f"In {folder}: {described(each)}")
 
 
 def default_export() -> ExportAtlas:

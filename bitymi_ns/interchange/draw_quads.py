@@ -1,0 +1,147 @@
+"""Quads as other programs draw them: a depth buffer, an alpha mask, a bilinear fetch without mip levels.
+
+It is here to measure a mesh with, and small rather than fast: torch on the CPU.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.interchange.quads import MASK, Quads
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.sampling import averaged
+
+SAMPLES = 2
+"""Samples per pixel along each axis, as a viewer's antialiasing takes four per pixel."""
+_AT_ONCE = 1 << 19  # pairs of quads and pixels
+
+
+@torch.no_grad()
+def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, near: float = 0.2) -> Tensor:
+    """Draws a view.
+
+    A ray r through a sample, with 1 as its z, meets the plane of a quad with the corner A and the sides E, F (in the
+    camera's frame) where z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with
+    n = E x F.
+
+    Args:
+        quads: in the camera's world frame.
+        camera: of an H x W view.
+        background: [3]; None = black.
+        near: nearest depth that is drawn.
+
+    Returns:
+        [H, W, 3] float32.
+    """
+    fine = camera.scaled(SAMPLES)
+    image = torch.zeros(fine.height * fine.width, 3)
+    if background is not None:
+        image[:] = background
+    hits = nearest(quads, fine, near)
+    image[hits.pixel] = hits.color
+    return averaged({"rgb": image.view(1, fine.height, fine.width, 3)}, SAMPLES)["rgb"][0]
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What is seen through the centres of pixels; those that show nothing are left out.
+
+    Attributes:
+        pixel: [F] y * width + x.
+        quad: [F] rows of the quads.
+        uv: [F, 2] float64 texture coordinates.
+        color: [F, 3] float32.
+    """
+
+    pixel: Tensor
+    quad: Tensor
+    uv: Tensor
+    color: Tensor
+
+
+@torch.no_grad()
+def nearest(quads: Quads, camera: Camera, near: float) -> Hits:
+    """The nearest quad of every pixel; see `draw_quads`."""
+    K, viewmat = camera.K.double(), camera.viewmat.double()
+    corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]
+    low, size, rows = _boxes(corners, K, near, camera.width, camera.height)
+    corner = corners[rows, 0]
+    sides = corners[rows][:, [1, 3]] - corner[:, None]
+    normal = torch.linalg.cross(sides[:, 0], sides[:, 1])
+    across = [torch.linalg.cross(sides[:, 1], corner), torch.linalg.cross(corner, sides[:, 0]), normal]
+    planes = torch.stack(across, dim=1) @ torch.linalg.inv(K)  # of places (x, y, 1) in pixels
+    level = (corner * normal).sum(1)
+    count = camera.width * camera.height
+    depth = torch.full((count,), math.inf, dtype=torch.float64)
+    quad, uv, color = torch.full((count,), -1), depth.new_zeros(count, 2), torch.zeros(count, 3)
+    for part in _parts(size.prod(1)):
+        own = part.repeat_interleave(size[part].prod(1))
+        first = size[part].prod(1).cumsum(0) - size[part].prod(1)
+        within = torch.arange(len(own)) - first[own - part[0]]
+        x, y = low[own, 0] + within % size[own, 0], low[own, 1] + within // size[own, 0]
+        s, t, w = (
+            (planes[own] * torch.stack([x + 0.5, y + 0.5, torch.ones(len(x))], 1)[:, None].double()).sum(2).unbind(1)
+        )
+        w = torch.where(w.abs() > 1e-30, w, torch.nan)
+        s, t, z, pixel = s / w, t / w, level[own] / w, y * camera.width + x
+        met = torch.nonzero((s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (z > near) & (z < depth[pixel])).squeeze(1)
+        at = quads.uv[rows[own[met]]].double()
+        at = at[:, 0] + s[met, None] * (at[:, 1] - at[:, 0]) + t[met, None] * (at[:, 3] - at[:, 0])
+        texel = _fetch(quads.pages, quads.page[rows[own[met]]], at)
+        there = texel[:, 3] >= MASK
+        met, at, texel = met[there], at[there], texel[there]
+        depth.scatter_reduce_(0, pixel[met], z[met], "amin")
+        first = z[met] <= depth[pixel[met]]
+        met = met[first]
+        quad[pixel[met]], uv[pixel[met]], color[pixel[met]] = rows[own[met]], at[first], texel[first, :3]
+    pixel = torch.nonzero(quad >= 0).squeeze(1)
+    return Hits(pixel, quad[pixel], uv[pixel], color[pixel])
+
+
+def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    """First pixels [M, 2] and sizes [M, 2] of the boxes around what is in the picture of the parts of quads beyond the
+    nearest depth, and the quads' rows [M]."""
+    rows = torch.nonzero((corners[..., 2] > near).any(1)).squeeze(1)
+    start, end = corners[rows], corners[rows].roll(-1, 1)
+    share = (near - start[..., 2:]) / (end[..., 2:] - start[..., 2:])  # of a side, where it meets that depth
+    meets = (share > 0) & (share < 1)
+    points = torch.cat([start, start + torch.where(meets, share, 0.0) * (end - start)], dim=1)
+    there = torch.cat([start[..., 2:] > near, meets], dim=1)
+    at = (points @ K.T)[..., :2] / points[..., 2:].clamp(min=near)
+    most = torch.tensor([width, height])
+    first = (at.where(there, math.inf).amin(1) - 0.5).ceil().clamp(min=0).minimum(most).long()
+    past = (at.where(there, -math.inf).amax(1) + 0.5).floor().clamp(min=0).minimum(most).long()
+    inside = (past > first).all(1)
+    return first[inside], (past - first)[inside], rows[inside]
+
+
+def _parts(counts: Tensor) -> Iterator[Tensor]:
+    """Rows in their order, in runs of about `_AT_ONCE` counts together."""
+    run = (counts.cumsum(0) - counts) // _AT_ONCE
+    start = 0
+    for length in torch.unique_consecutive(run, return_counts=True)[1].tolist():
+        yield torch.arange(start, start + length)
+        start += length
+
+
+def _fetch(pages: Tensor, page: Tensor, uv: Tensor) -> Tensor:
+    """[F, 4] float32 in [0, 1], bilinear, of pages [P, height, width, 4] uint8 at uv [F, 2]."""
+    size = torch.tensor([pages.shape[2], pages.shape[1]])
+    at = uv * size - 0.5
+    low = at.floor()
+    f = (at - low).float()
+    low = low.long()
+    low, high = (torch.minimum(c.clamp(min=0), size - 1) for c in (low, low + 1))
+
+    def texel(x: Tensor, y: Tensor) -> Tensor:
+        return pages[page, y, x].float() / 255.0
+
+    fu, fv = f[:, :1], f[:, 1:]
+    top = texel(low[:, 0], low[:, 1]) * (1 - fu) + texel(high[:, 0], low[:, 1]) * fu
+    bottom = texel(low[:, 0], high[:, 1]) * (1 - fu) + texel(high[:, 0], high[:, 1]) * fu
+    return top * (1 - fv) + bottom * fv

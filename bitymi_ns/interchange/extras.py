@@ -1,0 +1,199 @@
+"""Files for other programs, beside a bundle: a preview as Gaussian splats, and a textured mesh."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.lean_color import centers_of
+from bitymi_ns.bundle import Bundle, BundleError
+from bitymi_ns.files import complete_folder, reason
+from bitymi_ns.interchange.draw_quads import draw_quads
+from bitymi_ns.interchange.frame import to_capture
+from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
+from bitymi_ns.interchange.glb import glb_bytes
+from bitymi_ns.interchange.looks import Looks, fit_looks, shown_residual
+from bitymi_ns.interchange.quads import quads_of
+from bitymi_ns.interchange.recolor import recolored
+from bitymi_ns.interchange.splat import draw_gaussians
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.visibility import visibility
+from bitymi_ns.train.losses import mean_psnr, psnr
+from bitymi_ns.train.views import View, at_size
+
+Kind = Literal["gaussians", "mesh"]
+Frame = Literal["scene", "capture"]
+FILES: dict[str, str] = {"gaussians": "gaussians.ply", "mesh": "mesh.glb"}
+SUMMARY = "extras.json"
+SUFFIX = ".extras"
+"""Of the name of the folder beside a bundle."""
+LEVEL = 0.15
+"""Of the opacity at which the quads of a mesh end."""
+SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
+"""Longer side in pixels of the pictures by which it is found what the cameras see, those that colour a mesh, and those
+in which the files are measured."""
+COLORED_VIEWS, MEASURED_VIEWS = 64, 4
+"""At most so many training views colour a mesh; in so many held-out views the files are measured."""
+_UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written of a kind.
+
+    Attributes:
+        file: its name.
+        bytes: of it.
+        count: Gaussians or quads.
+        psnr: dB against the photographs of `views` held-out views, as other programs draw it; None = there were none.
+        psnr_bundle: dB of the bundle there.
+        views: in which this was measured, reduced to `MEASURED_SIDE` pixels.
+    """
+
+    file: str
+    bytes: int
+    count: int
+    psnr: float | None
+    psnr_bundle: float | None
+    views: int
+
+
+def place_of(bundle: Path) -> Path:
+    """The folder for the extras of a bundle: beside it, with its name and `SUFFIX`."""
+    bundle = bundle.absolute()
+    return bundle.with_name((bundle.stem if bundle.suffix == ".bitymi" else bundle.name) + SUFFIX)
+
+
+def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
+    """Checks what is asked for and its place, before the work.
+
+    Raises:
+        BundleError: there is no such kind, or the folder is there and may not be replaced.
+    """
+    unknown = [kind for kind in kinds if kind not in FILES]
+    if unknown or not kinds:
+        what = f"there is no extra {unknown[0]!r}" if unknown else "no extra is asked for"
+        raise BundleError(f"{what}: choose among {', '.join(FILES)}")
+    if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not (folder / SUMMARY).is_file():
+        raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another place")
+    if not overwrite:
+        raise BundleError(f"{folder} is there already: choose another place, or add --overwrite")
+
+
+def write_extras(
+    bundle: Bundle,
+    folder: str | Path,
+    kinds: Sequence[Kind] = get_args(Kind),
+    *,
+    frame: Frame = "scene",
+    cameras: Sequence[Camera] = (),
+    held_out: Sequence[View] = (),
+    overwrite: bool = False,
+    progress: Progress = no_progress,
+) -> dict[str, Written]:
+    """Writes a folder with a file for each kind and extras.json, which says how well they show held-out photographs;
+    whole or not at all.
+
+    Args:
+        bundle: on the CPU, texels decoded.
+        folder: the place.
+        kinds: gaussians, mesh.
+        frame: in which the files are: the scene's, or the capture's own, which bundle.json leads to.
+        cameras: of the training photographs: colours are fitted to what they see. Without any, harmonics are fitted
+            over the whole sphere, and a mesh keeps the surfels' own colours.
+        held_out: photographs to measure in.
+        overwrite: replace a folder of extras.
+        progress: called on the way.
+
+    Returns:
+        what was written, by kind.
+
+    Raises:
+        BundleError: what `check_extras` raises; the bundle has nothing to write of a kind; the capture's frame cannot
+            be reached by a rotation; or the folder cannot be written.
+    """
+    folder = Path(folder)
+    check_extras(kinds, folder, overwrite)
+    to = to_capture(bundle.info.world) if frame == "capture" else None
+    scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
+    chosen = [view.to("cpu") for view in evenly(held_out, MEASURED_VIEWS)]
+    views = [at_size(view, smaller(view.camera, MEASURED_SIDE), "cpu") for view in chosen]
+    looks = _looks(scene, cameras, progress)
+    base = _psnr(lambda camera: scene.render(camera, background).rgb, views, background)
+    written: dict[str, Written] = {}
+    try:
+        with complete_folder(folder, lambda: check_extras(kinds, folder, overwrite)) as new:
+            for kind in dict.fromkeys(kinds):
+                path = new / FILES[kind]
+                if kind == "gaussians":
+                    gaussians = gaussians_of(scene, looks.harmonics)
+                    count = len(gaussians)
+                    value = _psnr(
+                        lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background
+                    )
+                    write_gaussians(path, gaussians if to is None else gaussians.moved(to))
+                else:
+                    quads = quads_of(scene, looks.color, LEVEL)
+                    if not len(quads):
+                        raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
+                    chosen = [smaller(camera, COLORED_SIDE) for camera in evenly(cameras, COLORED_VIEWS)]
+                    picture = _picture(scene, background)
+                    quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
+                    value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
+                    up = torch.tensor(bundle.info.world.up or _UP) if to is None else None
+                    path.write_bytes(glb_bytes(quads if to is None else quads.moved(to), up))
+                written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views))
+            summary = {"frame": frame, "training_views": len(cameras)}
+            summary |= {kind: asdict(each) for kind, each in written.items()}
+            (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
+    except OSError as error:
+        raise BundleError(f"{folder} cannot be written: {reason(error, folder)}. Nothing was left behind") from error
+    return written
+
+
+def described(written: Written) -> str:
+    """What was written, in a line for people."""
+    line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB"
+    if written.psnr is None or written.psnr_bundle is None:
+        return line
+    return f"{line}; {written.psnr:.2f} dB in {written.views} held-out views, the bundle {written.psnr_bundle:.2f} dB"
+
+
+def evenly(items: Sequence, most: int) -> list:
+    """At most so many of them, evenly spaced, the first one too."""
+    count = min(len(items), most)
+    return [items[i * len(items) // count] for i in range(count)]
+
+
+def smaller(camera: Camera, side: int) -> Camera:
+    """The view in a picture of at most so many pixels along a side."""
+    return camera.scaled(min(1.0, side / max(camera.width, camera.height)))
+
+
+def _looks(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> Looks:
+    """Fitted to what the cameras see."""
+    chosen = [smaller(camera, SEEN_SIDE) for camera in cameras]
+    seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.through_pixel, progress).seen
+    return fit_looks(scene, shown_residual(scene), seen, centers_of(cameras, scene.surfels["means"]))
+
+
+def _picture(scene: BakedScene, background: Tensor) -> Callable[[Camera], Tensor]:
+    return lambda camera: scene.render(camera, background).rgb
+
+
+def _psnr(draw: Callable[[Camera], Tensor], views: Sequence[View], background: Tensor) -> float | None:
+    """Mean dB over the views; None without any of which a pixel counts."""
+    values = [psnr(draw(view.camera).clamp(0.0, 1.0), view.target(background, "cpu"), view.mask) for view in views]
+    mean = mean_psnr(values)
+    return round(mean, 4) if mean == mean else None

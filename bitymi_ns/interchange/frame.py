@@ -1,0 +1,62 @@
+"""From the scene's frame to the capture's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bitymi_ns.bundle.manifest import BundleError, Place
+
+_SLACK = 1e-4  # of a rotation that was stored with rounding
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_new = scale * (turn @ x) + shift.
+
+    Attributes:
+        turn: [3, 3] float64, orthogonal; it may mirror.
+        scale: of lengths.
+        shift: [3] float64.
+    """
+
+    turn: Tensor
+    scale: float
+    shift: Tensor
+
+    def points(self, points: Tensor) -> Tensor:
+        """[..., 3] points in the new frame, of their type."""
+        return (self.scale * (points.double() @ self.turn.T) + self.shift).to(points)
+
+    def rotations(self, quats: Tensor) -> Tensor:
+        """[N, 4] float64 unit quaternions wxyz in the new frame. Where it is mirrored, the third axis is turned round:
+        a disc's or a Gaussian's own mirror image."""
+        old = Rotation.from_quat(quats.detach().double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
+        new = self.turn.numpy() @ old
+        new[:, :, 2] *= np.linalg.det(self.turn.numpy())
+        return torch.from_numpy(Rotation.from_matrix(new).as_quat()[:, [3, 0, 1, 2]])
+
+
+def to_capture(place: Place) -> Similarity:
+    """What undoes x_scene = scale * (transform @ [x_capture, 1]).
+
+    Raises:
+        BundleError: the transform is no similarity, so that discs would not stay discs.
+    """
+    transform = torch.tensor(place.transform, dtype=torch.float64)
+    matrix, offset = transform[:, :3], transform[:, 3]
+    stretch = float(torch.linalg.det(matrix).abs()) ** (1 / 3)
+    turn = matrix / stretch if stretch > 0 else matrix
+    if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() <= _SLACK).all()):
+        raise BundleError(
+            "world.transform of the bundle is no rotation, so that nothing can be moved into the capture's own frame: "
+            "leave it in the scene's"
+        )
+    u, _, v = torch.linalg.svd(turn)
+    turn = u @ v  # the nearest orthogonal one
+    scale = 1 / (stretch * place.scale)
+    return Similarity(turn.T, scale, -(turn.T @ offset) / stretch)

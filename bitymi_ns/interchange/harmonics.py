@@ -1,0 +1,73 @@
+"""Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops import view_color
+from bitymi_ns.ops.sphere import fibonacci_sphere
+
+TERMS = 16
+"""Harmonics up to degree 3, that of degree 0 included."""
+_POWERS = [(i, j, n - i - j) for n in (2, 3) for i in range(n + 1) for j in range(n + 1 - i)]  # 6 + 10 = TERMS
+
+
+def basis(directions: Tensor) -> Tensor:
+    """The harmonics in some directions.
+
+    On the sphere they are polynomials of degree 2 and 3. The matrix that makes them of the monomials is solved from
+    values of the compiled kernel, in float64, where their formula stands.
+
+    Args:
+        directions: [..., 3] unit vectors.
+
+    Returns:
+        [..., 16] of the directions' type.
+    """
+    return _monomials(directions) @ _from_monomials().to(directions)
+
+
+def turned(matrix: Tensor) -> Tensor:
+    """How coefficients change when the directions are those of another frame.
+
+    Args:
+        matrix: [3, 3] float64, orthogonal: a direction d of the new frame is matrix @ d in the old one. Reflections
+            are allowed.
+
+    Returns:
+        [16, 16] float64; a colour of coefficients c in the old frame has the coefficients turned @ c in the new one.
+        Every degree turns into itself, so this is exact.
+    """
+    directions = fibonacci_sphere(_SAMPLES).double()
+    old = basis(torch.nn.functional.normalize(directions @ matrix.T, dim=1))
+    return torch.linalg.lstsq(basis(torch.nn.functional.normalize(directions, dim=1)), old).solution
+
+
+def _monomials(directions: Tensor) -> Tensor:
+    x, y, z = directions.unbind(-1)
+    powers = [[torch.ones_like(c), c, c * c, c * c * c] for c in (x, y, z)]
+    return torch.stack([powers[0][i] * powers[1][j] * powers[2][k] for i, j, k in _POWERS], dim=-1)
+
+
+@functools.cache
+def _from_monomials() -> Tensor:
+    directions = torch.nn.functional.normalize(fibonacci_sphere(_SAMPLES).double(), dim=1)
+    return torch.linalg.lstsq(_monomials(directions), _of_kernel(directions)).solution
+
+
+def _of_kernel(directions: Tensor) -> Tensor:
+    """[D, 16] float64: surfels whose coefficients are 0 but for one, seen in the directions."""
+    count = len(directions)
+    columns = []
+    for term in range(TERMS):
+        coefficients = directions.new_zeros(count, TERMS, 3)
+        coefficients[:, term, 0] = 1.0
+        parameters = {"sh_dc": coefficients[:, 0].contiguous(), "sh_rest": coefficients[:, 1:].contiguous()}
+        columns.append(view_color("sh", parameters, directions, directions.new_zeros(3))[:, 0])
+    return torch.stack(columns, dim=1)
+
+
+_SAMPLES = 64

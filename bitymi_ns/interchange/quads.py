@@ -1,0 +1,138 @@
+"""A baked scene as a textured mesh: a quad for each surfel that hides what is behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.packing import GRID, pack
+from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.interchange.frame import Similarity
+from bitymi_ns.interchange.looks import betas
+from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.tile_sizes import next_power_of_two
+from bitymi_ns.train.rotations import tangents
+
+MASK = 0.5
+"""Texels whose alpha is read as less are not drawn."""
+_CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+_CHUNK = 1 << 20  # texels at once
+
+
+@dataclass(frozen=True)
+class Quads:
+    """Q parallelograms with a texture each.
+
+    Attributes:
+        corners: [Q, 4, 3] float32 positions, in a ring.
+        uv: [Q, 4, 2] float32 texture coordinates of the corners: (0, 0) is the outer corner of the first texel of the
+            page, (1, 1) that of the last one, as in glTF.
+        page: [Q] int64, which page holds its texels.
+        pages: [P, height, width, 4] uint8, red, green, blue and alpha; what is read of alpha below `MASK` is a hole.
+    """
+
+    corners: Tensor
+    uv: Tensor
+    page: Tensor
+    pages: Tensor
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def moved(self, to: Similarity) -> Quads:
+        """The same in another frame."""
+        return replace(self, corners=to.points(self.corners))
+
+
+@torch.no_grad()
+def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
+    """The quads that stand for the surfels of a scene.
+
+    A quad is the square around the disc in which the surfel's opacity o (1 - r^2 / R^2)^beta is at least `level`, and
+    its alpha is 1 - r^2 / (2 radius^2): half of it at the rim of the disc. A surfel whose opacity nowhere reaches the
+    level has none. Its colours are max(color + residual, 0), the residual
+    read from the surfel's tile, on a grid about as fine as that, whose outer texel centres are the corners.
+
+    Args:
+        scene: N surfels on the CPU, with its texels decoded.
+        color: [N, 3] colour of each surfel without its residual.
+        level: of the opacity, in (0, 1).
+    """
+    surfels = scene.surfels
+    opacity = torch.sigmoid(surfels["opacity_logits"].double())
+    kept = torch.nonzero(opacity > level).squeeze(1)
+    share = (level / opacity[kept]) ** (1.0 / betas(surfels)[kept].double().clamp(min=1e-6))
+    radius = (SUPPORT * (1.0 - share).clamp(min=1e-12).sqrt()).float()
+    extent = torch.full_like(radius, SUPPORT) if scene.extent is None else scene.extent[kept]
+    size = _sizes(scene.tiles[kept, 3:], radius / extent)
+    packing = pack(size.numpy())
+    tiles = torch.from_numpy(packing.tiles)
+    pages = torch.zeros(packing.layers * packing.height * packing.width, 4, dtype=torch.uint8)
+    for r_u, r_v, rows in size_classes(tiles):
+        for part in rows.split(max(1, _CHUNK // (r_u * r_v))):
+            texels = _texels(scene, color, kept[part], (r_u, r_v), radius[part], extent[part])
+            pages[texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)] = texels
+    ring = torch.tensor(_CORNERS)
+    axes = tangents(surfels["quats"][kept]) * surfels["log_scales"][kept].exp()[:, None] * radius[:, None, None]
+    corners = surfels["means"][kept, None] + torch.einsum("nka,ca->nck", axes, ring)
+    first, count = tiles[:, None, :2].double(), tiles[:, None, 3:].double()
+    uv = (first + 0.5 + 0.5 * (ring + 1.0) * (count - 1.0)) / torch.tensor([packing.width, packing.height])
+    shape = (packing.layers, packing.height, packing.width, 4)
+    return Quads(corners.float(), uv.float(), tiles[:, 2].long(), pages.view(shape))
+
+
+def _sizes(tiles: Tensor, share: Tensor) -> Tensor:
+    """[n, 2] sides for quads that show a share [n] of the sides of tiles [n, 2]: as fine as the tile, powers of two."""
+    return next_power_of_two((tiles * share[:, None]).ceil()).clamp(min=GRID).long()
+
+
+def _texels(
+    scene: BakedScene, color: Tensor, rows: Tensor, size: tuple[int, int], radius: Tensor, extent: Tensor
+) -> Tensor:
+    """[n, r_v, r_u, 4] uint8 of quads of one size."""
+    across, down = (torch.linspace(-1.0, 1.0, count) for count in size)
+    r2 = across.square() + down[:, None].square()  # of the radius
+    shown = color[rows, None, None].expand(-1, size[1], size[0], -1)
+    if scene.mean_residual is not None:
+        shown = shown + scene.mean_residual[rows, None, None]
+    tiled = torch.nonzero(scene.tiles[rows, 3] > 0).squeeze(1)
+    if scene.atlas is not None and len(tiled):
+        u, v = (axis * (radius / extent)[tiled, None] for axis in (across, down))
+        shown = shown.clone()
+        shown[tiled] = color[rows[tiled], None, None] + _read(scene, scene.tiles[rows[tiled]].long(), u, v)
+    alpha = (1.0 - 0.5 * r2).clamp(min=0.0).expand(len(rows), -1, -1)[..., None]
+    return (torch.cat([shown, alpha], dim=3).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+
+
+def _read(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """[n, r_v, r_u, 3] residuals of tiles [n, 5] at u [n, r_u] and v [n, r_v] from -1 to 1, as the renderers fetch
+    them: bilinear between texel centres, constant beyond the outer ones."""
+    assert scene.atlas is not None
+    _, height, width, _ = scene.atlas.shape
+    (low_u, high_u, fu), (low_v, high_v, fv) = (
+        _between(at, tiles[:, 3 + i], tiles[:, i]) for i, at in enumerate((u, v))
+    )
+    layer = tiles[:, 2, None, None] * height
+    texels = scene.atlas.view(-1, 4)[:, :3]
+    unit = 255.0 if texels.dtype == torch.uint8 else 1.0
+
+    def fetch(x: Tensor, y: Tensor) -> Tensor:
+        found = texels[(layer + y[:, :, None]) * width + x[:, None]]
+        return found.float() / unit * scene.scale + scene.offset
+
+    fu, fv = fu[:, None, :, None], fv[:, :, None, None]
+    top = fetch(low_u, low_v) * (1 - fu) + fetch(high_u, low_v) * fu
+    bottom = fetch(low_u, high_v) * (1 - fu) + fetch(high_u, high_v) * fu
+    return top * (1 - fv) + bottom * fv
+
+
+def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The texels on both sides of places [n, r] from -1 to 1 along an axis, and how far they are to the second."""
+    last = (count - 1)[:, None]
+    x = ((0.5 * (at + 1.0)) * count[:, None] - 0.5).clamp(min=0.0)
+    x = torch.minimum(x, last.to(x))
+    low = x.floor().long()
+    return low + first[:, None], torch.minimum(low + 1, last) + first[:, None], x - low

@@ -1,0 +1,75 @@
+"""The colours of a mesh whose quads hide what is behind them, from pictures of the scene that it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.interchange.draw_quads import nearest
+from bitymi_ns.interchange.quads import Quads
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+
+PRIOR = 1.0
+"""A colour that was there before counts as much as so many pixels."""
+
+
+@torch.no_grad()
+def recolored(
+    quads: Quads,
+    picture: Callable[[Camera], Tensor],
+    cameras: Sequence[Camera],
+    near: float,
+    progress: Progress = no_progress,
+) -> Quads:
+    """Quads whose texels show what pictures show where they are the nearest.
+
+    A surfel is blended with what is behind it, a quad hides that. So every quad is shifted by the mean difference
+    between the pictures and its colours, over the pixels that show it; then every texel becomes the mean of the pixels
+    that show it. Both means count what was there before as PRIOR pixels.
+
+    Args:
+        quads: Q quads.
+        picture: draws the scene for a camera, [H, W, 3].
+        cameras: views to draw.
+        near: nearest depth that is drawn.
+        progress: called after every view.
+    """
+    pages, height, width, _ = quads.pages.shape
+    shift, shown = torch.zeros(len(quads), 3), torch.zeros(len(quads), 1)
+    texels, count = torch.zeros(pages * height * width, 3), torch.zeros(pages * height * width, 1)
+    flat = quads.pages.reshape(-1, 4).clone()
+    for done, camera in enumerate(cameras, start=1):
+        wanted = picture(camera).clamp(0.0, 1.0).reshape(-1, 3)
+        hits = nearest(quads, camera, near)
+        x, y = (hits.uv * torch.tensor([width, height])).long().unbind(1)
+        at = (quads.page[hits.quad] * height + y) * width + x
+        one = torch.ones(len(at), 1)
+        shift.index_add_(0, hits.quad, wanted[hits.pixel] - hits.color)
+        shown.index_add_(0, hits.quad, one)
+        texels.index_add_(0, at, wanted[hits.pixel])
+        count.index_add_(0, at, one)
+        progress("colouring the mesh", done, len(cameras))
+    owner = _owners(quads)
+    owned = torch.nonzero(owner >= 0).squeeze(1)
+    before = flat[owned, :3].float() / 255.0 + (shift / (shown + PRIOR))[owner[owned]]
+    after = (PRIOR * before + texels[owned]) / (PRIOR + count[owned])
+    flat[owned, :3] = (after.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    return replace(quads, pages=flat.view_as(quads.pages))
+
+
+def _owners(quads: Quads) -> Tensor:
+    """Of every texel of the pages, flat, the row of its quad; -1 = none."""
+    pages, height, width, _ = quads.pages.shape
+    corners = quads.uv.double() * torch.tensor([width, height])  # centres of texels
+    first = corners[:, 0].floor().long()
+    size = (corners[:, 2] - corners[:, 0]).round().long() + 1
+    tiles = torch.cat([first, quads.page[:, None], size], dim=1)
+    owner = torch.full((pages * height * width,), -1)
+    for r_u, r_v, rows in size_classes(tiles):
+        owner[texel_index(tiles[rows], (r_u, r_v), width, height)] = rows[:, None, None].expand(-1, r_v, r_u)
+    return owner

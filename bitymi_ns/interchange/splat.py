@@ -60,6 +60,9 @@ def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | No
             here = band[(low[band, 0] < right) & (high[band, 0] > left)]
             y, x = torch.meshgrid(torch.arange(top, bottom) + 0.5, torch.arange(left, right) + 0.5, indexing="ij")
             pixels = torch.stack([x, y], -1).reshape(-1, 2)
+            if not len(here):
+                image[top:bottom, left:right] = behind
+                continue
             rgb, left_over = _blend(pixels, center[here], conic[here], opacity[here], colors[here])
             image[top:bottom, left:right] = (rgb + left_over[:, None] * behind).view(bottom - top, right - left, 3)
     return image

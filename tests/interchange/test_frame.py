@@ -1,5 +1,6 @@
 """From the scene's frame to the capture's: points, discs and colours are where they were."""
 
+import json
 import math
 
 import pytest
@@ -17,7 +18,8 @@ from tests.interchange.test_looks import baked
 
 def place(matrix: torch.Tensor, scale: float) -> Place:
     shift = torch.tensor([[0.5], [-2.0], [7.0]], dtype=torch.float64)
-    return Place(transform=torch.cat([matrix, shift], 1).tolist(), scale=scale)
+    transform = torch.cat([matrix, shift], 1).tolist()
+    return Place.model_validate_json(json.dumps({"transform": transform, "scale": scale}))
 
 
 def covariance(g) -> torch.Tensor:

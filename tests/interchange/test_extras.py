@@ -1,0 +1,144 @@
+"""The folder beside a bundle: its files, its place, and what is refused."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bitymi_ns import cli
+from bitymi_ns.bundle import Bundle, BundleError, read_bundle
+from bitymi_ns.bundle.single import write_single
+from bitymi_ns.interchange import extras, given_with, place_of, write_extras
+from bitymi_ns.interchange.gaussians import read_gaussians
+from bitymi_ns.interchange.glb import read_glb
+from bitymi_ns.train.views import View
+from tests.bundle.made import make
+
+
+def row(camera, name: str, held_out: bool, **more) -> dict:
+    K = camera.K.tolist()
+    size = {"width": camera.width, "height": camera.height, "viewmat": camera.viewmat.flatten().tolist()}
+    return {
+        "name": name, "held_out": held_out, **size, "fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2], **more
+    }  # fmt: skip
+
+
+@pytest.fixture
+def with_cameras(surfels, camera, tmp_path: Path) -> Path:
+    """A bundle with cameras.json and a photograph of half the size of its camera's image."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.full((24, 32, 3), 90, np.uint8)).save(buffer, format="PNG")
+    rows = [row(camera(6.0), "a.jpg", False), row(camera(7.0), "b.jpg", False)]
+    rows += [row(camera(6.5), "c.jpg", True, photograph="photograph-0001.jpg"), row(camera(8.0), "d.jpg", True)]
+    files = {"cameras.json": json.dumps({"cameras": rows}).encode(), "photograph-0001.jpg": buffer.getvalue()}
+    make(surfels, tmp_path / "scene", count=12, mean_residual=torch.zeros(12, 3), extra_files=files)
+    return tmp_path / "scene"
+
+
+def test_both_files_hold_the_scene_and_their_quality_is_stated(bundle: Bundle, camera, tmp_path: Path) -> None:
+    views = [View(camera(6.0), torch.full((48, 64, 3), 0.4)), View(camera(7.0), torch.full((48, 64, 3), 0.5))]
+    out = tmp_path / "out"
+    written = write_extras(bundle, out, cameras=[camera(6.0), camera(8.0)], held_out=views)
+    assert {path.name for path in out.iterdir()} == {"gaussians.ply", "mesh.glb", "extras.json"}
+    stated = json.loads((out / "extras.json").read_text())
+    assert stated["frame"] == "scene" and stated["training_views"] == 2
+    for kind, each in written.items():
+        assert each.bytes == (out / each.file).stat().st_size and each.views == 2
+        assert each.psnr is not None and 3 < each.psnr < 60 and stated[kind]["psnr"] == each.psnr
+        assert "dB in 2 held-out views" in extras.described(each)
+    assert torch.equal(read_gaussians(out / "gaussians.ply").means, bundle.scene.surfels["means"])
+    assert len(read_glb(out / "mesh.glb")) == written["mesh"].count
+
+
+def test_the_captures_frame_is_reached(bundle: Bundle, tmp_path: Path) -> None:
+    for frame in ("scene", "capture"):
+        write_extras(bundle, tmp_path / frame, frame=frame)
+    place = bundle.info.world
+    transform = torch.tensor(place.transform)
+
+    def back(points: torch.Tensor) -> torch.Tensor:
+        return place.scale * (points @ transform[:, :3].T + transform[:, 3])
+
+    for read, name, of in ((read_gaussians, "gaussians.ply", "means"), (read_glb, "mesh.glb", "corners")):
+        old, new = (getattr(read(tmp_path / frame / name), of) for frame in ("scene", "capture"))
+        if of == "corners":  # the scene's file is turned to y up; its up is z
+            old = torch.stack([old[..., 0], -old[..., 2], old[..., 1]], -1)
+        assert torch.allclose(back(new), old, atol=2e-5)
+
+
+def test_a_bundle_on_its_own_is_written_by_the_command(
+    with_cameras: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["extras", str(with_cameras)]) == 0
+    out = capsys.readouterr().out
+    assert "gaussians.ply: 12, " in out and "dB in 1 held-out views" in out
+    folder = tmp_path / "scene.extras"
+    assert place_of(with_cameras) == folder and (folder / "mesh.glb").is_file()
+    assert cli.main(["extras", str(with_cameras)]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    args = ["extras", str(with_cameras), "--kinds", "gaussians", "--overwrite", "--frame", "capture"]
+    assert cli.main(args) == 0
+    assert {path.name for path in folder.iterdir()} == {"gaussians.ply", "extras.json"}
+
+
+def test_cameras_and_photographs_are_read_from_folder_and_file(with_cameras: Path, tmp_path: Path) -> None:
+    write_single(with_cameras, tmp_path / "scene.bitymi")
+    for place in (with_cameras, tmp_path / "scene.bitymi"):
+        given = given_with(place, read_bundle(place).info)
+        assert [camera.width for camera in given.train] == [64, 64] and len(given.held_out) == 1
+        (view,) = given.held_out
+        assert view.image.shape == (24, 32, 3) and (view.camera.width, view.camera.height) == (32, 24)
+        assert float(view.camera.K[0, 0]) == 30.0 and float(view.camera.K[1, 2]) == 12.0
+    assert place_of(tmp_path / "scene.bitymi") == tmp_path / "scene.extras"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"{", "Invalid JSON"),
+        (b'{"cameras": [{"name": "a"}]}', "held_out"),
+        (b'{"cameras": [{"name": "a", "held_out": true, "width": 0}]}', "width"),
+    ],
+)
+def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: bytes, message: str) -> None:
+    make(surfels, tmp_path / "b", extra_files={"cameras.json": text})
+    info = read_bundle(tmp_path / "b").info
+    with pytest.raises(BundleError, match=message):
+        given_with(tmp_path / "b", info)
+    (tmp_path / "b" / "cameras.json").write_bytes(b"[]")
+    with pytest.raises(BundleError, match="altered"):
+        given_with(tmp_path / "b", info)
+
+
+def test_what_cannot_be_written_is_refused_before_the_work(bundle: Bundle, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="there is no extra 'spz'"):
+        write_extras(bundle, tmp_path / "out", ["spz"])  # type: ignore[list-item]
+    with pytest.raises(BundleError, match="no extra is asked for"):
+        write_extras(bundle, tmp_path / "out", [])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(BundleError, match="other than extras"):
+        write_extras(bundle, tmp_path / "mine", overwrite=True)
+    assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_nothing_is_left_half_written(bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_extras(bundle, tmp_path / "out", ["gaussians"])
+    before = (tmp_path / "out" / "extras.json").read_bytes()
+    names = {path.name for path in tmp_path.iterdir()}
+    bundle.scene.surfels["opacity_logits"][:] = -9.0
+    with pytest.raises(BundleError, match="there is no mesh"):
+        write_extras(bundle, tmp_path / "out", overwrite=True)
+
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(extras, "write_gaussians", full)
+    with pytest.raises(BundleError, match="the disk is full"):
+        write_extras(bundle, tmp_path / "out", ["gaussians"], overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert (tmp_path / "out" / "extras.json").read_bytes() == before

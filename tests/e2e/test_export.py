@@ -76,6 +76,20 @@ def test_other_formats(trained: BitymiTrainerConfig, tmp_path: Path, format: str
     assert info["atlas"]["format"] == format
 
 
+def test_extras_are_written_beside_the_bundle(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    (tmp_path / "b.extras").mkdir()
+    (tmp_path / "b.extras" / "mine").touch()
+    with pytest.raises(SystemExit):
+        run_export(trained, tmp_path / "b", extras=("gaussians",))
+    assert not (tmp_path / "b").exists()  # refused before the work
+    (tmp_path / "b.extras" / "mine").unlink()
+    run_export(trained, tmp_path / "b", extras=("gaussians", "mesh"), finetune_steps=0, tolerance=TOLERANCE)
+    stated = json.loads((tmp_path / "b.extras" / "extras.json").read_text())
+    assert stated["training_views"] > 2
+    for kind in ("gaussians", "mesh"):
+        assert stated[kind]["views"] == 2 and 5 < stated[kind]["psnr"] < stated[kind]["psnr_bundle"] + 3
+
+
 def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainerConfig], tmp_path: Path) -> None:
     config = start(method="bitymi-notexture")
     config.max_num_iterations = 3

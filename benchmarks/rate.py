@@ -2,7 +2,7 @@
 """What a compact bundle shows for its bytes: held-out PSNR at several prices of a bit, as a table and a plot.
 
 A run is baked, polished where its texels have not learned in training, and reduced once, as `ns-export bitymi-atlas
---compact True` does; `--keep` keeps that in a file, from which the command goes on the next time. For every price:
+--format compact` does; `--keep` keeps that in a file, from which the command goes on the next time. For every price:
   price       squared error, in 8-bit steps, summed over pixels, channels and training views, that a bit is worth
   surfels     bytes of surfels.bin; per surfel
   texels      bytes of texels.bin

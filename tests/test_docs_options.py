@@ -23,10 +23,10 @@ ROOTS: dict[str, Any] = {
 ELSEWHERE = {
     "--max-num-iterations",
     "--pipeline.model.train.first-surfels",
-    "ns-export ... --compact",
     "ns-export ... --exact",
     "ns-export ... --extras",
     "ns-export ... --finetune-steps",
+    "ns-export ... --format",
     "ns-export ... --photographs",
     "ns-export ... --interchange",
     "ns-export ... --polish-steps",

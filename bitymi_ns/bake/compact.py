@@ -53,7 +53,7 @@ class Compact:
         held_in_every: as in `tune.TuneOptions`: views that are set aside do not weigh texels.
     """
 
-    share: float = 0.05
+    share: float = 0.03
     most_bytes: int | None = None
     psnr: float | None = None
     views: int = 8

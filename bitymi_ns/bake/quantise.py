@@ -268,6 +268,25 @@ def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
     return compress
 
 
+def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, threads: int | None = None) -> npt.NDArray[np.uint8]:
+    """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
+
+    Args:
+        pages: RGBA texels.
+        profile: effort of the encoder.
+        threads: of the encoder; not given: one per processor. The result does not depend on it.
+
+    Raises:
+        RuntimeError: the encoder is not installed.
+    """
+    compress = bc7_encoder(profile)
+    layers, height, width, _ = pages.shape
+    strips = [page[top : top + _STRIP] for page in pages for top in range(0, height, _STRIP)]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        blocks = bytearray().join(pool.map(compress, strips))
+    return np.frombuffer(blocks, np.uint8).reshape(layers, height // 4, width // 4, 16)
+
+
 def _extremes(texels: npt.NDArray[np.float32], packing: Packing) -> tuple[float, float]:
     layers, height, width, _ = texels.shape
     low, high = np.inf, -np.inf

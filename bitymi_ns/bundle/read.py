@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from torch import Tensor
 from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import paged_texels
-from bitymi_ns.bake.quantise import Range, decode_pages
+from bitymi_ns.bake.quantise import Profile, Range, bc7_blocks, decode_pages
 from bitymi_ns.bake.streams import StreamError
 from bitymi_ns.bake.texel_codes import constants
 from bitymi_ns.bundle import archive, compact, ktx2, ply
@@ -40,6 +41,11 @@ REMEDY = "Copy the bundle again from where it is whole, or export the scene agai
 """What to do about a damaged bundle."""
 MANIFEST_LIMIT = 64 << 20
 """Bytes that a bundle.json may have."""
+LARGE_ATLAS = 64 << 20
+"""Bytes of decoded texels of a compact bundle from which on a card gets BC7 blocks of them, a quarter of that. Fewer
+are no burden to any card, and blocks cost time, and some of the quality of texels that were not tuned to them."""
+LOAD_PROFILE: Profile = "veryfast"
+"""Of the encoder of these blocks: the next faster one loses more than twice as much."""
 _HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
 _CHUNK = 1 << 22
 
@@ -66,7 +72,8 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
     Args:
         folder: the bundle's folder, or its one file (`single.write_single`).
         verify: compare every file with its sha256 (sizes are always compared).
-        decode: also decode a BC7 atlas, four bytes per texel; a CUDA device draws from the blocks alone.
+        decode: also decode a BC7 atlas, four bytes per texel; a CUDA device draws from the blocks alone. False also
+            encodes the texels of a compact bundle where they are many (`LARGE_ATLAS`), because they have no blocks.
 
     Raises:
         BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
@@ -164,7 +171,7 @@ def assemble(
         BundleError: a file is malformed, or a value is out of range.
     """
     if info.surfels.file == COMPACT_SURFELS:
-        return _assemble_compact(folder, info, files, textured)
+        return _assemble_compact(folder, info, files, decode, textured)
     path = folder / SURFELS
     kind = info.surfels.view_color
     try:
@@ -199,19 +206,24 @@ def assemble(
     return Bundle(scene, info)
 
 
-def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray], textured: bool) -> Bundle:
+def _assemble_compact(
+    folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool, textured: bool
+) -> Bundle:
     """The bundle of surfels.bin and texels.bin."""
     atlas, where = info.atlas, folder / COMPACT_SURFELS
     try:
         codes, residual, step = compact.unpack_surfels(info.surfels, memoryview(files[COMPACT_SURFELS]))
         sizes = torch.from_numpy(codes.sizes)
-        tiles, texels = torch.zeros(len(codes), 5, dtype=torch.int32), None
+        tiles, texels, blocks = torch.zeros(len(codes), 5, dtype=torch.int32), None, None
         if atlas is not None and textured:
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
             found = compact.unpack_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]))
             value_range = Range(atlas.offset, atlas.scale, "")
             texels = _rounded(found.texels(), packing, value_range)
+            if not decode and texels.numel() >= LARGE_ATLAS:
+                blocks = _blocks(texels)
+                texels = texels if blocks is None else None
         elif atlas is None and bool((sizes > 0).any()):
             raise StreamError("a surfel has a tile, and there is no atlas")
     except StreamError as error:
@@ -226,6 +238,7 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
         near=info.render.near,
         weight_bound=info.render.weight_bound,
         prefilter=info.render.prefilter,
+        blocks=blocks,
         photographed=_photographed(info),
     )
     if atlas is not None:
@@ -249,6 +262,19 @@ def _rounded(texels: Tensor, packing: Packing, value_range: Range) -> Tensor:
     nothing = int(whole(np.zeros((1, 3), dtype=np.float32))[0])
     listed = torch.from_numpy(whole(texels.numpy()))
     return paged_texels(listed, packing, nothing)[..., None].view(torch.uint8)
+
+
+def _blocks(texels: Tensor) -> Tensor | None:
+    """BC7 blocks of decoded texels; None, with a warning, where the encoder is not installed."""
+    try:
+        return torch.from_numpy(bc7_blocks(texels.numpy(), LOAD_PROFILE))
+    except RuntimeError:
+        warnings.warn(
+            f"the texels stay decoded, {texels.numel() / 1e6:.0f} MB on the card where BC7 takes a quarter: the "
+            "encoder is not installed (pip install ispc_texcomp)",
+            stacklevel=2,
+        )
+        return None
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
+from bitymi_ns.host.device import kernel_device
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
 from bitymi_ns.ops import webgpu
@@ -43,15 +44,16 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder = Path(self.config.bundle)
+        folder, through_webgpu = Path(self.config.bundle), self._asks_for_webgpu()
+        on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
-            bundle = read_bundle(folder)
+            bundle = read_bundle(folder, decode=not on_card)
         except BundleError as error:
             fail(f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
         self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
         self._scene = bundle.scene
-        self._scene.through_webgpu = self._asks_for_webgpu()
+        self._scene.through_webgpu = through_webgpu
         self._count = len(bundle)
 
     def _asks_for_webgpu(self) -> bool:

@@ -1,12 +1,15 @@
-"""Options of the export for compact bundles."""
+"""Options of the export that say what a bundle is stored as."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from bitymi_ns.bake.compact import Compact
+from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.host.errors import fail
 
+BundleFormat = Literal["compact", "bc7", "uint8", "fp16"]
 MANIFEST_BYTES = 28_000
 """Of bundle.json and config.yml, at most about."""
 
@@ -15,11 +18,8 @@ MANIFEST_BYTES = 28_000
 class CompactOptions:
     """What a compact bundle is like."""
 
-    compact: bool = False
-    """Write a compact bundle (version 3): surfels and view colours as far as the pictures need them, texels by cosine
-    transform. `format` and `bc7_profile` then decide nothing."""
     interchange: bool = False
-    """Write surfels.ply into a compact bundle, too, for other programs."""
+    """Write surfels.ply into a compact bundle, too, for other programs; those of other formats have it."""
     compact_error: float = Compact.share
     """How much making it compact may add to the mean square error against the training photographs, as a share of it,
     before the texels are tuned; less where texels would then be too coarse to learn. The bytes go where they save most
@@ -31,29 +31,37 @@ class CompactOptions:
     """PSNR in dB against the training photographs, before the texels are tuned, in the place of compact_error:
     everything becomes as coarse as it may. Held-out views are shown less well than these."""
 
-    def check_compact(self, tolerance: float) -> None:
-        """Stops where an option is out of its range, or does not fit the tolerance of the bake."""
-        if self.compact and tolerance == 0:
-            fail("a compact bundle needs a tolerance (--compact with --exact or --tolerance 0)")
-        if self.interchange and not self.compact:
-            fail("--interchange adds surfels.ply to a compact bundle; another one has it (--compact)")
-        if self.target_mb is not None and (not self.compact or not 0.01 <= self.target_mb <= 1e5):
-            fail(f"--target-mb is for a compact bundle (--compact) and from 0.01 to 100,000 MB, not {self.target_mb}")
-        if self.target_psnr is not None and (not self.compact or not 1 <= self.target_psnr <= 100):
-            fail(f"--target-psnr is for a compact bundle (--compact) and from 1 to 100 dB, not {self.target_psnr}")
+    def check_compact(self, form: BundleFormat, tolerance: float, bc7_profile: str) -> None:
+        """Stops where an option is out of its range, or is for another format than that of the bundle.
+
+        Args:
+            form: format of the bundle.
+            tolerance: of the bake.
+            bc7_profile: that was asked for.
+        """
+        compact = form == "compact"
+        if compact and tolerance == 0:
+            fail("a compact bundle needs a tolerance: leave out --format compact, or --exact and --tolerance 0")
+        if form != "bc7" and bc7_profile != BakeOptions.bc7_profile:
+            fail(f"--bc7-profile is for --format bc7, and this bundle's is {form}")
+        for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
+            if not compact and getattr(self, name) != getattr(CompactOptions, name):
+                fail(f"--{name.replace('_', '-')} is for --format compact, and this bundle's is {form}")
+        if self.target_mb is not None and not 0.01 <= self.target_mb <= 1e5:
+            fail(f"--target-mb must be from 0.01 to 100,000 MB, not {self.target_mb}")
+        if self.target_psnr is not None and not 1 <= self.target_psnr <= 100:
+            fail(f"--target-psnr must be from 1 to 100 dB, not {self.target_psnr}")
         if self.target_mb is not None and self.target_psnr is not None:
             fail("--target-mb and --target-psnr cannot be asked for together: leave one out")
         if not 0 < self.compact_error < 1:
             fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
 
-    def compact_of(self, beside: int) -> Compact | None:
-        """How the bake is made compact; None = it is not.
+    def compact_of(self, beside: int) -> Compact:
+        """How the bake is made compact.
 
         Args:
             beside: bytes of other files, such as the preview.
         """
-        if not self.compact:
-            return None
         most = None
         if self.target_mb is not None:
             most = int(1e6 * self.target_mb) - beside - MANIFEST_BYTES

@@ -37,7 +37,7 @@ from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.compact_options import CompactOptions
+from bitymi_ns.host.compact_options import BundleFormat, CompactOptions
 from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.export_cameras import camera_files
 from bitymi_ns.host.export_summary import print_summary
@@ -73,6 +73,10 @@ class ExportAtlas(BakeOptions, CompactOptions):
     """Folder of the bundle."""
     overwrite: bool = False
     """Replace a bundle that is there already."""
+    format: BundleFormat | None = None  # type: ignore[assignment]  # of the bundle; that of the bake is `_options`
+    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a quarter to a
+    third of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
+    and 8 bytes. Not given: compact, or bc7 where everything is kept (--exact, --tolerance 0)."""
     exact: bool = False
     """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
@@ -109,7 +113,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
                     check_extras(self.extras, place_of(self.output_dir), self.overwrite)
-                check_room(self.output_dir, self.load_config, self, self.exact)
+                check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
                 self._run(bake_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
@@ -121,9 +125,12 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     def _options(self) -> BakeOptions:
         """Those of the bake; stops where any is out of its range, before anything is loaded."""
-        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
+        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions) if f.name != "format"})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
+        form = self._form
+        # a compact bundle needs no encoder: its texels are decoded to 8 bits
+        options = replace(options, format="uint8" if form == "compact" else form)
         if self.finetune_steps is not None and self.finetune_steps < 0:
             fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
         if self.polish_steps is not None and self.polish_steps < 0:
@@ -134,8 +141,16 @@ class ExportAtlas(BakeOptions, CompactOptions):
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
-        self.check_compact(options.tolerance)
+        self.check_compact(form, options.tolerance, options.bc7_profile)
         return options
+
+    @property
+    def _form(self) -> BundleFormat:
+        return self.format or ("bc7" if self.exact or self.tolerance == 0 else "compact")
+
+    @property
+    def _is_compact(self) -> bool:
+        return self._form == "compact"
 
     def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
         """What learns from so many training photographs, and whether the bundle is compact."""
@@ -161,9 +176,10 @@ class ExportAtlas(BakeOptions, CompactOptions):
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        shown = preview(model, datamanager, views, "JPEG" if self.compact else "PNG")
+        shown = preview(model, datamanager, views, "JPEG" if self._is_compact else "PNG")
         cameras_of = camera_files(datamanager, views, self.photographs)
-        learning = self._learning(model, len(views), self.compact_of(len(shown) + sum(map(len, cameras_of.values()))))
+        beside = len(shown) + sum(map(len, cameras_of.values()))
+        learning = self._learning(model, len(views), self.compact_of(beside) if self._is_compact else None)
         polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
@@ -181,7 +197,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 held_out = datamanager.eval_views if self.compare else ()
                 background = model.background.cpu()
                 photographs = datamanager.train_views
-                if polish or tune or self.compact:
+                if polish or tune or learning.compact:
                     photographs = corrected(photographs, model.resume_state.get("exposure"))
                 baked = bake_and_learn(
                     model.scene, views, photographs, background, options, learning, progress, held_out
@@ -196,7 +212,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             world=world_of(datamanager),
             statistics={"options": asdict(options), "method": config.method_name},
             extra_files={
-                "preview.jpg" if self.compact else "preview.png": shown,
+                "preview.jpg" if self._is_compact else "preview.png": shown,
                 **cameras_of,
             },
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},

@@ -86,7 +86,7 @@ def print_savings(table: Table, info: Manifest) -> None:
         table.add_row("... by the pixels that show them: polished", f"{texels.polished:,}")
     first = texels.paper or texels.learned or texels.within_visible_part
     table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, first):.1f} %)")
-    rule = first * BYTES_PER_TEXEL[options.format]
+    rule = first * BYTES_PER_TEXEL["bc7" if info.surfels.columns else options.format]
     stored = info.files[info.atlas.file].bytes if info.atlas else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     if error is None:  # the tiles hold what was learned, not the field

@@ -41,9 +41,9 @@ def bundle_place(folder: Path, overwrite: bool) -> Iterator[None]:
         yield
 
 
-def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool) -> None:
+def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool, compact: bool = False) -> None:
     """Stop where there may be too little room for a bundle."""
-    needed, free = space_needed(load_config, options, exact), free_bytes(folder)
+    needed, free = space_needed(load_config, options, exact, compact), free_bytes(folder)
     if free < needed:
         beside = " beside the earlier one" if folder.exists() else ""
         fail(
@@ -53,7 +53,7 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
         )
 
 
-def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
+def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: bool = False) -> int:
     """A generous estimate of the bytes of a run's bundle.
 
     It assumes that the newest checkpoint holds nothing but surfels, each with a tile of 32 x 32 texels, or with the
@@ -63,11 +63,13 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
         load_config: config.yml of the run; without a checkpoint beside it the estimate is 0.
         options: of the bake.
         exact: whether everything is kept.
+        compact: whether the bundle is compact, of which a texel takes less than a byte.
     """
     newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
     surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
     side = options.r_max if exact else min(options.r_max, TYPICAL_SIDE)
-    return surfels * (SURFEL_BYTES + side * side * BYTES_PER_TEXEL.get(options.format, max(BYTES_PER_TEXEL.values())))
+    texel = 1 if compact else BYTES_PER_TEXEL[options.format]
+    return surfels * (SURFEL_BYTES + side * side * texel)
 
 
 def bundle_version(folder: Path) -> tuple[int, int] | None:

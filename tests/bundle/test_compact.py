@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,11 @@ import pytest
 import torch
 
 from bitymi_ns.bake.packing import pack
+from bitymi_ns.bake.pages import coverage
 from bitymi_ns.bake.quantise import encode
 from bitymi_ns.bake.texel_codes import pages
-from bitymi_ns.bundle import BundleError, check_files, ply, read_bundle, write_bundle
+from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, write_bundle
+from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import RANGE, make_codes, scene_of, write_compact
 from tests.bundle.damage import amend, signed
@@ -60,6 +63,31 @@ def test_it_is_much_smaller_than_a_plain_one_and_can_carry_the_ply(tmp_path: Pat
     bundle = read_bundle(folder)
     np.testing.assert_array_equal(columns["x"], bundle.scene.surfels["means"][:, 0].numpy())
     np.testing.assert_array_equal(columns["tile_ru"], bundle.scene.tiles[:, 3].numpy())
+
+
+def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path: Path, monkeypatch) -> None:
+    folder = write_compact(tmp_path / "b", make_codes(count=400))
+    whole = read_bundle(folder).scene
+    few = read_bundle(folder, decode=False).scene
+    assert torch.equal(few.atlas, whole.atlas) and few.blocks is None  # a small atlas stays as it is
+    monkeypatch.setattr(read, "LARGE_ATLAS", whole.atlas.numel())
+    many = read_bundle(folder, decode=False).scene
+    assert many.atlas is None and many.blocks.numel() == whole.atlas.numel() / 4
+    owned = pixels_of(whole.tiles, whole.atlas)
+    error = (decoded(many.blocks)[owned].float() - whole.atlas[owned].float())[:, :3].square().mean().sqrt()
+    assert 0 < error < 20  # steps of 255, of texels that are noise of a deviation of 37
+    assert read_bundle(folder).scene.blocks is None  # the CPU needs none
+    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
+    with pytest.warns(UserWarning, match="pip install ispc_texcomp"):
+        without = read_bundle(folder, decode=False).scene
+    assert torch.equal(without.atlas, whole.atlas) and without.blocks is None
+
+
+def pixels_of(tiles: torch.Tensor, atlas: torch.Tensor) -> torch.Tensor:
+    """Which texels of pages belong to a tile: [layers, height, width] bool."""
+    layers, height, width = atlas.shape[:3]
+    owned = torch.from_numpy(coverage(tiles.numpy(), width, height, layers))
+    return owned.repeat_interleave(4, 1).repeat_interleave(4, 2)
 
 
 def test_an_empty_bundle_is_whole(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from bitymi_ns.bake import bake
 from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import draw
@@ -26,6 +27,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
+from tests.bundle.compact_scene import make_codes, write_compact
 from tests.cuda.baked_scenes import FLIP, camera_of, front, most, scene_of, textured
 from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_view_color import lean_parameters
@@ -149,6 +151,14 @@ def check_blocks(scene: BakedScene, want: BakedScene, device: torch.device, cpu)
         if unit
         else [f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory"]
     )
+
+
+def test_a_compact_bundle_of_many_texels(device: torch.device, cpu, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bundle_read, "LARGE_ATLAS", 0)
+    with cpu():
+        scene = read_bundle(write_compact(tmp_path / "b", make_codes(count=60)), decode=False).scene
+        want = replace(scene, atlas=baked_cuda.decoded(scene.blocks))
+    check_blocks(scene, want, device, cpu)
 
 
 def test_a_card_that_draws_no_blocks(device: torch.device, cpu, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -171,4 +171,4 @@ def test_a_run_is_found_beside_its_configuration(
 
 def test_the_options_of_the_command_are_the_declared_defaults() -> None:
     options = default_export()
-    assert (options.format, options.r_max, options.cap_by_views, options.tolerance) == ("bc7", 64, True, 0.75)
+    assert (options.format, options.r_max, options.cap_by_views, options.tolerance) == (None, 64, True, 0.75)

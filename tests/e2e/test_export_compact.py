@@ -14,9 +14,13 @@ from bitymi_ns.host.verify import check_run
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 
-def test_it_is_smaller_and_shows_the_same(trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path) -> None:
+def test_it_is_the_default_smaller_and_shows_the_same(
+    trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "b"
-    run_export(trained, folder, tolerance=TOLERANCE, finetune_steps=30, compact=True, interchange=True)
+    run_export(trained, folder, format=None, tolerance=TOLERANCE, finetune_steps=30, interchange=True)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "MB dct" in out and "per surfel" in out
     assert {path.name for path in folder.iterdir()} == {
         "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg", "cameras.json"
     }  # fmt: skip
@@ -36,11 +40,11 @@ def test_it_is_smaller_and_shows_the_same(trained: BitymiTrainerConfig, bundle: 
 
 
 def test_it_can_be_as_small_as_is_asked_for(field_run: BitymiTrainerConfig, tmp_path: Path) -> None:
-    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=0, compact=True)
+    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=0, format="compact")
     whole = sum(path.stat().st_size for path in (tmp_path / "b").iterdir())
     texels = (tmp_path / "b" / "texels.bin").stat().st_size
     target = (whole - texels / 2) / 1e6
-    run_export(field_run, tmp_path / "c", tolerance=TOLERANCE, finetune_steps=30, compact=True, target_mb=target)
+    run_export(field_run, tmp_path / "c", tolerance=TOLERANCE, finetune_steps=30, format="compact", target_mb=target)
     assert sum(path.stat().st_size for path in (tmp_path / "c").iterdir()) <= 1e6 * target
     assert len(read_bundle(tmp_path / "c")) == len(read_bundle(tmp_path / "b"))
 
@@ -48,12 +52,17 @@ def test_it_can_be_as_small_as_is_asked_for(field_run: BitymiTrainerConfig, tmp_
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"compact": True, "exact": True}, "needs a tolerance"),
-        ({"interchange": True}, "--interchange"),
-        ({"target_mb": 1.0}, "--target-mb"),
-        ({"compact": True, "compact_error": 0.0}, "--compact-error"),
-        ({"target_psnr": 30.0}, "--target-psnr"),
-        ({"compact": True, "target_psnr": 30.0, "target_mb": 1.0}, "together"),
+        ({"format": "compact", "exact": True}, "needs a tolerance"),
+        ({"interchange": True}, "--interchange is for --format compact, and this bundle's is bc7"),
+        ({"target_mb": 1.0}, "--target-mb is for"),
+        ({"compact_error": 0.1}, "--compact-error is for"),
+        ({"format": None, "compact_error": 0.0}, "--compact-error must lie"),
+        ({"format": "fp16", "target_psnr": 30.0}, "--target-psnr is for .* fp16"),
+        ({"format": None, "target_psnr": 200.0}, "--target-psnr must be from"),
+        ({"format": None, "target_mb": 0.0}, "--target-mb must be from"),
+        ({"format": None, "target_psnr": 30.0, "target_mb": 1.0}, "together"),
+        ({"format": None, "bc7_profile": "basic"}, "--bc7-profile is for --format bc7, and this bundle's is compact"),
+        ({"format": None, "exact": True, "interchange": True}, "this bundle's is bc7"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(trained: BitymiTrainerConfig, tmp_path: Path, options, said) -> None:

@@ -15,7 +15,7 @@ from bitymi_ns.measure.bench.engine import open_cells, run_chains
 from bitymi_ns.measure.bench.matrix import Matrix, Row, SceneSpec
 from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.bench.progress import Display
-from bitymi_ns.measure.bench.suites import format_bundles, local_scenes, read_plan, standard_scenes, suites
+from bitymi_ns.measure.bench.suites import FORMATS, format_bundles, local_scenes, read_plan, standard_scenes, suites
 from bitymi_ns.measure.bench.tables import results_page
 
 # A switch without its --no- twin, where this tyro knows how.
@@ -44,8 +44,8 @@ class BenchRun:
     """Train once for each of these seeds; none = once, with the method's own."""
     steps: int | None = None
     """Steps of a training; the schedules follow. None = the method's own for this machine."""
-    formats: tuple[str, ...] = ("fp16", "uint8", "bc7")
-    """Atlas formats that each trained scene is baked into; none = no baking."""
+    formats: tuple[str, ...] = FORMATS
+    """Formats of bundles that each trained scene is baked into; none = no baking."""
     pictures: int = 2
     """Worst held-out views of each run that are drawn with their decomposition and errors; 0 = none."""
     knobs: Flag = False

@@ -144,9 +144,16 @@ def _export(at: Layout, stage: Stage) -> dict[str, Any]:
         "folder": at.relative(folder),
         "bytes": sum(files.values()) + (folder / MANIFEST).stat().st_size,
         "files": files,
-        "format": info.atlas.format if info.atlas else None,
+        "format": _format(info),
         "statistics": info.statistics.model_dump(mode="json"),
     }
+
+
+def _format(info: Any) -> str | None:
+    """What `--format` calls it; None = there is no atlas."""
+    if info.atlas is None:
+        return None
+    return info.atlas.format if info.surfels.columns is None else "compact"
 
 
 def _evaluation(at: Layout, stage: Stage) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from bitymi_ns.capture.recognise import NotRecognised, recognise
 from bitymi_ns.measure.bench.matrix import Bundle, Row, SceneSpec
 from bitymi_ns.measure.bench.process import BenchError
 
-FORMATS = ("fp16", "uint8", "bc7")
-"""Atlas formats of `ns-export bitymi-atlas`."""
+FORMATS = ("fp16", "uint8", "bc7", "compact")
+"""Formats of `ns-export bitymi-atlas`."""
 HOLD_OUT = 8
 """Every which image of one's own captures is held out: the method's default."""
 

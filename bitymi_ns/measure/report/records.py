@@ -16,7 +16,7 @@ MAX_JSONL_BYTES = 64 << 20
 
 _BUNDLE = re.compile(r"(?<![a-z])(bundle|baked)(?![a-z])")
 _BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
-_FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7)(?![a-z0-9])")
+_FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7|compact)(?![a-z0-9])")
 
 
 class ReportError(Exception):

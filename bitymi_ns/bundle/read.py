@@ -111,6 +111,13 @@ def read_manifest(folder: Path) -> Manifest:
         raise BundleError(f"{path} cannot be read: {error}") from error
 
 
+def download_bytes(folder: Path, info: Manifest) -> int:
+    """Bytes of bundle.json and of the files that it lists, or of the one file that a bundle is."""
+    if folder.is_file():
+        return folder.stat().st_size
+    return (folder / MANIFEST).stat().st_size + sum(entry.bytes for entry in info.files.values())
+
+
 def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> bytearray:
     """The bytes of a file that bundle.json lists: all of those with surfels and texels, none of others.
 

@@ -12,6 +12,7 @@ from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
+from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.host.device import kernel_device
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
@@ -52,6 +53,7 @@ class BakedModel(SurfelModel):
             fail(f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
         self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
+        self._bundle_bytes = download_bytes(folder, bundle.info)
         self._scene = bundle.scene
         self._scene.through_webgpu = through_webgpu
         self._count = len(bundle)
@@ -82,7 +84,8 @@ class BakedModel(SurfelModel):
         return torch.tensor(self.config.background, device=self.device)
 
     def size_metrics(self) -> dict[str, float]:
-        return {**super().size_metrics(), "atlas_bytes": float(self._atlas_bytes)}
+        sizes = {"atlas_bytes": float(self._atlas_bytes), "bundle_bytes": float(self._bundle_bytes)}
+        return {**super().size_metrics(), **sizes}
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)

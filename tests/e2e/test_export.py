@@ -50,7 +50,9 @@ def test_stock_evaluation_of_checkpoint_and_bundle_agree(
         assert math.isfinite(neural[name]) and math.isfinite(baked[name])
     assert baked["psnr"] == pytest.approx(neural["psnr"], abs=0.2)
     assert baked["atlas_bytes"] == (bundle / "atlas.ktx2").stat().st_size
-    assert "atlas_bytes" not in neural
+    whole = sum(path.stat().st_size for path in bundle.iterdir() if path.name != "config.yml")
+    assert baked["bundle_bytes"] == whole
+    assert "atlas_bytes" not in neural and "bundle_bytes" not in neural
     assert ("lpips" in neural) == ("lpips" in baked)
 
 

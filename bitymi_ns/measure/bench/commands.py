@@ -134,15 +134,15 @@ def _train(at: Layout, stage: Stage) -> dict[str, Any]:
 
 
 def _export(at: Layout, stage: Stage) -> dict[str, Any]:
-    from bitymi_ns.bundle.manifest import MANIFEST  # with torch, which the stages of other methods do without
-    from bitymi_ns.bundle.read import read_manifest
+    # with torch, which the stages of other methods do without
+    from bitymi_ns.bundle.read import download_bytes, read_manifest
 
     folder = at.place("bundles", stage.form)
     info = read_manifest(folder)
     files = {name: entry.bytes for name, entry in info.files.items()}
     return {
         "folder": at.relative(folder),
-        "bytes": sum(files.values()) + (folder / MANIFEST).stat().st_size,
+        "bytes": download_bytes(folder, info),
         "files": files,
         "format": _format(info),
         "statistics": info.statistics.model_dump(mode="json"),

@@ -43,7 +43,8 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Cost:
-    """What quality is bought with: name in file names, axis label, section, value, whether baking changes it."""
+    """What quality is bought with: name in file names, axis label, section, value, whether baking changes it, and
+    whether the bundles of a method lie along a curve."""
 
     name: str
     title: str
@@ -51,6 +52,7 @@ class Cost:
     section: str
     value: Callable[[Evaluation], float | None]
     arrows: bool
+    curve: bool = False
 
 
 def _positive(key: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
@@ -58,14 +60,15 @@ def _positive(key: str, scale: float = 1.0) -> Callable[[Evaluation], float | No
 
 
 def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
-    """The x axes. Sizes are of whole bundles where all bundles state them, else of their atlases."""
+    """The x axes. Sizes are of whole bundles, which is what is downloaded, where all bundles state them; else of their
+    atlases."""
     baked = [e for e in rows if e.baked]
     whole = bool(baked) and all(e.get("bundle_bytes") for e in baked)
     key, what = ("bundle_bytes", "bundle") if whole else ("atlas_bytes", "atlas")
     return (
         Cost("train_seconds", "training seconds", "training seconds", TRAINING, _positive("train_seconds"), False),
         Cost("render_ms", "render milliseconds", "milliseconds per view", RENDERING, _positive("render_ms"), True),
-        Cost("bytes", f"{what} size", f"{what} MB", SIZE, _positive(key, 1e-6), False),
+        Cost("bytes", f"{what} size", f"{what} MB", SIZE, _positive(key, 1e-6), False, True),
     )
 
 
@@ -92,8 +95,8 @@ def _curve_sheet(name: str, title: str, x: str, y: str, keys: tuple[str, str], c
 
 
 def _scatter_sheet(metric: Metric, cost: Cost, evaluations: list[Evaluation], colors: dict[str, int]) -> Sheet | None:
-    """Quality against cost: hollow circles before baking, filled marks after, a thin line from parent to bundle, and
-    the Pareto front of all points of a scene."""
+    """Quality against cost: hollow circles before baking, filled marks after, a thin line from parent to bundle or
+    through the bundles of a method, and the Pareto front of all points of a scene."""
     points = {id(e): (cost.value(e), e.get(metric.key)) for e in evaluations}
     drawn = [e for e in evaluations if None not in points[id(e)]]
     if not drawn:
@@ -107,6 +110,9 @@ def _scatter_sheet(metric: Metric, cost: Cost, evaluations: list[Evaluation], co
         if len(best) > 1:
             xs, ys = zip(*best, strict=True)
             axes.step(xs, ys, where="post", color=theme.ink, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.6, zorder=1)
+        for method in sorted({e.method for e in here}) if cost.curve else ():
+            xs, ys = zip(*sorted(points[id(e)] for e in here if e.method == method), strict=True)
+            axes.plot(xs, ys, color=line_color(theme, colors[method]), linewidth=0.9, alpha=0.55, zorder=2)
         for e in here:
             color = line_color(theme, colors[e.method])
             px, py = points[id(e)]

@@ -46,22 +46,40 @@ class Coding(Protocol[C]):
         ...
 
 
+@dataclass(frozen=True)
+class CosineTexels:
+    """Texels as the codes of a compact bundle.
+
+    Attributes:
+        listed: [T, 3] what was coded.
+        codes: as they are stored.
+    """
+
+    listed: Tensor
+    codes: TexelCodes
+
+    def texels(self) -> Tensor:
+        return self.codes.texels()
+
+
 class Cosines:
     """The codes of a compact bundle, of no more bytes than the options say."""
 
     def __init__(self, coder: TexelCoder, options: TexelCodeOptions) -> None:
         self._coder, self._most = coder, options.most_bytes
 
-    def first(self, texels: Tensor) -> TexelCodes:
-        return self._coder.code(texels) if self._most is None else self._coder.fit(texels, self._most * TO_START)
+    def first(self, texels: Tensor) -> CosineTexels:
+        most = self._most
+        coded = self._coder.code(texels) if most is None else self._coder.fit(texels, most * TO_START)
+        return CosineTexels(texels.clone(), coded)
 
-    def again(self, texels: Tensor) -> TexelCodes:
-        return self._coder.code(texels, rounds=0)
+    def again(self, texels: Tensor) -> CosineTexels:
+        return CosineTexels(texels.clone(), self._coder.code(texels, rounds=0))
 
-    def last(self, coded: TexelCodes) -> TexelCodes:
-        if self._most is None or coded.nbytes() <= self._most:
+    def last(self, coded: CosineTexels) -> CosineTexels:
+        if self._most is None or coded.codes.nbytes() <= self._most:
             return coded
-        return self._coder.fit(coded.texels(), self._most, rounds=1)
+        return CosineTexels(coded.listed, self._coder.fit(coded.texels(), self._most, rounds=1))
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,9 @@ from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2
 """Price that is looked at first: squared error that a bit is worth, colours from 0 to 1."""
-MOST_PRICE = 13.0 / 255**2
+MOST_PRICE = 8.0 / 255**2
 """The price is no larger where a share of the error decides: much of a large error is what no texel mends, such as of
-exposure, and does not hide that of rounding; and texels learn little behind steps above the 7.5 of 255 that this is."""
+exposure, and does not hide that of rounding; and texels learn little behind steps above the 5.9 of 255 that this is."""
 TEXEL_SHARE = 0.5
 """Of the error that a bit is worth elsewhere, what it is worth in texels, which are tuned after it."""
 LEAST_ERROR = 1e-7
@@ -211,7 +211,7 @@ def compacted(
         coding = replace(coding, most_bytes=options.most_bytes - rounded.codes.surfels.nbytes())
     mse = found.error - coder.error if coder.measured else None
     rounding = Rounding(mse=mse if mse is None else max(0.0, mse), steps=dict(rounded.codes.surfels.steps))
-    statistics = rounded.statistics.but(rounding=rounding, error=None, view_color=_thinned(rounded))
+    statistics = rounded.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(rounded))
     return replace(rounded, statistics=statistics), coding
 
 
@@ -252,7 +252,7 @@ def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> 
     options = options or TexelCodeOptions()
     coder = TexelCoder(torch.from_numpy(baked.packing.tiles[:, 3:]), torch.ones(len(texels)), options)
     coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
-    return baked.with_texel_codes(coded)
+    return baked.with_texel_codes(coded, texels)
 
 
 def _thinned(baked: Baked) -> ViewColorError | None:

@@ -1,4 +1,4 @@
-"""How far stored tiles are from the field."""
+"""How far stored tiles are from the field, or from what they held before."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.footprint import averaged, cells_per_pixel
 from bitymi_ns.bake.options import STEPS
 from bitymi_ns.bake.pages import size_classes, texel_index
-from bitymi_ns.bake.plan import Field, Plan
-from bitymi_ns.bake.reference import references
+from bitymi_ns.bake.plan import Field, Plan, Shown
+from bitymi_ns.bake.reference import references, weights
 from bitymi_ns.bake.resample import read_at
-from bitymi_ns.bake.statistics import Percentiles, TileError
+from bitymi_ns.bake.statistics import Certificate, Percentiles, TileError
 from bitymi_ns.progress import Progress, no_progress
+
+_CONSTANT = (8, 8)
+"""Points at which the weight of a surfel without a tile is looked at."""
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
@@ -24,6 +28,41 @@ def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
     return STEPS * (square / count).sqrt()
 
 
+def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
+    """`weighted_rms` of what a view can see: difference times weight is averaged over its pixels first, of `cells`
+    [n, 2]."""
+    return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
+
+
+@torch.no_grad()
+def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
+    """What differences of texels are as the closest training view sees them.
+
+    Args:
+        difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
+        sizes: [N, 2] sides of the tiles; (0, 0) = none.
+        shown: how much of the tiles is seen, N rows.
+        chunk: texels taken at once (a tile is never split).
+
+    Returns:
+        [N] root mean squares in 8-bit steps, each times the largest blending weight that a fragment has there; and [N]
+        bool, whether any fragment of the surfel gets a residual.
+    """
+    errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
+    area = sizes.long().clamp(min=1).prod(dim=1)
+    first, bare = area.cumsum(0) - area, torch.nonzero(sizes[:, 0] == 0).squeeze(1)
+    classes = size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1))
+    for r_u, r_v, members in [*classes, (*_CONSTANT, bare)]:
+        for rows in members.split(max(1, chunk // (r_u * r_v))):
+            inside = torch.arange(r_u * r_v) if members is not bare else torch.zeros(r_u * r_v, dtype=torch.long)
+            values = difference[first[rows, None] + inside].view(-1, r_v, r_u, 3).permute(0, 3, 1, 2)
+            weight, extent = weights(shown, rows, (r_u, r_v)), shown.extent[rows]
+            pixels = None if shown.pixels is None else shown.pixels[rows]
+            errors[rows] = seen_rms(values, weight, cells_per_pixel(pixels, extent, (r_u, r_v)))
+            seen[rows] = (weight > 0).flatten(1).any(1)
+    return errors, seen
+
+
 @dataclass
 class TileErrors:
     """Errors in 8-bit steps, each times the largest blending weight that a fragment has there.
@@ -31,11 +70,13 @@ class TileErrors:
     Attributes:
         rms: [N] root mean square over the visible part of each surfel and the colour channels.
         largest: [N] largest absolute value.
+        seen: [N] root mean square of what the closest training view sees, which averages over its pixels.
         shown: [N] bool, whether any fragment of the surfel gets a residual; the errors are 0 elsewhere.
     """
 
     rms: Tensor
     largest: Tensor
+    seen: Tensor
     shown: Tensor
 
     def summary(self, tolerance: float) -> TileError:
@@ -46,6 +87,10 @@ class TileErrors:
             for values in (self.rms, self.largest)
         )
         return TileError(tolerance=tolerance, unit=unit, rms=rms, largest=largest)
+
+    def certificate(self, tolerance: float) -> Certificate | None:
+        """How many of these surfels are within the tolerance as they are seen; None without one."""
+        return Certificate.of(self.seen[self.shown], tolerance, "field") if tolerance else None
 
 
 @torch.no_grad()
@@ -69,7 +114,7 @@ def tile_errors(
         chunk: points evaluated at once.
         progress: called with the number of tiles done.
     """
-    rms, largest = torch.zeros(len(plan)), torch.zeros(len(plan))
+    rms, largest, seen = (torch.zeros(len(plan)) for _ in range(3))
     places = torch.as_tensor(tiles)
     flat = None if residuals is None else torch.as_tensor(residuals).reshape(-1, 3)
     done = 0
@@ -83,8 +128,11 @@ def tile_errors(
                 rebuilt[at] = read_at(stored, part.size)
         difference = rebuilt.to(part.values) - part.values
         rms[rows] = weighted_rms(difference, part.weight).cpu()
+        pixels = None if plan.pixels is None else plan.pixels[part.rows]
+        cells = cells_per_pixel(pixels, plan.extent[part.rows], part.size)
+        seen[rows] = seen_rms(difference, part.weight, cells).cpu()
         weighted = STEPS * difference.abs().amax(1) * part.weight
         largest[rows] = weighted.flatten(1).amax(1).cpu()
         done += len(rows)
         progress("measuring the error", done, len(plan))
-    return TileErrors(rms, largest, plan.extent.cpu() > 0)
+    return TileErrors(rms, largest, seen, plan.extent.cpu() > 0)

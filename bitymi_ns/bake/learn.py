@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
+from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
@@ -72,7 +73,7 @@ def bake_and_learn(
     progress: Progress = no_progress,
     held_out: Sequence[View] = (),
 ) -> Baked:
-    """Bakes a scene, lets it learn, reduces and encodes it.
+    """Bakes a scene, lets it learn, reduces and encodes it, and states how far what is stored is from what it learned.
 
     With a polish the order is: fine tiles, polish, reduction of tiles and view colours, fine-tuning. Without: reduced
     tiles and view colours, fine-tuning. A scene whose texels learned in training has its fine tiles already.
@@ -101,4 +102,4 @@ def bake_and_learn(
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
     if baked.codes is not None and baked.codes.texels is None:
         baked = with_coded_texels(baked, coding)
-    return baked.encoded(progress)
+    return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras], progress)

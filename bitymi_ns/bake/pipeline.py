@@ -49,6 +49,7 @@ class Baked:
         texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
         atlas: the encoded atlas, None without texture.
         options: what it was baked with.
+        uncoded: [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`.
         codes: the integers that the surfels, and once they are coded the texels, stand for; None = they are stored as
             they are.
         statistics: what was left out, what it cost, and the error of the quantisation.
@@ -62,6 +63,11 @@ class Baked:
     options: BakeOptions
     statistics: Statistics = field(default_factory=Statistics)
     codes: Codes | None = None
+    uncoded: Tensor | None = None
+
+    def with_statistics(self, **changes: Any) -> Baked:
+        """The same bake with other statistics."""
+        return replace(self, statistics=self.statistics.but(**changes))
 
     @property
     def mean_residual(self) -> Tensor:
@@ -135,7 +141,7 @@ class Baked:
         texels = texels.detach().float().cpu().contiguous()
         means = tile_means(texels, self.packing, self.mean_residual)
         # no error: the field is no longer what the texels are meant to hold
-        statistics = self.statistics.but(atlas=None, error=None)
+        statistics = self.statistics.but(atlas=None, error=None, certificate=None)
         return replace(self.with_mean_residual(means), texels=texels, atlas=None, statistics=statistics)
 
     def encoded(self, progress: Progress = no_progress) -> Baked:
@@ -148,8 +154,9 @@ class Baked:
         """The same bake with its texels as they are encoded."""
         return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=_cost(self.packing, atlas)))
 
-    def with_texel_codes(self, codes: TexelCodes) -> Baked:
-        """The same bake with the residual colours of codes, which are those of its tiles."""
+    def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> Baked:
+        """The same bake with the residual colours of codes, which are those of its tiles, and were made of `uncoded`
+        [T, 3]."""
         assert self.codes is not None
         texels = pages(codes, self.packing)
         value_range = choose_range(
@@ -160,7 +167,8 @@ class Baked:
             self.with_mean_residual(codes.constants),
             texels=texels,
             atlas=atlas,
-            statistics=self.statistics.but(atlas=_cost(self.packing, atlas), error=None),
+            statistics=self.statistics.but(atlas=_cost(self.packing, atlas), error=None, certificate=None),
+            uncoded=uncoded,
             codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
         )
 
@@ -308,13 +316,13 @@ def _textured(
     plan = method.plan(field, inputs)
     tiles = method.tiles(field, plan, inputs, progress)
     packing = tiles.packing
-    atlas = error = None
+    atlas = error = certificate = None
     counts = plan.texels if method.final else plan.texels.but(polished=packing.texels)
     if method.final:
         atlas = None if tiles.texels is None else encoded_pages(tiles.texels, packing, options, progress)
         stored = None if atlas is None else atlas.decoded()
         errors = tile_errors(field, plan, packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
-        error = errors.summary(options.tolerance)
+        error, certificate = errors.summary(options.tolerance), errors.certificate(options.tolerance)
     return (
         tiles,
         atlas,
@@ -324,6 +332,7 @@ def _textured(
             field=levels,
             atlas=None if atlas is None else _cost(packing, atlas),
             error=error,
+            certificate=certificate,
         ),
     )
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.footprint import closest_pixels
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.statistics import KeptTexels
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import (
     kernel_parameters,
-    max_projected_extent,
     nyquist_resolution,
     visible_extent,
     voxel_along_axes,
@@ -48,12 +48,14 @@ class Shown:
         extent: [N] half side of the tile in scale units: beyond it every fragment stays below the weight bound; 0 where
             all do.
         weight_bound: fragments of smaller weight get no residual.
+        pixels: [N, 2] pixels of a scale unit in the closest view (`footprint.closest_pixels`); None = not known.
     """
 
     opacity: Tensor
     beta: Tensor
     extent: Tensor
     weight_bound: float
+    pixels: Tensor | None = field(default=None, kw_only=True)
 
 
 @dataclass
@@ -113,9 +115,8 @@ def make_plan(
         if options.local_voxel
         else voxel.amin().expand(scales.shape)
     )
-    pixels = None
-    if cameras and options.cap_by_views:
-        pixels = max_projected_extent(means, axes, scales, cameras, options.extent, near)[0]
+    closest = closest_pixels(surfels, cameras, options.extent, near) if cameras else None
+    pixels = None if closest is None or not options.cap_by_views else closest * (2.0 * options.extent)
 
     def grids(share: Tensor, pixels: Tensor | None) -> Tensor:
         capped = None if pixels is None else pixels * share
@@ -131,7 +132,7 @@ def make_plan(
         within_visible_part=_texels(limit),
     )
     edges = axes * scales[:, None, :]
-    return Plan(opacity, beta, extent, weight_bound, means, edges, probes, limit, counts)
+    return Plan(opacity, beta, extent, weight_bound, means, edges, probes, limit, counts, pixels=closest)
 
 
 def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:

@@ -6,7 +6,7 @@ Every part may lack what an earlier version did not state, and keeps keys that i
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_serializer
 from torch import Tensor
@@ -68,6 +68,34 @@ class TileError(Part):
     unit: str | None = None
     rms: Percentiles
     largest: Percentiles
+
+
+MARKS = 128
+"""Sums of signed texels by which a certificate is checked (`bake/certificate.py`)."""
+
+
+class Certificate(Part):
+    """Of how many surfels the stored residual is within the tolerance, as the closest training view sees it: weighted
+    by the blending weight, averaged over a pixel, root mean square over the tile."""
+
+    against: Literal["field", "texels"]
+    """What is stored is compared with: the field, or the texels as they learned, before they were stored."""
+    tolerance: NotNegative
+    within: Whole
+    beyond: Whole
+    worst: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """8-bit steps."""
+    texel_rms: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """Root mean square of the texels themselves, wherever they are seen, 8-bit steps."""
+    marks: Annotated[str, Field(min_length=1368, max_length=1368, pattern=r"^[A-Za-z0-9+/]{1366}==$")] | None = None
+    """2 x 128 sums, before and as stored (`certificate.marks_text`)."""
+
+    @classmethod
+    def of(cls, errors: Tensor, tolerance: float, against: Literal["field", "texels"]) -> Certificate:
+        """That of errors [n], 8-bit steps."""
+        within = int((errors <= tolerance).sum())
+        worst = float(errors.amax()) if len(errors) else 0.0
+        return cls(against=against, tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
 
 
 class LeftOut(Part):
@@ -202,6 +230,8 @@ class Statistics(Part):
     texels: KeptTexels | None = None
     error: TileError | None = None
     """None: nothing was textured, or the texels were changed after the bake."""
+    certificate: Certificate | None = None
+    """None: nothing was textured, or there is no tolerance."""
     view_color: ViewColorError | None = None
     """None: all of the view colours is kept."""
     field: FieldLevels | None = None

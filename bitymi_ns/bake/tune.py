@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.codings import C, Coding, Cosines, Pages, PageTexels
+from bitymi_ns.bake.codings import C, Coding, Cosines, CosineTexels, Pages, PageTexels
 from bitymi_ns.bake.looks import FEWEST_VIEWS, Looks, gain, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
-from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
+from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder
 from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews, coverage
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.config import TexelSteps
@@ -128,8 +128,8 @@ def tune_atlas(
         error_before=baked.statistics.error,
         psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels())),
     )
-    if isinstance(coded, TexelCodes):
-        result = baked.with_texel_codes(coded)
+    if isinstance(coded, CosineTexels):
+        result = baked.with_texel_codes(coded.codes, coded.listed)
     else:
         result = scene.baked(coded.listed).with_atlas(coded.atlas)
     return replace(result, statistics=result.statistics.but(finetune=statistics))
@@ -137,7 +137,7 @@ def tune_atlas(
 
 def _coding(
     baked: Baked, scene: TexelScene, views: TexelViews, options: TexelCodeOptions, progress: Progress
-) -> Coding[TexelCodes] | Coding[PageTexels]:
+) -> Coding[CosineTexels] | Coding[PageTexels]:
     """How the texels are stored."""
     if baked.codes is not None:
         weights = coverage(scene, views, progress, squared=True)[:, 0]

@@ -10,15 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.certificate import marks, marks_of, measured_rms
 from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bake.methods import bake_method
-from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.options import STEPS, BakeOptions
+from bitymi_ns.bake.packing import Packing
+from bitymi_ns.bake.pages import listed_texels
 from bitymi_ns.bake.plan import Field
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
 from bitymi_ns.bundle.read import Bundle, assemble, enough_memory, read_file, read_manifest
 from bitymi_ns.bundle.write import World
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters
@@ -26,6 +30,12 @@ from bitymi_ns.scene.visibility import visibility
 
 _SLACK = 1.02  # sums in another order, rotations that were written with length 1
 _SLACK_STEPS = 0.02
+_SLACK_COUNT = 2
+"""Surfels at the bound itself."""
+_SLACK_CODES = 4.0
+"""8-bit codes by which a mark may differ: what a transform leaves between two codes, processors round either way."""
+_SLACK_MARKS = 1.4
+"""The square that marks tell is within 1.96 times the true one: 7 standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,7 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
     except BundleError as error:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
-    return bundle, [*checks, _tiles(bundle), _statements(bundle)]
+    return bundle, [*checks, _tiles(bundle), _statements(bundle), *check_certificate(bundle)]
 
 
 def _real_world(place: Place) -> str:
@@ -90,6 +100,40 @@ def check_place(stated: Place, world: World) -> Check:
         same = value == found if isinstance(found, str) else np.allclose(value, found, rtol=1e-4, atol=1e-5)
         wrong += [] if same else [f"{key} is {value}, that of the run {found}"]
     return Check("place of the scene", not wrong, "; ".join(wrong) or "as the run has it")
+
+
+def check_certificate(bundle: Bundle) -> list[Check]:
+    """Whether the texels are those of which bundle.json states how near they are to what they held before they were
+    stored, and whether they are that near; nothing where it states none, or of the field."""
+    stated, atlas = bundle.info.statistics.certificate, bundle.info.atlas
+    if stated is None:
+        return []
+    worst, count = stated.worst, stated.within + stated.beyond
+    detail = f"{stated.within:,} of {count:,} surfels within {stated.tolerance:g} steps of the {stated.against} as seen"
+    detail += f", at most {_steps(worst)}"
+    if count > len(bundle) or (worst is not None and (worst > stated.tolerance) != (stated.beyond > 0)):
+        return [Check("certificate", False, f"{detail}: these numbers contradict each other")]
+    if stated.marks is None or stated.texel_rms is None or atlas is None:
+        return [Check("certificate", True, detail)]
+    scene = bundle.scene
+    before, stored = marks_of(stated.marks)
+    texels = scene_texels(scene)
+    code = atlas.scale / STEPS
+    allowed = _SLACK_CODES * code * max(1.0, (len(texels) / 1e6) ** 0.5)
+    same = bool(np.abs(marks(texels) - stored).max() <= allowed)
+    found = measured_rms(texels, before)
+    near = found <= _SLACK_MARKS * stated.texel_rms + _SLACK_STEPS
+    detail += f"; texels {found:.2f} steps from those before they were stored (stated {stated.texel_rms:.2f})"
+    detail += "" if same else "; these are not those that were measured"
+    return [Check("certificate", same and near, detail)]
+
+
+def scene_texels(scene: BakedScene) -> Tensor:
+    """[T, 3] residual colours of a scene in the order of `ops.TexelTiles`."""
+    assert scene.atlas is not None and scene.mean_residual is not None
+    layers, height, width = scene.atlas.shape[:3]
+    packing = Packing(scene.tiles.numpy(), width, height, layers, 1.0)
+    return listed_texels(scene.residuals(), packing, scene.mean_residual)
 
 
 def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Check:
@@ -121,6 +165,13 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
         largest = float(measured.amax())
         ok &= bound is not None and largest <= bound * _SLACK + _SLACK_STEPS
         lines.append(f"{what} {largest:.3f} (stated {_steps(bound)})")
+    certificate = statistics.certificate
+    if certificate is not None:
+        again = found.certificate(certificate.tolerance)
+        assert again is not None
+        ok &= certificate.worst is not None and again.worst <= certificate.worst * _SLACK + _SLACK_STEPS
+        ok &= again.beyond <= certificate.beyond * _SLACK + _SLACK_COUNT
+        lines.append(f"as seen {again.beyond:,} beyond {certificate.tolerance:g} (stated {certificate.beyond:,})")
     return Check(name, ok, ", ".join(lines) + " steps")
 
 

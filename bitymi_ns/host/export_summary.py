@@ -89,6 +89,12 @@ def print_savings(table: Table, info: Manifest) -> None:
     rule = first * BYTES_PER_TEXEL["bc7" if info.surfels.columns else options.format]
     stored = info.files[info.atlas.file].bytes if info.atlas else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
+    certificate = statistics.certificate
+    if certificate is not None:
+        count, of = certificate.within + certificate.beyond, {"field": "the field", "texels": "what was learned"}
+        table.add_row("As stored and seen", f"{certificate.within:,} of {count:,} surfels within the tolerance")
+        worst = "no number" if certificate.worst is None else f"at most {certificate.worst:.2f} steps"
+        table.add_row("", f"({certificate.tolerance:g} steps from {of[certificate.against]}; {worst})")
     if error is None:  # the tiles hold what was learned, not the field
         return
     tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"

@@ -32,7 +32,7 @@ def test_a_bundle_passes_as_it_was_written(made):
     bundle, checks = check_files(folder)
     assert all(check.ok for check in checks)
     assert [check.name for check in checks] == [
-        "bundle.json", "atlas.ktx2", "surfels.ply", "contents", "tiles", "statistics"
+        "bundle.json", "atlas.ktx2", "surfels.ply", "contents", "tiles", "statistics", "certificate"
     ]  # fmt: skip
     assert check_field(bundle, trained.field, views).ok
     assert main(["verify", str(folder)]) == 0

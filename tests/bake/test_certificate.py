@@ -1,0 +1,197 @@
+"""What a bundle states of how near its texels are to those before they were stored is true, and is measured again."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn
+from bitymi_ns.bake.certificate import certified, marks, marks_of, marks_text, measured_rms, texel_rms
+from bitymi_ns.bake.compact import Compact
+from bitymi_ns.bake.errors import listed_errors
+from bitymi_ns.bake.footprint import averaged, cells_per_pixel, closest_pixels
+from bitymi_ns.bake.plan import Shown
+from bitymi_ns.bake.statistics import MARKS, Certificate
+from bitymi_ns.bundle import check_field, check_files, export
+from tests.bake.test_tune import BACKGROUND, photographs, waving
+from tests.bundle.damage import amend
+
+SIDES = ((0, 0), (4, 4), (8, 4), (16, 32))
+
+
+def mean_over(row: np.ndarray, center: float, width: float) -> float:
+    """Mean of a piecewise constant function of unit steps over a window."""
+    low, high = center - width / 2, center + width / 2
+    edges = np.arange(len(row))
+    share = np.clip(np.minimum(high, edges + 1) - np.maximum(low, edges), 0, None)
+    return float((share * row).sum() / width)
+
+
+def by_hand(values: np.ndarray, cells: tuple[float, float]) -> np.ndarray:
+    """`averaged` of one channel [v, u], cell by cell."""
+    for axis, width in ((1, cells[0]), (0, cells[1])):
+        count = values.shape[axis]
+        at = [min(max(i + 0.5, width / 2), count - width / 2) for i in range(count)]
+        moved = np.moveaxis(values, axis, 1)
+        moved = np.array([[mean_over(row, center, width) for center in at] for row in moved])
+        values = np.moveaxis(moved, 1, axis)
+    return values
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    size=st.sampled_from(SIDES[1:]),
+    shares=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+    seed=st.integers(0, 1000),
+)
+def test_a_pixel_averages_what_it_covers(size: tuple[int, int], shares: tuple[float, float], seed: int) -> None:
+    values = np.random.default_rng(seed).normal(size=(size[1], size[0]))
+    cells = tuple(1 + share * (side - 1) for share, side in zip(shares, size, strict=True))
+    got = averaged(torch.from_numpy(values).float()[None, None], torch.tensor([cells]))
+    np.testing.assert_allclose(got[0, 0].numpy(), by_hand(values, cells), atol=2e-5)
+
+
+def test_a_pixel_covers_from_one_cell_to_the_whole_tile() -> None:
+    pixels = torch.tensor([[10.0, 1.0], [0.0, 0.25]])
+    cells = cells_per_pixel(pixels, torch.tensor([1.0, 2.0]), (8, 16))
+    assert cells.tolist() == [[1.0, 8.0], [8.0, 16.0]]
+    values = torch.rand(2, 3, 16, 8)
+    assert torch.equal(averaged(values, torch.ones(2, 2)), values)
+    whole = averaged(values, torch.tensor([[8.0, 16.0]] * 2))
+    torch.testing.assert_close(whole, values.mean((2, 3), keepdim=True).expand_as(values))
+
+
+def test_pixels_are_those_of_the_closest_view(scene, camera) -> None:
+    surfels = scene(5).surfels
+    near, far = (closest_pixels(surfels, [camera(d)], 3.0, 0.2) for d in (4.0, 9.0))
+    both = closest_pixels(surfels, [camera(4.0), camera(9.0)], 3.0, 0.2)
+    assert torch.equal(both, torch.maximum(near, far)) and (near > far).any()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.0, 0.05))
+def test_the_counts_are_true(seed: int, size: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    sizes = torch.tensor([SIDES[i] for i in torch.randint(len(SIDES), (9,), generator=generator).tolist()])
+    extent, opacity, beta = (torch.rand(9, generator=generator) for _ in range(3))
+    pixels = 20 * torch.rand(9, 2, generator=generator)
+    shown = Shown(opacity, 4 * beta, 0.2 + 2.8 * extent, 0.3, pixels=pixels)
+    area = sizes.clamp(min=1).prod(1)
+    difference = size * torch.randn(int(area.sum()), 3, generator=generator)
+    errors, seen = listed_errors(difference, sizes, shown, chunk=40)
+    found, first = [], 0
+    for i, (r_u, r_v) in enumerate(sizes.tolist()):
+        u, v = (r_u, r_v) if r_u else (8, 8)
+        d = difference[first : first + int(area[i])].double().numpy()
+        d = d.reshape(v, u, 3) if r_u else np.broadcast_to(d, (v, u, 3))
+        first += int(area[i])
+        e, b = float(shown.extent[i]), float(shown.beta[i])
+        x, y = (e * ((2 * np.arange(n) + 1) / n - 1) for n in (u, v))
+        rest = np.clip(1 - (x[None, :] ** 2 + y[:, None] ** 2) / 9, 0, None)
+        weight = float(opacity[i]) * rest**b
+        weight[(weight < 0.3) | (rest <= 0)] = 0
+        if not weight.any():
+            assert not seen[i]
+            continue
+        cells = [min(max(n / (2 * e * float(p)), 1.0), n) for n, p in zip((u, v), pixels[i], strict=True)]
+        seen_by_a_pixel = np.stack([by_hand(weight * d[..., c], cells) for c in range(3)])
+        square = (seen_by_a_pixel**2 * (weight > 0)).sum() / (3 * (weight > 0).sum())
+        found.append(255 * math.sqrt(square))
+        assert seen[i] and float(errors[i]) == pytest.approx(found[-1], rel=1e-3, abs=1e-4)
+    if found and min(abs(each - 0.75) for each in found) > 1e-3:
+        stated = Certificate.of(errors[seen], 0.75, "texels")
+        assert (stated.within, stated.beyond) == (sum(e <= 0.75 for e in found), sum(e > 0.75 for e in found))
+        assert stated.worst == pytest.approx(max(found), rel=1e-3, abs=1e-4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 400), st.booleans())
+def test_marks_tell_how_far_texels_are(seed: int, count: int, few: bool) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    before = torch.randn(count, 3, generator=generator)
+    change = torch.randn(count, 3, generator=generator)
+    if few:  # one number alone
+        change[1:] = 0.0
+    stored = before + 0.02 * change
+    two = marks_of(marks_text(before, stored))
+    assert two.shape == (2, MARKS) and np.abs(two[1] - marks(stored)).max() < 1e-4
+    assert measured_rms(stored, two[0]) == pytest.approx(texel_rms(stored, before), rel=0.55, abs=1e-3)
+
+
+def test_marks_are_the_same_everywhere() -> None:
+    found = marks(torch.arange(300.0).view(100, 3))
+    assert found[:4].tolist() == EXPECTED and marks(torch.zeros(0, 3)).tolist() == [0.0] * MARKS
+
+
+EXPECTED = [-667.0, -141.0, -296.0, -144.0]
+"""By the same formula with whole numbers."""
+
+
+@pytest.fixture(scope="module")
+def truth(scene) -> Baked:
+    return waving(scene(60))
+
+
+def learned(scene, truth: Baked, compact: bool) -> Baked:
+    """A bake that was tuned, and stored."""
+    made, views = scene(60), photographs(truth)
+    made.surfels["log_scales"] += 1.5
+    made.surfels["opacity_logits"] += 1.0
+    learning = Learning(tune=TuneOptions(steps=2, coded_steps=10), compact=Compact() if compact else None)
+    at = ([view.camera for view in views], views, BACKGROUND)
+    return bake_and_learn(made, *at, BakeOptions(format="uint8"), learning)
+
+
+@pytest.mark.parametrize("compact", [True, False])
+def test_texels_that_were_altered_fail_behind_a_good_hash(scene, truth: Baked, tmp_path: Path, compact: bool) -> None:
+    baked = learned(scene, truth, compact)
+    stated = baked.statistics.certificate
+    assert stated is not None and stated.against == "texels" and stated.within + stated.beyond <= len(baked.rows)
+    export(baked, tmp_path / "b")
+    checks = {check.name: check for check in check_files(tmp_path / "b")[1]}
+    assert all(check.ok for check in checks.values()) and "steps of the texels as seen" in checks["certificate"].detail
+    if compact:  # the same bundle with other codes
+        codes = baked.codes.texels
+        other = replace(codes, coefficients=[3 * each for each in codes.coefficients])
+        export(baked.with_texel_codes(other, baked.uncoded).with_statistics(certificate=stated), tmp_path / "c")
+    else:
+        export(baked, tmp_path / "c")
+        data = bytearray((tmp_path / "c" / "atlas.ktx2").read_bytes())
+        data[-2048:] = bytes(255 - value for value in data[-2048:])
+        (tmp_path / "c" / "atlas.ktx2").write_bytes(data)
+        amend(tmp_path / "c")
+    failed = [check for check in check_files(tmp_path / "c")[1] if not check.ok]
+    assert [check.name for check in failed] == ["certificate"]
+    assert "not those that were measured" in failed[0].detail
+
+
+def test_counts_that_contradict_each_other_fail(scene, truth: Baked, tmp_path: Path) -> None:
+    export(learned(scene, truth, True), tmp_path / "b")
+    amend(tmp_path / "b", lambda info: info["statistics"]["certificate"].update(beyond=0, worst=2.0))
+    assert [check.name for check in check_files(tmp_path / "b")[1] if not check.ok] == ["certificate"]
+
+
+def test_a_bake_of_the_field_is_held_against_it_as_seen(scene, camera, tmp_path: Path) -> None:
+    made, views = scene(40), [camera(6.0), camera(40.0)]
+    options = BakeOptions(format="uint8", tolerance=0.3)
+    baked = certified(bake(made, views, options), views)
+    stated, error = baked.statistics.certificate, baked.statistics.error
+    assert stated.against == "field" and stated.marks is None
+    assert stated.worst <= error.rms.p100 + 1e-4 and stated.within > 0
+    export(baked, tmp_path / "b", statistics={"options": vars(options)})
+    bundle, checks = check_files(tmp_path / "b")
+    assert all(check.ok for check in checks) and check_field(bundle, made.field, views).ok
+    info = json.loads((tmp_path / "b" / "bundle.json").read_text())
+    worst = info["statistics"]["certificate"]["worst"]
+    amend(tmp_path / "b", lambda info: info["statistics"]["certificate"].update(worst=worst / 2 - 0.05))
+    bundle, _ = check_files(tmp_path / "b")
+    assert bundle is not None and not check_field(bundle, made.field, views).ok
+    assert bake(made, views, replace(options, tolerance=0.0)).statistics.certificate is None

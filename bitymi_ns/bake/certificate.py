@@ -19,13 +19,11 @@ from torch import Tensor
 
 from bitymi_ns.bake.errors import listed_errors
 from bitymi_ns.bake.footprint import closest_pixels
-from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.options import STEPS
 from bitymi_ns.bake.pages import listed_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.plan import Shown
 from bitymi_ns.bake.statistics import MARKS, Certificate
-from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 
@@ -33,14 +31,13 @@ _CHUNK = 1 << 20
 
 
 @torch.no_grad()
-def certified(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_progress) -> Baked:
+def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
     """The bake with the certificate of what is stored of its texels; as it is where it has one, against the field, or
     where there are no texels or no tolerance.
 
     Args:
         baked: encoded, on the CPU.
         cameras: training views.
-        progress: called on the way.
     """
     scene, options = baked.scene, baked.options
     if baked.texels is None or baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:
@@ -49,10 +46,8 @@ def certified(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_p
     before = baked.uncoded
     if before is None:
         before = listed_texels(baked.texels, baked.packing, baked.mean_residual)
-    inputs = BakeInput(scene.surfels, cameras, scene.near, scene.weight_bound, scene.through_pixel)
-    inputs = inputs.looked_at(options, progress)
     pixels = closest_pixels(scene.surfels, cameras, options.extent, scene.near) if cameras else None
-    opacity, beta = kernel_parameters(scene.surfels, inputs.transmittance)
+    opacity, beta = kernel_parameters(scene.surfels, baked.in_front)
     shown = Shown(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
     errors, seen = listed_errors(stored - before, torch.from_numpy(baked.packing.tiles[:, 3:]), shown)
     certificate = Certificate.of(errors[seen], options.tolerance, "texels").but(

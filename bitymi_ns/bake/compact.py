@@ -152,7 +152,8 @@ class Coder:
         kept = Codes(
             codes, None, residual_codes(residual), RESIDUAL_STEP, baked.options.page_width, baked.options.page_rows
         )
-        rounded = replace(baked, rows=baked.rows[order], codes=kept).with_surfels(codes.surfels())
+        in_front = None if baked.in_front is None else baked.in_front[order]
+        rounded = replace(baked, rows=baked.rows[order], codes=kept, in_front=in_front).with_surfels(codes.surfels())
         rounded = rounded.with_tiles(Tiles(packing, pages, codes.extent(baked.options.extent), residual))
         coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * price / PER_BIT))))
         size, shown = kept.surfels.nbytes(), rounded

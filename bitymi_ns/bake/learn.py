@@ -102,4 +102,4 @@ def bake_and_learn(
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
     if baked.codes is not None and baked.codes.texels is None:
         baked = with_coded_texels(baked, coding)
-    return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras], progress)
+    return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras])

@@ -50,6 +50,7 @@ class Baked:
         atlas: the encoded atlas, None without texture.
         options: what it was baked with.
         uncoded: [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`.
+        in_front: [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1.
         codes: the integers that the surfels, and once they are coded the texels, stand for; None = they are stored as
             they are.
         statistics: what was left out, what it cost, and the error of the quantisation.
@@ -64,6 +65,7 @@ class Baked:
     statistics: Statistics = field(default_factory=Statistics)
     codes: Codes | None = None
     uncoded: Tensor | None = None
+    in_front: Tensor | None = None
 
     def with_statistics(self, **changes: Any) -> Baked:
         """The same bake with other statistics."""
@@ -131,7 +133,8 @@ class Baked:
         texels = None
         if self.texels is not None and packing.texels:
             texels = moved_texels(self.texels, torch.from_numpy(self.packing.tiles)[kept], packing)
-        some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept])
+        in_front = None if self.in_front is None else self.in_front[kept]
+        some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept], in_front=in_front)
         return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.mean_residual[kept]))
 
     def with_texels(self, texels: Tensor) -> Baked:
@@ -231,7 +234,8 @@ def bake(
         photographed=photographed(inputs),
     )
     statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
-    return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics)
+    in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
+    return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics, in_front=in_front)
 
 
 @torch.no_grad()
@@ -264,7 +268,7 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     result = baked.only(kept)
     if options.tolerance > 0 and result.texels is not None:
         result = result.with_tiles(reduced_tiles(result.tiles, inputs, options, progress))
-    result = result.with_surfels(lean)
+    result = replace(result.with_surfels(lean), in_front=inputs.transmittance)
     result = replace(result, scene=replace(result.scene, photographed=photographed(inputs)))
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None

@@ -84,7 +84,7 @@ def test_up_is_y_in_the_file(up: tuple, tmp_path: Path) -> None:
     assert torch.allclose(torch.cdist(found[0], found[0]), torch.cdist(corners[0], corners[0]), atol=1e-5)
 
 
-def square(z: float, half: float, rgb: tuple[int, int, int], index: int) -> tuple[torch.Tensor, torch.Tensor]:
+def square(z: float, half: float, rgb: tuple[int, int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     ring = torch.tensor([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
     page = torch.full((4, 4, 4), 255, dtype=torch.uint8)
     page[..., :3] = torch.tensor(rgb, dtype=torch.uint8)
@@ -93,7 +93,7 @@ def square(z: float, half: float, rgb: tuple[int, int, int], index: int) -> tupl
 
 def two_squares() -> Quads:
     """A red one before a larger green one, each with a page of its own; the first column of the red one is a hole."""
-    (near, red), (far, green) = square(-1.0, 1.0, (200, 0, 0), 0), square(1.0, 3.0, (0, 100, 0), 1)
+    (near, red), (far, green) = square(-1.0, 1.0, (200, 0, 0)), square(1.0, 3.0, (0, 100, 0))
     red[:, 0, 3] = 0
     inset = torch.tensor([[0.125, 0.125], [0.875, 0.125], [0.875, 0.875], [0.125, 0.875]])
     return Quads(torch.stack([near, far]), inset.expand(2, 4, 2), torch.tensor([0, 1]), torch.stack([red, green]))

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.interchange import splat
 from bitymi_ns.interchange.gaussians import Gaussians
 from bitymi_ns.interchange.splat import draw_gaussians
 from bitymi_ns.ops.reference.view_color import sh_basis
@@ -65,17 +66,12 @@ def test_pictures_are_those_of_the_formulas(camera) -> None:
     assert difference.max() < 0.03 and np.median(difference) < 1e-5
 
 
-def test_many_gaussians_in_a_pixel_are_blended_as_few(camera) -> None:
+def test_many_gaussians_in_a_pixel_are_blended_as_few(camera, monkeypatch) -> None:
     """More than are blended at once."""
     gs, view = gaussians(1200), camera(4.0, 20, 18)
     at_once = draw_gaussians(gs, view)
-    from bitymi_ns.interchange import splat
-
-    before, splat._AT_ONCE = splat._AT_ONCE, 7
-    try:
-        assert torch.allclose(draw_gaussians(gs, view), at_once, atol=2e-5)
-    finally:
-        splat._AT_ONCE = before
+    monkeypatch.setattr(splat, "_AT_ONCE", 7)
+    assert torch.allclose(draw_gaussians(gs, view), at_once, atol=2e-5)
 
 
 def test_nothing_shows_the_background(camera) -> None:

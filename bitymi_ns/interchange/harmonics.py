@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import entry_of
 
 TERMS = 16
 """Harmonics up to degree 3, that of degree 0 included."""
@@ -65,7 +66,8 @@ def _of_kernel(directions: Tensor) -> Tensor:
     for term in range(TERMS):
         coefficients = directions.new_zeros(count, TERMS, 3)
         coefficients[:, term, 0] = 1.0
-        parameters = {"sh_dc": coefficients[:, 0].contiguous(), "sh_rest": coefficients[:, 1:].contiguous()}
+        parts = coefficients[:, 0].contiguous(), coefficients[:, 1:].contiguous()
+        parameters = dict(zip(entry_of("sh").names, parts, strict=True))
         columns.append(view_color("sh", parameters, directions, directions.new_zeros(3))[:, 0])
     return torch.stack(columns, dim=1)
 

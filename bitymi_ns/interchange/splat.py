@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.interchange.gaussians import Gaussians
-from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, TRANSMITTANCE_MIN
+from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, TILE, TRANSMITTANCE_MIN
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.rotations import tangents
 
@@ -22,7 +22,6 @@ REACH = 3.0
 """A footprint ends at so many standard deviations along its longer axis."""
 BEYOND = 1.3
 """Means farther out than this many half images are linearised as if they lay there."""
-TILE = 16
 _AT_ONCE = 512
 
 

@@ -29,6 +29,10 @@ FEWEST_VIEWS = 32
 """That are looked through for the tiles, however short the run."""
 SMALLEST = 4
 """Side of the smallest tile, texels: a block of BC7."""
+LEAST_SHARE = 0.25
+"""What a texel counts as seen by, at least, where not all views are looked through: this share of what one view can
+show of it. So no step is much longer than four times the rate. With all of it, texels that others hide learn too
+slowly."""
 
 
 class LearningTexels:
@@ -84,9 +88,38 @@ def blank_texels(scene: Scene, views: Sequence[View], count: int, options: Texel
     seen = visibility(surfels, cameras, scene.near, bound, scene.config.through_pixel)
     size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options)
     field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
-    share = 1.0 / (coverage(scene, field, views) * (count / max(1, len(views))) + options.prior)
-    field.share.copy_(share)
+    seen_in_all = coverage(scene, field, views) * (count / max(1, len(views)))
+    if len(views) < count:
+        least = LEAST_SHARE * in_one_view(surfels, cameras, size, extent, scene.near)
+        seen_in_all = torch.maximum(seen_in_all, least)
+    field.share.copy_(1.0 / (seen_in_all + options.prior))
     return field
+
+
+def in_one_view(
+    surfels: Mapping[str, Tensor], cameras: Sequence[Camera], size: Tensor, extent: Tensor, near: float
+) -> Tensor:
+    """About as much as a view can show of every texel, pixels [T]: its area in the view that is nearest to it, whether
+    or not that shows it, times the surfel's opacity.
+
+    Not all views are looked through. One that is not may show what all others hide: by what was counted, its texels
+    would take steps a hundred times too long, and run away.
+
+    Args:
+        surfels: of N rows.
+        cameras: the views that are looked through; the others are about as near.
+        size: [N, 2] of the tiles.
+        extent: [N] half sides of the tiles in scale units.
+        near: nearest drawn depth.
+    """
+    area = tile_pixels(surfels, cameras, extent, near).prod(1) / size.prod(1)
+    return (area * surfels["opacity_logits"].sigmoid()).repeat_interleave(size.long().prod(1))
+
+
+def tile_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: Tensor, near: float) -> Tensor:
+    """Sides of the tiles of half sides `extent` in the view that shows them largest: pixels [N, 2]."""
+    scales, axes = surfels["log_scales"].exp(), tangents(surfels["quats"])
+    return max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near)[0] * (extent / SUPPORT)[:, None]
 
 
 def tiles_as_seen(
@@ -111,11 +144,8 @@ def tiles_as_seen(
     Returns:
         sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 where no fragment reaches the bound.
     """
-    scales = surfels["log_scales"].exp()
     extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
-    axes = tangents(surfels["quats"])
-    pixels = max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near)[0]
-    size = seen_sides(pixels * (extent / SUPPORT)[:, None], SMALLEST, options.largest)
+    size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
     size = coarsened(size, seen.pixels / options.pixels_per_texel, SMALLEST)
     size[extent <= 0] = 1
     return size, torch.where(extent > 0, extent, torch.full_like(extent, SUPPORT))

@@ -14,7 +14,7 @@ from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.texels import blank_texels, coverage, tiles_as_seen
+from bitymi_ns.train.texels import LEAST_SHARE, blank_texels, coverage, in_one_view, tiles_as_seen
 
 OPTIONS = TexelConfig(start=18_000, pixels_per_texel=0.5)
 
@@ -79,7 +79,9 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
     found = coverage(scene, field, views)
     assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
     half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views stand for all
-    assert torch.allclose(half.share, 1 / (2 * found + OPTIONS.prior))
+    cameras = [view.camera for view in views]
+    least = LEAST_SHARE * in_one_view(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
+    assert torch.allclose(half.share, 1 / (torch.maximum(2 * found, least) + OPTIONS.prior))
     with torch.no_grad():
         scene.surfels["sv_rgb"].fill_(0.2)  # no colour is cut off
     scene.field, total = field, 0.0
@@ -89,6 +91,17 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
     total.backward()
     torch.testing.assert_close(found, field.texels.grad[:, 0], rtol=1e-4, atol=1e-4)
     assert (found > 0).any()
+
+
+def test_views_that_were_not_looked_through_move_no_texel_far(textured, views) -> None:
+    scene, far = textured(), 0.0
+    field = blank_texels(scene, views[:1], len(views), OPTIONS)
+    counted = coverage(scene, field, views[:1]) * len(views)
+    for view in views[1:]:
+        seen = coverage(scene, field, [view])
+        far = max(far, float((seen / (counted + OPTIONS.prior)).max()))
+        assert float((seen * field.share).max()) < 1.5 / LEAST_SHARE  # times the rate
+    assert far > 1.5 / LEAST_SHARE
 
 
 def test_a_run_with_texels_is_better_than_one_without(textured, make_scene, views) -> None:

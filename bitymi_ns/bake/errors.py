@@ -15,6 +15,7 @@ from bitymi_ns.bake.plan import Field, Plan, Shown
 from bitymi_ns.bake.reference import references, weights
 from bitymi_ns.bake.resample import read_at
 from bitymi_ns.bake.statistics import Certificate, Percentiles, TileError
+from bitymi_ns.ops import TexelTiles
 from bitymi_ns.progress import Progress, no_progress
 
 _CONSTANT = (8, 8)
@@ -49,8 +50,8 @@ def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 
         bool, whether any fragment of the surfel gets a residual.
     """
     errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
-    area = sizes.long().clamp(min=1).prod(dim=1)
-    first, bare = area.cumsum(0) - area, torch.nonzero(sizes[:, 0] == 0).squeeze(1)
+    first = TexelTiles.of_sizes(sizes.clamp(min=1), shown.extent).first
+    bare = torch.nonzero(sizes[:, 0] == 0).squeeze(1)
     classes = size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1))
     for r_u, r_v, members in [*classes, (*_CONSTANT, bare)]:
         for rows in members.split(max(1, chunk // (r_u * r_v))):

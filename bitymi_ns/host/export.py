@@ -74,8 +74,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
     overwrite: bool = False
     """Replace a bundle that is there already."""
     format: BundleFormat | None = None  # type: ignore[assignment]  # of the bundle; that of the bake is `_options`
-    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a quarter to a
-    third of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
+    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a sixth to a
+    half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
     and 8 bytes. Not given: compact, or bc7 where everything is kept (--exact, --tolerance 0)."""
     exact: bool = False
     """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all

@@ -12,9 +12,9 @@ from torch import Tensor
 from bitymi_ns.bundle import ply
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.interchange.frame import Similarity
-from bitymi_ns.interchange.looks import betas
 from bitymi_ns.ops.constants import ALPHA_MAX, SUPPORT
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 FLAT_LOG_SCALE = -16.0
 """Third scale of the Gaussians in the scene's frame, whose cameras lie within a unit of the origin."""
@@ -72,7 +72,7 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
     radius R the mean of u^2 is R^2 / (2 (beta + 2)).
     """
     surfels = scene.surfels
-    variance = SUPPORT**2 / (2.0 * (betas(surfels).double() + 2.0))
+    variance = SUPPORT**2 / (2.0 * (kernel_parameters(surfels)[1].double() + 2.0))
     tangent = surfels["log_scales"].double() + 0.5 * variance.log()[:, None]
     flat = tangent.new_full((len(tangent), 1), FLAT_LOG_SCALE)
     opacity = torch.sigmoid(surfels["opacity_logits"].double()).clamp(max=ALPHA_MAX)

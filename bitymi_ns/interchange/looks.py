@@ -13,9 +13,10 @@ from bitymi_ns.bake.lean_color import shown_at
 from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.bake.texels import texel_centres
 from bitymi_ns.interchange import harmonics
-from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS, SUPPORT
+from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 OUTSIDE, OUTSIDE_WEIGHT = 32, 0.1
 """So many directions over the whole sphere count so much together, where the others count 1."""
@@ -93,7 +94,7 @@ def shown_residual(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
     if scene.atlas is None:
         return residual
     extent = means.new_full((len(means),), SUPPORT) if scene.extent is None else scene.extent
-    beta = betas(scene.surfels)
+    beta = kernel_parameters(scene.surfels)[1]
     _, height, width, _ = scene.atlas.shape
     flat = scene.residuals().reshape(-1, 3)
     for r_u, r_v, rows in size_classes(scene.tiles):
@@ -104,8 +105,3 @@ def shown_residual(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
             texels = flat[texel_index(scene.tiles[part], (r_u, r_v), width, height)]
             residual[part] = (texels * weight[..., None]).sum((1, 2)) / weight.sum((1, 2))[:, None]
     return residual
-
-
-def betas(surfels: Mapping[str, Tensor]) -> Tensor:
-    """[N] exponents of the kernels."""
-    return BETA_MAX * torch.sigmoid(surfels["beta_raw"])

@@ -10,10 +10,9 @@ from torch import Tensor
 from bitymi_ns.bake.packing import GRID, pack
 from bitymi_ns.bake.pages import size_classes, texel_index
 from bitymi_ns.interchange.frame import Similarity
-from bitymi_ns.interchange.looks import betas
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.tile_sizes import next_power_of_two
+from bitymi_ns.scene.tile_sizes import kernel_parameters, next_power_of_two
 from bitymi_ns.train.rotations import tangents
 
 MASK = 0.5
@@ -64,7 +63,7 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     surfels = scene.surfels
     opacity = torch.sigmoid(surfels["opacity_logits"].double())
     kept = torch.nonzero(opacity > level).squeeze(1)
-    share = (level / opacity[kept]) ** (1.0 / betas(surfels)[kept].double().clamp(min=1e-6))
+    share = (level / opacity[kept]) ** (1.0 / kernel_parameters(surfels)[1][kept].double().clamp(min=1e-6))
     radius = (SUPPORT * (1.0 - share).clamp(min=1e-12).sqrt()).float()
     extent = torch.full_like(radius, SUPPORT) if scene.extent is None else scene.extent[kept]
     size = _sizes(scene.tiles[kept, 3:], radius / extent)

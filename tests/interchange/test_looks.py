@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from bitymi_ns.bundle import Bundle
-from bitymi_ns.interchange.looks import betas, fit_looks, rows_of, shown_residual, weighted_fit
+from bitymi_ns.interchange.looks import fit_looks, rows_of, shown_residual, weighted_fit
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.reference.view_color import sh_basis
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 
 def baked(params: dict, kind: str, **more) -> BakedScene:
@@ -60,7 +61,7 @@ def test_the_fit_follows_the_colour_where_cameras_look_from(surfels, residual: f
 def test_the_residual_is_the_mean_over_the_disc(bundle: Bundle) -> None:
     scene = bundle.scene
     found = shown_residual(scene)
-    atlas, beta = scene.residuals().double(), betas(scene.surfels).double()
+    atlas, beta = scene.residuals().double(), kernel_parameters(scene.surfels)[1].double()
     for i, (x, y, layer, r_u, r_v) in enumerate(scene.tiles.tolist()):
         u, v = ((torch.arange(r) + 0.5) / r * 2 * scene.extent[i] - scene.extent[i] for r in (r_u, r_v))
         rest = (1 - (u[None] ** 2 + v[:, None] ** 2) / 9).clamp(min=0).double()

@@ -9,10 +9,10 @@ import trimesh
 from bitymi_ns.bundle import Bundle
 from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest
 from bitymi_ns.interchange.glb import glb_bytes, read_glb
-from bitymi_ns.interchange.looks import betas
 from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.rotations import tangents
 
 LEVEL = 0.15
@@ -26,7 +26,7 @@ def color() -> torch.Tensor:
 def test_quads_hold_the_disc_and_what_the_tile_shows(bundle: Bundle, color: torch.Tensor) -> None:
     scene = bundle.scene
     quads = quads_of(scene, color, LEVEL)
-    opacity, beta = torch.sigmoid(scene.surfels["opacity_logits"]), betas(scene.surfels)
+    opacity, beta = torch.sigmoid(scene.surfels["opacity_logits"]), kernel_parameters(scene.surfels)[1]
     kept = torch.nonzero(opacity > LEVEL).squeeze(1).tolist()
     assert len(quads) == len(kept) > 3
     axes = tangents(scene.surfels["quats"]) * scene.surfels["log_scales"].exp()[:, None]

@@ -5,7 +5,7 @@
 wheels of what the core packages need beside torch and numpy; nothing is compiled or fetched there. On the machine,
 `card.py run ORDER... --stage FOLDER --output RESULTS` unpacks them beside a copy of this checkout and runs the orders:
 each step is a process with a limit of its own, its output is appended to RESULTS/log.txt, and a step that fails is a
-line of the summary.
+line of the summary. Orders that are joined by a plus sign (check+variants) run at the same time: for what is not timed.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 CARRIED = ("bitymi_ns", "benchmarks", "tests", "method_configs", "pyproject.toml", "csrc", "docs", "README.md")
 NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
+NEEDED += ("zstandard", "wgpu", "cffi", "pycparser", "rendercanvas")
 """Wheels that machines with torch and the usual scientific packages lack."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 
@@ -55,7 +56,8 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """What can be run: name -> steps. `fox` and `textures` need that capture in `data`; `train` takes every other one.
+    """What can be run: name -> steps. `fox` and `textures` need that capture in `data`; `train`, `variants` and `peers`
+    take every other one; `peers` and `webgpu` draw the bundles that orders before them left.
 
     Args:
         results: folder of the tables.
@@ -64,6 +66,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         steps: of the runs of `train`; None = the preset's.
     """
     length = [] if steps is None else ["--steps", str(steps)]
+    others = [name for name in captures(data) if name != "fox"]
     tests = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", "--timeout=90", "tests/cuda"]
     bundles = results / "bundles"
     baked = ("--surfels", "150000", "--runs", "100", "--no-check", "--sections", "baked")
@@ -109,9 +112,9 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
                 "textures",
                 [
                     python("gpu_train.py", str(data / "fox"), "--presets", "bitymi", "--textures", "hash", "texels")
-                    + [*length, "--output", str(results / "textures.md")]
+                    + ["--keep", str(bundles), "--steps", "3000", "--output", str(results / "textures.md")]
                 ],
-                600,
+                200,
             ),
         ],
         "profile": [
@@ -132,10 +135,70 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
                 ],
                 600,
             )
-            for name in sorted(file.parent.name for file in data.glob("*/transforms.json"))
-            if name != "fox"
+            for name in others
+        ],
+        "variants": [
+            Step(
+                f"variants of {name}",
+                [
+                    python("gpu_train.py", str(data / name), "--presets", "bitymi", "--textures", texture)
+                    + ["--downscale", "2", *options, *length]
+                    + ["--output", str(results / f"{name}-{i}.md")]
+                    for i, (texture, options) in enumerate(VARIANTS)
+                ],
+                450,
+            )
+            for name in others
+        ],
+        "peers": [
+            Step(
+                f"peers on {name}",
+                [
+                    python("gpu_peers.py", str(data / name), "--bundles", *map(str, sorted(bundles.glob(f"{name}/*"))))
+                    + ["--output", str(results / f"{name}-peers.md")]
+                ],
+                400,
+            )
+            for name in others
+        ],
+        "webgpu": [
+            Step(
+                "webgpu tests",
+                [[sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "--timeout=60", "tests/ops/webgpu"]],
+                60,
+            ),
+            Step(
+                "webgpu",
+                [
+                    python("gpu_webgpu.py", *map(str, sorted(bundles.glob("bitymi*"))))
+                    + ["--output", str(results / "webgpu.md")]
+                ],
+                90,
+            ),
         ],
     }
+
+
+VARIANTS = (
+    ("hash", ()),
+    ("texels", ()),
+    ("hash", ("--options", "train.exposure=auto")),
+    ("texels", ("--options", "train.exposure=auto")),
+    ("none", ("--options", "train.exposure=auto")),
+    ("texels", ("--options", "train.exposure=auto", "train.loss.falloff_weight=0")),
+)
+"""Textures and options that are compared on a capture at half its size."""
+
+
+def captures(data: Path) -> list[str]:
+    """Names of the captures in a folder."""
+    return sorted(file.parent.name for file in data.glob("*/transforms.json"))
+
+
+def together(steps: Sequence[Step]) -> Step:
+    """The commands of several steps at the same time."""
+    commands = [command for step in steps for command in step.commands]
+    return Step(" + ".join(step.name for step in steps), commands, max(step.limit for step in steps))
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
@@ -200,6 +263,8 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], log: Path, dea
         for i, command in enumerate(step.commands):
             output = open(Path(folder) / str(i), "w+")  # noqa: SIM115
             environment_of = {**environment, "TMPDIR": folder}
+            if len(step.commands) > 1:
+                environment_of["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
             try:
                 process = subprocess.Popen(
                     command, cwd=tree, env=environment_of, stdout=output, stderr=output, start_new_session=True
@@ -239,7 +304,8 @@ def main() -> int:
     )
     staging.add_argument("--build", type=Path, help="build folder that is kept")
     running = commands.add_parser("run", help="run orders on the machine")
-    running.add_argument("orders", nargs="+", choices=list(orders(Path(), Path())))
+    names = list(orders(Path(), Path()))
+    running.add_argument("orders", nargs="+", metavar="ORDER", help=f"{', '.join(names)}; A+B: at the same time")
     running.add_argument("--stage", type=Path, required=True, help="folder of wheels")
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
@@ -249,6 +315,9 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.command == "stage":
         return stage(arguments)
+    for name in (part for order in arguments.orders for part in order.split("+")):
+        if name not in names:
+            parser.error(f"no order {name}: there are {', '.join(names)}")
     deadline = time.monotonic() + arguments.seconds
     results = arguments.output.resolve()
     results.mkdir(parents=True, exist_ok=True)
@@ -256,8 +325,10 @@ def main() -> int:
     lines = ["| step | exit status | s |", "|---|---|---:|"]
     with tempfile.TemporaryDirectory() as work:
         environment = unpack(arguments.stage.resolve(), Path(work))
-        for name in arguments.orders:
-            for step in orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)[name]:
+        for order in arguments.orders:
+            known = orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)
+            steps = [step for name in order.split("+") for step in known[name]]
+            for step in steps if "+" not in order else [together(steps)]:
                 lines.append(run_step(step, Path(work) / "tree", environment, log, deadline))
                 print(lines[-1], flush=True)
                 (results / "summary.md").write_text("\n".join(lines) + "\n")

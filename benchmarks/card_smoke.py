@@ -10,12 +10,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import torch
-from gpu_baked import textured
+from gpu_baked import around, textured
 from gpu_common import deterministic, photo_loss, trained_like, training_step, with_texels
 
 from bitymi_ns import ops
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 
 
@@ -24,6 +27,14 @@ def baked(n: int, width: int, height: int, device: torch.device) -> Callable[[],
     scene, camera = textured(n, width, height, device)
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
+    return renderer.run
+
+
+def bundled(folder: Path, width: int, height: int, device: torch.device) -> Callable[[], object]:
+    """A frame of a bundle."""
+    bundle = read_bundle(folder, decode=False)
+    renderer = BakedRenderer(bundle.scene.to(device), width, height, images=("packed",))
+    renderer.draw([around(bundle, width, height)[0]])
     return renderer.run
 
 
@@ -63,14 +74,17 @@ def main() -> int:
     )
     parser.add_argument("--surfels", type=int, default=300)
     parser.add_argument("--size", default="96x64", metavar="WxH", help="image size (%(default)s)")
-    parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
+    parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
+    parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="draw these as well")
     parser.add_argument("--profile", action="store_true", help="warm up, then mark one run")
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
     arguments = parser.parse_args()
     width, height = (int(part) for part in arguments.size.split("x"))
     device = torch.device("cuda")
-    for name in arguments.sections:
-        run = SECTIONS[name](arguments.surfels, width, height, device)
+    made = {name: partial(SECTIONS[name], arguments.surfels) for name in arguments.sections}
+    made |= {folder.name: partial(bundled, folder) for folder in arguments.bundles}
+    for name, make in made.items():
+        run = make(width, height, device)
         if not arguments.profile and not arguments.times:
             run()
             torch.cuda.synchronize()

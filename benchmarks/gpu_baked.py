@@ -89,7 +89,7 @@ def _synthetic(n: int, width: int, height: int, options: Options, rate: float) -
 def _bundle(folder: Path, width: int, height: int, options: Options, rate: float) -> tuple[list[str], float]:
     bundle = read_bundle(folder, decode=options.device.type != "cuda")
     scene = bundle.scene.to(options.device)
-    return _row(f"{Path(folder).name}, {len(bundle):,}", scene, _around(bundle, width, height), options, rate)
+    return _row(f"{Path(folder).name}, {len(bundle):,}", scene, around(bundle, width, height), options, rate)
 
 
 def textured(n: int, width: int, height: int, device: torch.device) -> tuple[BakedScene, Camera]:
@@ -162,7 +162,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
     return row, mean["packed"]
 
 
-def _around(bundle, width: int, height: int) -> list[Camera]:
+def around(bundle, width: int, height: int) -> list[Camera]:
     """Three cameras around the middle of a bundle, which training places in the ball of the cameras, of radius 1."""
     middle = bundle.scene.surfels["means"].median(dim=0).values
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])

@@ -14,11 +14,13 @@ import tempfile
 import time
 import traceback
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from common import number, page, publish, say, table
 from gpu_common import Options, milliseconds
 from plain_capture import Capture, load_capture
@@ -26,6 +28,7 @@ from plain_capture import Capture, load_capture
 from bitymi_ns import bundle
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
 from bitymi_ns.host.preset import Preset, load_preset
+from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene
@@ -33,6 +36,22 @@ from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.views import judging_background
+
+
+class Stages:
+    """Progress that adds up the seconds before each report, by what was reported."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        now = time.perf_counter()
+        self._seconds[step] = self._seconds.get(step, 0.0) + now - self._last
+        self._last = now
+
+    def __str__(self) -> str:
+        return ", ".join(f"{step} {seconds:.1f}" for step, seconds in self._seconds.items())
 
 
 @dataclass
@@ -43,6 +62,7 @@ class Point:
     seconds: float
     surfels: int
     psnr: float
+    cc_psnr: float
 
 
 @dataclass
@@ -87,6 +107,30 @@ def new_scene(capture: Capture, preset: Preset) -> Scene:
     return scene
 
 
+def chosen(name: str, texture: str | None, options: Sequence[str]) -> tuple[str, Preset]:
+    """A preset with another texture and other options, each `group.name=value` of the preset's file; and what to call
+    it.
+
+    Raises:
+        PresetError: there is no such option.
+    """
+    changes = [*options, *([] if texture is None else [f"scene.texture={texture}"])]
+    values: dict[str, Any] = {}
+    for change in changes:
+        keys, _, value = change.partition("=")
+        group = values
+        *above, last = keys.split(".")
+        for key in above:
+            group = group.setdefault(key, {})
+        group[last] = yaml.safe_load(value)
+    label = "-".join([name, *(change.rpartition(".")[2].replace("=", "-") for change in changes)])
+    with tempfile.TemporaryDirectory() as folder:
+        for file in preset_dir().glob("*.yaml"):
+            (Path(folder) / file.name).write_text(file.read_text("utf8"), "utf8")
+        (Path(folder) / "changed.yaml").write_text(yaml.safe_dump({"base": name, **values}), "utf8")
+        return label, load_preset("changed", Path(folder))
+
+
 def waits_of(trainer: Trainer, steps: int) -> float:
     """Mean number of times that the host waits for the card in a step, over the next steps."""
     torch.cuda.set_sync_debug_mode("warn")
@@ -102,7 +146,7 @@ def waits_of(trainer: Trainer, steps: int) -> float:
 
 def run(
     name: str,
-    texture: str | None,
+    preset: Preset,
     capture: Capture,
     steps: int,
     points: int,
@@ -110,11 +154,7 @@ def run(
     options: Options,
     keep: Path | None,
 ) -> Result:
-    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given. A texture takes the place of
-    the preset's."""
-    preset = load_preset(name)
-    if texture is not None:
-        preset, name = replace(preset, scene=replace(preset.scene, texture=texture)), f"{name}-{texture}"
+    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given."""
     scene = new_scene(capture, preset).to(device)
     trainer = Trainer(scene, capture.train, preset.train, steps)
     due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
@@ -135,10 +175,11 @@ def run(
         if trainer.step in due:
             trainer.training.watch.finish(scene)
             quality = evaluate(scene, capture.held_out, preset.train)
-            curve.append(Point(trainer.step, seconds, len(scene), quality.psnr))
+            curve.append(Point(trainer.step, seconds, len(scene), quality.psnr, quality.cc_psnr))
             say(
-                f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {quality.psnr:.2f} dB, "
-                f"{len(scene):,} surfels, {quality.fragments / pixels:.1f} fragments per pixel"
+                f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {quality.psnr:.2f} dB "
+                f"({quality.cc_psnr:.2f} after the affine fit), {len(scene):,} surfels, "
+                f"{quality.fragments / pixels:.1f} fragments per pixel"
             )
     peak = torch.cuda.max_memory_allocated(device) if cuda else 0
     camera = capture.held_out[0].camera.to(device)
@@ -147,8 +188,10 @@ def run(
     start = time.perf_counter()
     background = judging_background(preset.train.background, torch.device("cpu"))
     cameras = [view.camera for view in capture.train]
-    made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning())  # nothing learns
+    stages = Stages()
+    made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning(), stages)  # nothing learns
     bake_seconds = time.perf_counter() - start
+    say(f"{name}: bake, seconds by what was reported at the end of them: {stages}")
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder if keep is None else keep) / f"{name}-{steps}"
         bundle.export(made, target)
@@ -179,6 +222,7 @@ def report(results: list[Result], capture: Capture) -> str:
             r.preset,
             number(r.curve[-1].seconds, 1),
             number(r.curve[-1].psnr, 2),
+            number(r.curve[-1].cc_psnr, 2),
             number(r.curve[-1].surfels, 0),
             number(r.peak / 1e6, 0),
             number(r.waits, 1),
@@ -190,15 +234,19 @@ def report(results: list[Result], capture: Capture) -> str:
         ]
         for r in results
     ]
-    header = ("preset", "training s", "PSNR dB", "surfels", "peak MB", "waits a step", "frames/s")
+    header = ("preset", "training s", "PSNR dB", "after affine fit", "surfels", "peak MB", "waits a step", "frames/s")
     header += ("bake s", "atlas MB", "baked PSNR dB", "baked frames/s")
     text = (
         f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n\n"
     )
     text += table(header, rows)
     for r in results:
-        curve = [[number(p.step, 0), number(p.seconds, 1), number(p.surfels, 0), number(p.psnr, 2)] for p in r.curve]
-        text += f"\n\n#### {r.preset}\n\n" + table(("step", "seconds", "surfels", "PSNR dB"), curve)
+        curve = [
+            [number(p.step, 0), number(p.seconds, 1), number(p.surfels, 0), number(p.psnr, 2), number(p.cc_psnr, 2)]
+            for p in r.curve
+        ]
+        header = ("step", "seconds", "surfels", "PSNR dB", "after affine fit")
+        text += f"\n\n#### {r.preset}\n\n" + table(header, curve)
     return text
 
 
@@ -213,6 +261,9 @@ def main() -> int:
     )
     parser.add_argument(
         "--textures", nargs="+", choices=("hash", "texels", "none"), help="each of them in place of a preset's own"
+    )
+    parser.add_argument(
+        "--options", nargs="+", default=[], metavar="KEY=VALUE", help="of the presets' files: train.exposure=auto"
     )
     parser.add_argument("--steps", type=int, help="length of a run; default: the preset's on a GPU")
     parser.add_argument("--points", type=int, default=10, help="evaluations over a run (%(default)s)")
@@ -235,16 +286,17 @@ def main() -> int:
     notes = [f"Device: {what}.", f"Frames: median of about {arguments.runs} after {arguments.warm_up}."]
     results, failed = [], False
     runs = [(name, texture) for name in arguments.presets for texture in arguments.textures or (None,)]
-    for name, texture in runs:
-        steps = arguments.steps or load_preset(name).trainer.iterations
+    for preset_name, texture in runs:
+        name, preset = chosen(preset_name, texture, arguments.options)
+        steps = arguments.steps or preset.trainer.iterations
         points = min(arguments.points, steps)
         try:
-            results.append(run(name, texture, capture, steps, points, device, options, arguments.keep))
+            results.append(run(name, preset, capture, steps, points, device, options, arguments.keep))
         except (RuntimeError, ValueError, OSError) as error:
             traceback.print_exc()
-            notes.append(f"{name} {texture or ''} failed: {' '.join(str(error).split())[:400]}")
+            notes.append(f"{name} failed: {' '.join(str(error).split())[:400]}")
             failed = True
-        last = (name, texture) == runs[-1]
+        last = (preset_name, texture) == runs[-1]
         text = page(f"Training on a card: {arguments.data.name}", report(results, capture), notes)
         publish(text, arguments.output, silent=not last)
     return int(failed)

@@ -256,14 +256,8 @@ class SceneOnDevice:
         Returns:
             [H, W, 4]: the sums, and what is left of the transmittance.
         """
-        target = self._target_of(camera.width, camera.height)
-        if photo_pixel < 1.0 and self._coarser is None:
-            self._make_coarser()
-        self._set_frame(camera, show, layers, photo_pixel)
-        self._device.queue.write_buffer(self._visible, 0, bytes(4))
+        target = self.begin(camera, show, layers, photo_pixel)
         encoder = self._device.create_command_encoder()
-        self._encode_sorting(encoder)
-        self._encode_drawing(encoder, target, show, layers)
         sums, _ = target.sums
         encoder.copy_texture_to_buffer(
             {"texture": sums},
@@ -272,6 +266,20 @@ class SceneOnDevice:
         )
         self._device.queue.submit([encoder.finish()])
         return self._read(target)
+
+    def begin(self, camera: Camera, show: str, layers: int, photo_pixel: float = 1.0) -> _Target:
+        """Queues the drawing of a view, with the arguments of `draw`, and does not wait for it: what it draws stays on
+        the device."""
+        target = self._target_of(camera.width, camera.height)
+        if photo_pixel < 1.0 and self._coarser is None:
+            self._make_coarser()
+        self._set_frame(camera, show, layers, photo_pixel)
+        self._device.queue.write_buffer(self._visible, 0, bytes(4))
+        encoder = self._device.create_command_encoder()
+        self._encode_sorting(encoder)
+        self._encode_drawing(encoder, target, show, layers)
+        self._device.queue.submit([encoder.finish()])
+        return target
 
     def _encode_sorting(self, encoder: Any) -> None:
         p, work = self._programs, encoder.begin_compute_pass()

@@ -1,0 +1,326 @@
+#!/usr/bin/env python
+"""Equal quality on a card: gsplat's Gaussians are trained on the photographs that our bundles were trained on, by its
+MCMC strategy with several numbers of Gaussians, and both are drawn at the held-out cameras: PSNR beside ms per frame.
+
+Our bundles are those that `gpu_train.py --keep` left. The Gaussians get the rates of gsplat's own example (positions
+1.6e-4 times the extent of the cameras, falling to a hundredth; scales 5e-3, opacities 5e-2, rotations 1e-3, colours
+2.5e-3 and a twentieth of it), the same points to start from, and losses of 0.8 L1 + 0.2 (1 - SSIM) with the weights
+of 0.01 on opacities and scales that the strategy asks for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from common import number, page, publish, say, table
+from gpu_common import Options, milliseconds
+from gpu_gsplat import load
+from plain_capture import Capture, load_capture
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from bitymi_ns.bundle import read_bundle
+from bitymi_ns.ops.ssim import ssim
+from bitymi_ns.scene.baked_renderer import BakedRenderer
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.views import View, training_order
+
+SH0 = 0.28209479177387814  # of the constant harmonic
+RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+
+
+@dataclass
+class Row:
+    """One way to draw one scene.
+
+    Attributes:
+        name: of the renderer.
+        count: primitives.
+        seconds: of training; None = not trained here.
+        quality: psnr, psnr after the affine fit of each view, ssim; means over the held-out views.
+        frames: factor of the photographs' size -> mean ms per frame over some held-out cameras.
+    """
+
+    name: str
+    count: int
+    seconds: float | None
+    quality: tuple[float, float, float]
+    frames: dict[int, float]
+
+
+def larger(camera: Camera, times: int) -> Camera:
+    """The camera with so many times the pixels along each side."""
+    K = camera.K.clone()
+    K[:2] *= times
+    return Camera(camera.viewmat, K, times * camera.width, times * camera.height)
+
+
+def quality(draw: Callable[[Camera], Tensor], views: Sequence[View], device: torch.device) -> tuple[float, ...]:
+    """Means over the views: psnr, psnr after the affine fit, ssim."""
+    values = []
+    for view in (view.to(device) for view in views):
+        rgb, target = draw(view.camera).float().clamp(0, 1), view.target(None, device)
+        values.append((psnr(rgb, target, view.mask), cc_psnr(rgb, target, view.mask), float(ssim(rgb, target))))
+    return tuple(fmean(column) for column in zip(*values, strict=True))
+
+
+def timed(make: Callable[[Camera], Callable[[], object]], cameras: Sequence[Camera], options: Options) -> float:
+    """Mean over the cameras of the median milliseconds of what `make` gives for one."""
+    return fmean(milliseconds(make(camera), options) for camera in cameras)
+
+
+class Gaussians:
+    """Trains Gaussians on a capture, by gsplat's MCMC strategy.
+
+    Attributes:
+        parameters: means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3].
+        seconds: of training.
+    """
+
+    def __init__(self, gsplat: Any, capture: Capture, most: int, steps: int, device: torch.device) -> None:
+        """
+        Args:
+            most: Gaussians.
+            steps: of training; the strategy refines in the first 25 of 30 parts.
+        """
+        self._gsplat = gsplat
+        centres = torch.stack([view.camera.center for view in capture.train])
+        extent = 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())
+        self.parameters = torch.nn.ParameterDict(
+            {name: torch.nn.Parameter(value.to(device)) for name, value in self._first(capture, most).items()}
+        )
+        rates = {**RATES, "means": RATES["means"] * extent}
+        optimizers = {
+            name: torch.optim.Adam([{"params": value, "lr": rates[name], "name": name}], eps=1e-15, fused=True)
+            for name, value in self.parameters.items()
+        }
+        strategy = gsplat.MCMCStrategy(
+            cap_max=most, refine_start_iter=min(500, steps // 10), refine_stop_iter=steps * 25 // 30
+        )
+        strategy.check_sanity(self.parameters, optimizers)
+        state = strategy.initialize_state()
+        falling = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / steps))
+        views = [view.to(device) for view in capture.train]
+        torch.cuda.synchronize(device)
+        start = time.perf_counter()
+        for step in range(steps):
+            view = views[training_order(len(views), 0, step)]
+            rgb, information = self._draw(view.camera, min(3, step // max(1, min(1000, steps // 10))))
+            target = view.target(None, device)
+            loss = 0.8 * (rgb - target).abs().mean() + 0.2 * (1 - ssim(rgb, target))
+            loss = loss + 0.01 * torch.sigmoid(self.parameters["opacities"]).mean()
+            loss = loss + 0.01 * torch.exp(self.parameters["scales"]).mean()
+            loss.backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            falling.step()
+            rate = falling.get_last_lr()[0]
+            strategy.step_post_backward(self.parameters, optimizers, state, step, information, lr=rate)
+        torch.cuda.synchronize(device)
+        self.seconds = time.perf_counter() - start
+
+    @staticmethod
+    def _first(capture: Capture, most: int) -> dict[str, Tensor]:
+        from scipy.spatial import cKDTree
+
+        chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
+        points, colours = capture.points[chosen], capture.colours[chosen]
+        distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)
+        size = torch.from_numpy(distances[:, 1:]).float().square().mean(1).sqrt().clamp_min(1e-6)
+        n = len(points)
+        return {
+            "means": points.clone(),
+            "scales": torch.log(0.1 * size)[:, None].repeat(1, 3),
+            "quats": torch.randn(n, 4, generator=torch.Generator().manual_seed(1)),
+            "opacities": torch.logit(torch.full((n,), 0.5)),
+            "sh0": ((colours - 0.5) / SH0)[:, None],
+            "shN": torch.zeros(n, 15, 3),
+        }
+
+    def _draw(self, camera: Camera, degree: int = 3) -> tuple[Tensor, dict]:
+        p = self.parameters
+        rgb, _, information = self._gsplat.rasterization(
+            p["means"],
+            p["quats"],
+            torch.exp(p["scales"]),
+            torch.sigmoid(p["opacities"]),
+            torch.cat([p["sh0"], p["shN"]], 1),
+            camera.viewmat[None],
+            camera.K[None],
+            camera.width,
+            camera.height,
+            sh_degree=degree,
+            packed=False,
+        )
+        return rgb[0], information
+
+    @torch.no_grad()
+    def finished(self) -> dict[str, Tensor]:
+        """means, quats (unit), scales, opacities, sh [N, 16, 3]."""
+        p = self.parameters
+        return {
+            "means": p["means"].detach().contiguous(),
+            "quats": normalize(p["quats"].detach(), dim=-1).contiguous(),
+            "scales": p["scales"].detach().exp().contiguous(),
+            "opacities": torch.sigmoid(p["opacities"].detach()).contiguous(),
+            "sh": torch.cat([p["sh0"], p["shN"]], 1).detach().contiguous(),
+        }
+
+
+def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Callable[[Camera], Callable[[], Tensor]]:
+    """Makes frames by `rasterization`."""
+
+    def make(camera: Camera) -> Callable[[], Tensor]:
+        view = (camera.viewmat[None], camera.K[None], camera.width, camera.height)
+
+        @torch.no_grad()
+        def draw() -> Tensor:
+            return gsplat.rasterization(*g.values(), *view, sh_degree=3, packed=False)[0][0]
+
+        return draw
+
+    return make
+
+
+def inferred(gsplat: Any, g: dict[str, Tensor]) -> Callable[[Camera], Callable[[], Tensor]]:
+    """Makes frames by the inference renderer, of a scene packed to half precision."""
+    from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
+
+    name = f"trained{len(g['means'])}"
+    scene = GaussianInferenceScene.from_gaussian_tensors(*g.values(), sh_degree=3, sh_compression="none", id=name)
+    renderer = GaussianInferenceRenderer(scene)
+
+    def make(camera: Camera) -> Callable[[], Tensor]:
+        view = dict(viewmat=camera.viewmat, K=camera.K, width=camera.width, height=camera.height)
+
+        @torch.inference_mode()
+        def draw() -> Tensor:
+            return renderer.render(**view).frame[0, ..., :3]
+
+        return draw
+
+    return make
+
+
+def row(
+    name: str,
+    count: int,
+    seconds: float | None,
+    make: Callable[[Camera], Callable[[], Tensor]],
+    capture: Capture,
+    cameras: Sequence[Camera],
+    times: Sequence[int],
+    options: Options,
+) -> Row:
+    """Measures one way to draw."""
+    good = quality(lambda camera: make(camera)(), capture.held_out, options.device)
+    frames = {k: timed(make, [larger(camera, k) for camera in cameras], options) for k in times}
+    say(f"{name}, {count:,}: {good[0]:.2f} dB, " + ", ".join(f"{ms:.3f} ms at {k} x" for k, ms in frames.items()))
+    return Row(name, count, seconds, good, frames)
+
+
+def ours(folder: Path, device: torch.device) -> tuple[int, Callable[[Camera], Callable[[], Tensor]]]:
+    """Surfels of a bundle, and what makes its frames: recorded graphs with 8 bits per channel."""
+    bundle = read_bundle(folder, decode=False)
+    scene = bundle.scene.to(device)
+
+    def make(camera: Camera) -> Callable[[], Tensor]:
+        drawn = BakedRenderer(scene, camera.width, camera.height, images=("packed",), graph=True)
+        drawn.draw([camera])
+        shape = (camera.height, camera.width)
+
+        def draw() -> Tensor:
+            drawn.run()
+            return drawn.images["packed"][0].view(torch.uint8).reshape(*shape, 4)[..., :3] / 255
+
+        draw.timed = drawn.run  # type: ignore[attr-defined]  # the frame alone
+        return draw
+
+    return len(bundle), make
+
+
+def report(rows: Sequence[Row], capture: Capture, times: Sequence[int], baked: int) -> str:
+    """Markdown."""
+    camera = capture.held_out[0].camera
+    header = ("what draws", "primitives", "training s", "PSNR dB", "after affine fit", "SSIM")
+    header += tuple(f"ms at {k * camera.width} x {k * camera.height}" for k in times)
+    cells = [
+        [r.name, number(r.count, 0), number(r.seconds, 0), *(number(r.quality[i], 2) for i in (0, 1))]
+        + [number(r.quality[2], 3), *(number(r.frames.get(k, math.nan), 3) for k in times)]
+        for r in rows
+    ]
+    text = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n"
+    text += f"The first {baked} rows are our bundles.\n" if baked else ""
+    return text + "\n" + table(header, cells)
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
+    parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes of the same capture")
+    parser.add_argument("--counts", nargs="+", type=int, default=[30_000, 100_000, 300_000, 1_000_000])
+    parser.add_argument("--steps", type=int, default=10_000, help="of training Gaussians (%(default)s)")
+    parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
+    parser.add_argument("--downscale", type=int, default=1, help="whole factor by which photographs are reduced")
+    parser.add_argument("--cameras", type=int, default=6, help="held-out cameras that are timed (%(default)s)")
+    parser.add_argument("--runs", type=int, default=50, help="frames per camera (%(default)s)")
+    parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew after each row")
+    arguments = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("no CUDA device is to be seen (or torch is a CPU build)")
+    device = torch.device("cuda")
+    capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
+    every = max(1, len(capture.held_out) // arguments.cameras)
+    cameras = [view.camera.to(device) for view in capture.held_out[::every][: arguments.cameras]]
+    options = Options(device, (), (), 5, arguments.runs, 0.0)
+    rows: list[Row] = []
+    notes = [f"Device: {torch.cuda.get_device_name(device)}."]
+    baked = 0
+
+    def write(silent: bool = True) -> None:
+        text = page(f"Equal quality: {arguments.data.name}", report(rows, capture, arguments.times, baked), notes)
+        publish(text, arguments.output, silent=silent)
+
+    for folder in arguments.bundles:
+        count, make = ours(folder, device)
+        good = quality(lambda camera, make=make: make(camera)(), capture.held_out, device)
+        frames = {
+            k: timed(lambda camera, make=make: make(camera).timed, [larger(c, k) for c in cameras], options)
+            for k in arguments.times
+        }
+        say(f"{folder.name}: {good[0]:.2f} dB, {frames}")
+        rows.append(Row(folder.name, count, None, good, frames))
+        baked += 1
+        write()
+    gsplat, why = load()
+    if gsplat is None:
+        notes.append(why)
+    for most in arguments.counts if gsplat is not None else []:
+        trained = Gaussians(gsplat, capture, most, arguments.steps, device)
+        g = trained.finished()
+        n, seconds = len(g["means"]), trained.seconds
+        del trained
+        for name, renderer in (("rasterization", rasterized), ("inference renderer", inferred)):
+            made = renderer(gsplat, g)
+            rows.append(row(f"gsplat {name}", n, seconds, made, capture, cameras, arguments.times, options))
+            write()
+    write(silent=False)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -168,7 +168,7 @@ class Reader {
   }
   template <class T>
   void number(const char* name, T& to) {
-    std::conditional_t<std::is_floating_point_v<T>, double, T> value;
+    std::conditional_t<std::is_floating_point_v<T>, double, T> value = {};
     if (!nb::try_cast(find(name), value)) wrong(name, std::is_same_v<T, bool> ? "a bool" : "a number");
     to = T(value);
   }

@@ -17,6 +17,10 @@ constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 constexpr int64_t kLeastBlocks = 1024;  // where there are fewer a block takes fewer surfels,
 constexpr int kLeastOwned = 4;          // but as many as this
 constexpr int kMoved = 4;               // pairs that a thread moves
+constexpr int kLarge = 128;             // tiles from which on a surfel is left to `large_pairs_kernel`
+constexpr int kLargeParts = 16;         // in which such a surfel's rows of tiles are shared out
+constexpr int kLong = 2;                // times the mean of all tiles: a list that is long
+constexpr int kLargeBlocks = 528;       // four for each multiprocessor of a large card
 
 // Sums of the values of the threads before mine.
 __device__ int warp_sum_before(int value, int lane) {
@@ -57,8 +61,37 @@ struct alignas(Footprint) FootprintRoom {
 };
 __device__ Footprint& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint*>(&room); }
 
+// At most so many tiles are listed for a surfel.
+__device__ int most_tiles(const Footprint& of, const BakedFrame& f) {
+  const Interval<float> x = columns_of(of.bounds);
+  const float pad = of.bounds.ellipse ? of.pad : 0;
+  const int left = of.bounds.whole ? 0 : pixel_from(of.cx + x.x0 - pad, f.width) / kTile,
+            right = of.bounds.whole ? f.tiles_x - 1 : pixel_to(of.cx + x.x1 + pad, f.width) / kTile;
+  return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
+}
+
+// The first tile of row `ty` of the view that row `r` of the surfels belongs to.
+__device__ uint32_t first_tile(const BakedFrame& f, uint32_t r, int ty) {
+  return r / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x);
+}
+
+__device__ void list_pair(const BakedFrame& f, int64_t at, uint32_t r, uint32_t tile, uint32_t parts) {
+  const BakedMemory& m = f.memory;
+  if (at >= f.capacity) return;
+  const int32_t number = atomicAdd(m.ranges + 2 * int64_t(tile) + 1, 1);
+  m.listed_tile[at] = tile;
+  m.listed_pair[at] = r << 8 | parts;
+  m.listed_number[at] = number;
+}
+
+__device__ int64_t take_places(const BakedFrame& f, int pairs) {
+  return int64_t(
+      atomicAdd(reinterpret_cast<unsigned long long*>(f.memory.total), static_cast<unsigned long long>(pairs)));
+}
+
 // Threads take a surfel each, then a row of tiles each, then a pair each, so that all are busy and neighbours write to
-// neighbouring places however many rows a surfel has and however wide they are. A block takes `owned` surfels.
+// neighbouring places however many rows a surfel has and however wide they are. A block takes `owned` surfels. Those
+// of many tiles are only noted: the block with most of them would be what a frame waits for.
 template <class Kernel>
 __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int owned) {
   __shared__ FootprintRoom area[kThreads];
@@ -76,6 +109,7 @@ __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int ow
     const Footprint of = footprint<Kernel>(m.rows + r * kRow, f.height);
     footprint_in(area[me]) = of;
     mine = of.bottom - of.top + 1;
+    if (most_tiles(of, f) >= kLarge) m.large[atomicAdd(m.large_count, 1)] = uint32_t(r), mine = 0;
   }
   first_row[me] = block_sum_before(mine, sums, rows);
   __syncthreads();
@@ -90,39 +124,66 @@ __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int ow
       width = mine.right - mine.left + 1;
       row[me] = mine;
       row_id[me] = uint32_t(first + surfel);
-      row_tile[me] =
-          row_id[me] / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x + mine.left);
+      row_tile[me] = first_tile(f, row_id[me], ty) + uint32_t(mine.left);
     }
     first_pair[me] = block_sum_before(width, sums, pairs);
-    if (me == 0 && pairs > 0)
-      place =
-          int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(m.total), static_cast<unsigned long long>(pairs)));
+    if (me == 0 && pairs > 0) place = take_places(f, pairs);
     __syncthreads();
     for (int k = me; k < pairs; k += kThreads) {
-      const int64_t at = place + k;
-      if (at >= f.capacity) break;
       const int of = last_at_most(first_pair, taken, k), right = k - first_pair[of];
-      const uint32_t tile = row_tile[of] + uint32_t(right);
-      const int32_t number = atomicAdd(m.ranges + 2 * int64_t(tile) + 1, 1);
-      m.listed_tile[at] = tile;
-      m.listed_pair[at] = row_id[of] << 8 | part_mask(row[of], row[of].left + right);
-      m.listed_number[at] = number;
+      list_pair(f, place + k, row_id[of], row_tile[of] + uint32_t(right), part_mask(row[of], row[of].left + right));
     }
     __syncthreads();
   }
 }
 
-// From the number of a tile's pairs to where they begin and end.
+// The surfels of many tiles, a warp to a share of the rows of tiles of one.
+template <class Kernel>
+__global__ void __launch_bounds__(kThreads) large_pairs_kernel(BakedFrame f) {
+  const BakedMemory& m = f.memory;
+  const int lane = threadIdx.x % kWarp, warps = int(gridDim.x) * kWarps;
+  const int64_t shares = int64_t(*m.large_count) * kLargeParts;
+  for (int64_t i = int64_t(blockIdx.x) * kWarps + threadIdx.x / kWarp; i < shares; i += warps) {
+    const uint32_t r = m.large[i / kLargeParts];
+    const Footprint of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.height);
+    for (int ty = of.top + int(i % kLargeParts); ty <= of.bottom; ty += kLargeParts) {
+      const TileRow row = tile_row(of, ty, f.width);
+      const int width = row.right - row.left + 1;
+      if (width <= 0) continue;
+      int64_t place = 0;
+      if (lane == 0) place = take_places(f, width);
+      place = __shfl_sync(kFullMask, place, 0);
+      const uint32_t tile = first_tile(f, r, ty);
+      for (int k = lane; k < width; k += kWarp)
+        list_pair(f, place + k, r, tile + uint32_t(row.left + k), part_mask(row, row.left + k));
+      __syncwarp();
+    }
+  }
+}
+
+// From the number of a tile's pairs to where they begin and end. Tiles of long lists are drawn first, so that none of
+// them is left when all others are done.
 __global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
+  const BakedMemory& m = f.memory;
   const int64_t tile = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = threadIdx.x % kWarp;
-  int32_t* range = f.memory.ranges + 2 * tile;
-  const int count = tile < f.tiles ? range[1] : 0;
+  const bool in = tile < f.tiles;
+  const int count = in ? m.ranges[2 * tile + 1] : 0;
   const int before = warp_sum_before(count, lane);
-  int32_t begin = 0;
-  if (lane == kWarp - 1) begin = atomicAdd(f.memory.given, before + count);
+  const bool is_long = in && int64_t(count) * f.tiles > kLong * *m.total;
+  const unsigned longs = __ballot_sync(kFullMask, is_long), others = __ballot_sync(kFullMask, in && !is_long);
+  int32_t begin = 0, first = 0, last = 0;
+  if (lane == kWarp - 1) {
+    begin = atomicAdd(m.given, before + count);
+    if (longs) first = atomicAdd(m.long_tiles, __popc(longs));
+    if (others) last = atomicAdd(m.other_tiles, __popc(others));
+  }
   begin = __shfl_sync(kFullMask, begin, kWarp - 1) + before;
-  if (tile < f.tiles) range[0] = begin, range[1] = begin + count;
+  first = __shfl_sync(kFullMask, first, kWarp - 1) + __popc(longs & ((1u << lane) - 1));
+  last = __shfl_sync(kFullMask, last, kWarp - 1) + __popc(others & ((1u << lane) - 1));
+  if (!in) return;
+  m.ranges[2 * tile] = begin, m.ranges[2 * tile + 1] = begin + count;
+  m.order[is_long ? first : f.tiles - 1 - last] = uint32_t(tile);
 }
 
 __global__ void __launch_bounds__(kThreads) places_kernel(BakedFrame f) {
@@ -147,7 +208,8 @@ __global__ void __launch_bounds__(kThreads) places_kernel(BakedFrame f) {
 int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   Arena arena(base);
   BakedMemory& m = f.memory;
-  m.total = arena.take<int64_t>(2), m.given = reinterpret_cast<int32_t*>(m.total + 1);
+  m.total = arena.take<int64_t>(3), m.given = reinterpret_cast<int32_t*>(m.total + 1);
+  m.large_count = m.given + 1, m.long_tiles = m.given + 2, m.other_tiles = m.given + 3;
   m.ranges = arena.take<int32_t>(2 * f.tiles);
   m.cleared = arena.used();
   m.rows = arena.take<float>(f.rows * kRow);
@@ -155,6 +217,7 @@ int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   m.depth = arena.take<uint32_t>(f.rows);
   m.pairs = arena.take<uint32_t>(f.capacity);
   m.keys = arena.take<uint64_t>(f.capacity), m.merged = arena.take<uint64_t>(f.capacity);
+  m.large = arena.take<uint32_t>(f.rows), m.order = arena.take<uint32_t>(f.tiles);
   m.listed_tile = reinterpret_cast<uint32_t*>(m.keys), m.listed_pair = reinterpret_cast<uint32_t*>(m.merged);
   m.listed_number = reinterpret_cast<int32_t*>(m.listed_tile + f.capacity);
   return arena.used();
@@ -185,6 +248,8 @@ void baked_bin(const BakedFrame& f, Stream stream) {
   const dim3 blocks(unsigned(ceil_div(f.rows, owned)));
   with_kernel(f.through_pixel, [&](auto kernel) {
     BT_LAUNCH(pairs_kernel<decltype(kernel)>, blocks, dim3(kThreads), 0, stream, f, owned);
+    const unsigned large = unsigned(min_<int64_t>(kLargeBlocks, ceil_div(f.rows * kLargeParts, kWarps)));
+    BT_LAUNCH(large_pairs_kernel<decltype(kernel)>, dim3(large), dim3(kThreads), 0, stream, f);
   });
   BT_LAUNCH(ranges_kernel, dim3(unsigned(ceil_div(f.tiles, kThreads))), dim3(kThreads), 0, stream, f);
   const unsigned moves = unsigned(ceil_div(f.capacity, kThreads * kMoved));

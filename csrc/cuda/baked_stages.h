@@ -25,15 +25,19 @@ enum RowColumn {
 static_assert(kRow == 24 && kR2 == 12);
 
 struct BakedMemory {
-  int64_t* total;           // pairs of surfel and tile
-  int32_t* given;           // places of lists that tiles have taken
-  int32_t* ranges;          // [tiles, 2] where a tile's list begins and ends; before that a 0 and its pairs
-  int64_t cleared;          // bytes from `total` on that a frame begins with as zeros: the three above
-  float* rows;              // [rows, kRow]
-  float4* normals;          // [rows], null: not wanted
-  uint32_t* depth;          // [rows] keys in the order of depth
-  uint32_t* pairs;          // [capacity] row << 8 | mask, tile by tile
-  uint64_t *keys, *merged;  // [capacity] of lists that are too long for shared memory
+  int64_t* total;                     // pairs of surfel and tile
+  int32_t* given;                     // places of lists that tiles have taken
+  int32_t* large_count;               // surfels of many tiles
+  int32_t *long_tiles, *other_tiles;  // tiles whose list is long, and others
+  int32_t* ranges;                    // [tiles, 2] where a tile's list begins and ends; before that a 0 and its pairs
+  int64_t cleared;                    // bytes from `total` on that a frame begins with as zeros: all above
+  float* rows;                        // [rows, kRow]
+  float4* normals;                    // [rows], null: not wanted
+  uint32_t* depth;                    // [rows] keys in the order of depth
+  uint32_t* large;                    // [rows] surfels of many tiles
+  uint32_t* order;                    // [tiles] in which they are drawn
+  uint32_t* pairs;                    // [capacity] row << 8 | mask, tile by tile
+  uint64_t *keys, *merged;            // [capacity] of lists that are too long for shared memory
   // [capacity] pairs as they come, in the memory of these: tile, row << 8 | mask, and which of the tile's pairs it is
   uint32_t *listed_tile, *listed_pair;
   int32_t* listed_number;

@@ -161,8 +161,9 @@ __device__ Vec3<S> encode_vjp(const FieldArrays<S>& f, Vec3<S> c, bool active, i
     uint32_t* indices = stage.corner_indices(turn, lane);
     BT_UNROLL
     for (int k = 0; k < 8; ++k) weights[k] = at.weight[k], indices[k] = at.index[k];
-    const bool same = __shfl_sync(kFullMask, at.x, lane + 1) == at.x & __shfl_sync(kFullMask, at.y, lane + 1) == at.y &
-                      __shfl_sync(kFullMask, at.z, lane + 1) == at.z;
+    const auto next_x = __shfl_sync(kFullMask, at.x, lane + 1), next_y = __shfl_sync(kFullMask, at.y, lane + 1),
+               next_z = __shfl_sync(kFullMask, at.z, lane + 1);
+    const bool same = next_x == at.x && next_y == at.y && next_z == at.z;
     const unsigned ends = __ballot_sync(kFullMask, active && followed && !same);
     __syncwarp();
     if (positions) {

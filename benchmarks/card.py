@@ -56,8 +56,9 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """What can be run: name -> steps. `fox` and `textures` need that capture in `data`; `train`, `variants` and `peers`
-    take every other one; `peers` and `webgpu` draw the bundles that orders before them left.
+    """What can be run: name -> steps. `fox` and `textures` need that capture in `data`; `train`, `variants`,
+    `gaussians` and `peers` take every other one. `peers`, `kernels` and `webgpu` draw the bundles that orders before
+    them left, `peers` the Gaussians of `gaussians`, too.
 
     Args:
         results: folder of the tables.
@@ -150,16 +151,39 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             )
             for name in others
         ],
+        "gaussians": [
+            Step(
+                f"Gaussians of {name}",
+                [
+                    python("gpu_peers.py", str(data / name), "--counts", str(count), "--save", str(results / name))
+                    for count in GAUSSIANS
+                ],
+                300,
+            )
+            for name in others
+        ],
         "peers": [
             Step(
                 f"peers on {name}",
                 [
                     python("gpu_peers.py", str(data / name), "--bundles", *map(str, sorted(bundles.glob(f"{name}/*"))))
+                    + ["--gaussians", *(str(results / name / f"{count}.pt") for count in GAUSSIANS)]
                     + ["--output", str(results / f"{name}-peers.md")]
                 ],
-                400,
+                120,
             )
             for name in others
+        ],
+        "kernels": [
+            Step(
+                f"kernels of bundles, {size}",
+                [
+                    python("card_smoke.py", "--sections", "--size", size, "--times", "20", "--bundles")
+                    + [str(file.parent) for file in sorted(bundles.glob("**/bundle.json"))]
+                ],
+                60,
+            )
+            for size in ("1297x840", "3840x2160")
         ],
         "webgpu": [
             Step(
@@ -188,6 +212,10 @@ VARIANTS = (
     ("texels", ("--options", "train.exposure=auto", "train.loss.falloff_weight=0")),
 )
 """Textures and options that are compared on a capture at half its size."""
+
+
+GAUSSIANS = (300_000, 1_000_000)
+"""Numbers that are trained to compare with."""
 
 
 def captures(data: Path) -> list[str]:

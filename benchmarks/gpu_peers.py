@@ -22,13 +22,14 @@ from typing import Any
 
 import torch
 from common import number, page, publish, say, table
-from gpu_common import Options, milliseconds
+from gpu_common import Options, attempt, milliseconds
 from gpu_gsplat import load
 from plain_capture import Capture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from bitymi_ns.bundle import read_bundle
+from bitymi_ns.ops.baked_cuda import Stage
 from bitymi_ns.ops.ssim import ssim
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
@@ -250,6 +251,21 @@ def ours(folder: Path, device: torch.device) -> tuple[int, Callable[[Camera], Ca
     return len(bundle), make
 
 
+def by_stage(folder: Path, cameras: Sequence[Camera], options: Options) -> str:
+    """What the stages of our frames take, and of how much, means over the cameras."""
+    scene = read_bundle(folder, decode=False).scene.to(options.device)
+    drawn = BakedRenderer(scene, cameras[0].width, cameras[0].height, images=("packed",))
+    sums: dict[str, float] = {"pairs": 0.0, "fragments": 0.0}
+    for camera in cameras:
+        drawn.draw([camera])
+        sums["pairs"] += drawn.workspace.pairs
+        sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
+        for stage in (Stage.PREPARE, Stage.BIN, Stage.DRAW):
+            ms = milliseconds(lambda stage=stage: drawn.run(stage), options)
+            sums[f"{stage.name} ms"] = sums.get(f"{stage.name} ms", 0.0) + ms
+    return ", ".join(f"{name} {value / len(cameras):,.3f}" for name, value in sums.items())
+
+
 def report(rows: Sequence[Row], capture: Capture, times: Sequence[int], baked: int) -> str:
     """Markdown."""
     camera = capture.held_out[0].camera
@@ -272,12 +288,14 @@ def main() -> int:
     )
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes of the same capture")
-    parser.add_argument("--counts", nargs="+", type=int, default=[30_000, 100_000, 300_000, 1_000_000])
-    parser.add_argument("--steps", type=int, default=10_000, help="of training Gaussians (%(default)s)")
+    parser.add_argument("--counts", nargs="+", type=int, default=[300_000, 1_000_000])
+    parser.add_argument("--steps", type=int, default=20_000, help="of training Gaussians (%(default)s)")
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
     parser.add_argument("--downscale", type=int, default=1, help="whole factor by which photographs are reduced")
     parser.add_argument("--cameras", type=int, default=6, help="held-out cameras that are timed (%(default)s)")
     parser.add_argument("--runs", type=int, default=50, help="frames per camera (%(default)s)")
+    parser.add_argument("--save", type=Path, help="train into files of this folder, and draw nothing")
+    parser.add_argument("--gaussians", nargs="+", type=Path, help="draw these files, and train nothing")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew after each row")
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
@@ -287,6 +305,13 @@ def main() -> int:
     every = max(1, len(capture.held_out) // arguments.cameras)
     cameras = [view.camera.to(device) for view in capture.held_out[::every][: arguments.cameras]]
     options = Options(device, (), (), 5, arguments.runs, 0.0)
+    if arguments.save:
+        arguments.save.mkdir(parents=True, exist_ok=True)
+        for most in arguments.counts:
+            trained = Gaussians(load()[0], capture, most, arguments.steps, device)
+            torch.save((trained.finished(), trained.seconds), arguments.save / f"{most}.pt")
+            say(f"{most:,} Gaussians, {arguments.steps:,} steps: {trained.seconds:.0f} s")
+        return 0
     rows: list[Row] = []
     notes = [f"Device: {torch.cuda.get_device_name(device)}."]
     baked = 0
@@ -303,20 +328,30 @@ def main() -> int:
             for k in arguments.times
         }
         say(f"{folder.name}: {good[0]:.2f} dB, {frames}")
+        for k in arguments.times:
+            say(f"at {k} x: {by_stage(folder, [larger(c, k) for c in cameras], options)}")
         rows.append(Row(folder.name, count, None, good, frames))
         baked += 1
         write()
     gsplat, why = load()
     if gsplat is None:
         notes.append(why)
-    for most in arguments.counts if gsplat is not None else []:
-        trained = Gaussians(gsplat, capture, most, arguments.steps, device)
-        g = trained.finished()
-        n, seconds = len(g["means"]), trained.seconds
-        del trained
+    for what in (arguments.gaussians or arguments.counts) if gsplat is not None else []:
+        if isinstance(what, Path):
+            g, seconds = torch.load(what, map_location=device, weights_only=True)
+        else:
+            trained = Gaussians(gsplat, capture, what, arguments.steps, device)
+            g, seconds = trained.finished(), trained.seconds
+            del trained
+        n = len(g["means"])
         for name, renderer in (("rasterization", rasterized), ("inference renderer", inferred)):
-            made = renderer(gsplat, g)
-            rows.append(row(f"gsplat {name}", n, seconds, made, capture, cameras, arguments.times, options))
+
+            def measured(name: str = name, renderer: Callable = renderer, g: dict = g, s: float = seconds) -> Row:
+                made = renderer(gsplat, g)
+                return row(f"gsplat {name}", len(g["means"]), s, made, capture, cameras, arguments.times, options)
+
+            if found := attempt(f"{name}, {n:,}", measured):
+                rows.append(found)
             write()
     write(silent=False)
     return 0

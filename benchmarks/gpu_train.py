@@ -187,7 +187,7 @@ def run(
         frame = milliseconds(lambda: scene.render(camera, field_mode="frozen"), options)
     start = time.perf_counter()
     background = judging_background(preset.train.background, torch.device("cpu"))
-    cameras = [view.camera for view in capture.train]
+    cameras = [view.camera.to(device) for view in capture.train]
     stages = Stages()
     made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning(), stages)  # nothing learns
     bake_seconds = time.perf_counter() - start

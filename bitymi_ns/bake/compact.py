@@ -36,6 +36,7 @@ TEXEL_SHARE = 0.5
 LEAST_ERROR = 1e-7
 """Mean square error that is always allowed, of colours from 0 to 1: 70 dB."""
 _SEARCH = 7
+_CPU = torch.device("cpu")
 _FAST = 9
 
 
@@ -98,6 +99,7 @@ class Coder:
         background: Tensor,
         options: Compact,
         progress: Progress = no_progress,
+        device: torch.device = _CPU,
     ) -> None:
         """
         Args:
@@ -106,6 +108,7 @@ class Coder:
             background: [3] colour behind the scene.
             options: see `Compact`.
             progress: called on the way.
+            device: where view colours are weighed.
         """
         options.check()
         self._baked, self._pictures = baked, Pictures(views, background, options.views)
@@ -116,8 +119,7 @@ class Coder:
         rows = set_aside(len(views), options.held_in_every)[1] if len(views) >= FEWEST_VIEWS else range(len(views))
         learned = [views[row] for row in rows]
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(learned)
-        cameras = [view.camera.to("cpu") for view in learned]
-        self._colors = color_choices(scene, cameras, progress)
+        self._colors = color_choices(scene, [view.camera.to(device) for view in learned], progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._weights = None
@@ -171,6 +173,7 @@ def compacted(
     background: Tensor,
     options: Compact | None = None,
     progress: Progress = no_progress,
+    device: torch.device = _CPU,
 ) -> tuple[Baked, TexelCodeOptions]:
     """A bake whose surfels have the values that a compact bundle keeps, in its order, and how its texels are to be
     coded: by `tune.tune_atlas` or `with_coded_texels`.
@@ -181,12 +184,13 @@ def compacted(
         background: [3] colour behind the scene.
         options: see `Compact`.
         progress: called on the way.
+        device: where view colours are weighed; all else is done on the CPU.
 
     Raises:
         ValueError: an option is out of range, or what is asked for cannot be had.
     """
     options = options or Compact()
-    coder = Coder(baked, views, background, options, progress)
+    coder = Coder(baked, views, background, options, progress, device)
     if options.most_bytes is not None:
         found = _search(coder, lambda priced: priced.bytes > 0.97 * options.most_bytes, progress, upper=True)
         if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:

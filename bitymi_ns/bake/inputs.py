@@ -63,6 +63,11 @@ class BakeInput:
         )
 
 
+def device_of(cameras: Sequence[Camera]) -> torch.device:
+    """The device of views, which looks through them; the CPU where there are none."""
+    return cameras[0].viewmat.device if cameras else torch.device("cpu")
+
+
 def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
     """Rows that can be drawn and that a bundle can hold, [N] int64, and how many were left out for which reason."""
     finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)

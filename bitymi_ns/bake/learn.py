@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
+from bitymi_ns.bake.inputs import device_of
 from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
@@ -59,7 +60,7 @@ def baked_and_reduced(
     if polish is not None and baked.texels is not None:
         baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
     if polish is not None or has_learned:
-        baked = reduced(baked, [camera.to("cpu") for camera in cameras], progress)
+        baked = reduced(baked, cameras, progress)
     return baked
 
 
@@ -97,7 +98,7 @@ def bake_and_learn(
     baked = baked_and_reduced(scene, cameras, photographs, background, options, learning, progress, held_out)
     coding = None
     if learning.compact is not None:
-        baked, coding = compacted(baked, photographs, background, learning.compact, progress)
+        baked, coding = compacted(baked, photographs, background, learning.compact, progress, device_of(cameras))
     if tune is not None and baked.texels is not None:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
     if baked.codes is not None and baked.codes.texels is None:

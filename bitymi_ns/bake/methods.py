@@ -186,12 +186,12 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
 
     Args:
         tiles: of N surfels, with texels.
-        inputs: the surfels, and what the views see of them.
+        inputs: the surfels, and what the views see of them; their device does the work.
     """
     assert tiles.texels is not None
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
-    shown = Shown(opacity, beta, tiles.extent, inputs.weight_bound)
-    parts = held(tiles.texels, tiles.packing, shown, options.chunk)
+    shown = Shown(opacity, beta, tiles.extent.to(opacity.device), inputs.weight_bound)
+    parts = held(tiles.texels.to(opacity.device), tiles.packing, shown, options.chunk)
     smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress)
     bare = torch.from_numpy(tiles.packing.tiles)[:, 3] == 0
     smaller.constant[bare] = tiles.mean_residual[bare]

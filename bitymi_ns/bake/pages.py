@@ -43,7 +43,7 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
     """
     x, y, layer = tiles[:, 0].long(), tiles[:, 1].long(), tiles[:, 2].long()
     origin = (layer * height + y) * width + x  # [N]
-    i, j = torch.arange(size[0]), torch.arange(size[1])
+    i, j = (torch.arange(side, device=tiles.device) for side in size)
     return origin[:, None, None] + (j[:, None] * width + i[None, :])
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.codes import Codes
 from bitymi_ns.bake.errors import tile_errors
-from bitymi_ns.bake.inputs import BakeInput, drawable
+from bitymi_ns.bake.inputs import BakeInput, device_of, drawable
 from bitymi_ns.bake.methods import BakeMethod, FineBake, Tiles, bake_method, reduced_tiles
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.packing import Packing, pack
@@ -247,7 +247,7 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
 
     Args:
         baked: made with `pixels_per_texel`, or `learned`.
-        cameras: training views.
+        cameras: training views; their device does the work.
 
     Raises:
         ValueError: no surfel is left.
@@ -255,20 +255,21 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     rows, gone = drawable(baked.scene.surfels)
     kept = torch.zeros(len(baked.rows), dtype=torch.bool)
     kept[rows] = True
-    scene, options = baked.scene, baked.options
-    surfels = {name: value[rows] for name, value in scene.surfels.items()}
+    scene, options, device = baked.scene, baked.options, device_of(cameras)
+    surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
     inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.through_pixel)
     inputs, seen = _looked_at(inputs, options, progress)
     if seen is not None:
         gone = gone.but(unseen=int((~seen).sum()))
-        kept[rows] = seen
+        kept[rows] = seen.cpu()
     if not bool(kept.any()):
         raise ValueError("no surfel is left to bake")
     lean, view_color = bake_method(options).view_color(inputs, progress)
     result = baked.only(kept)
     if options.tolerance > 0 and result.texels is not None:
         result = result.with_tiles(reduced_tiles(result.tiles, inputs, options, progress))
-    result = replace(result.with_surfels(lean), in_front=inputs.transmittance)
+    in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
+    result = replace(result.with_surfels(lean), in_front=in_front)
     result = replace(result, scene=replace(result.scene, photographed=photographed(inputs)))
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None

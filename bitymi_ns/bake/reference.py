@@ -90,12 +90,12 @@ def held(texels: Tensor, packing: Packing, shown: Shown, chunk: int = 1 << 18) -
     """What tiles hold, in chunks of tiles of one size.
 
     Args:
-        texels: [layers, height, width, 3] in the places of `packing`.
+        texels: [layers, height, width, 3] in the places of `packing`, on the device of `shown`.
         packing: N tiles; surfels without one are left out.
         shown: how much of them is.
         chunk: texels taken at once (a tile is never split).
     """
-    tiles, flat = torch.from_numpy(packing.tiles), texels.reshape(-1, 3)
+    tiles, flat = torch.from_numpy(packing.tiles).to(texels.device), texels.reshape(-1, 3)
     for r_u, r_v, members in size_classes(tiles):
         for rows in members.split(max(1, chunk // (r_u * r_v))):
             at = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)

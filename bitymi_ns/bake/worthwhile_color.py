@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
+from bitymi_ns.bake.inputs import device_of
 from bitymi_ns.bake.lean_color import FIT_STEPS, FIT_VIEWS, OUTSIDE, OUTSIDE_WEIGHT, centers_of, shown_at
 from bitymi_ns.bake.limits import beyond
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
@@ -66,10 +67,12 @@ class ColorChoices:
 @torch.no_grad()
 def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progress = no_progress) -> Tensor:
     """[V, N] sum over a view's pixels of the squared blending weight of each surfel: an error e of its colour adds e^2
-    times as much to the picture."""
-    found = torch.zeros(len(cameras), len(scene))
+    times as much to the picture. On the device of the cameras."""
+    device = device_of(cameras)
+    found = torch.zeros(len(cameras), len(scene), device=device)
+    geometry = [scene.surfels[name].to(device) for name in GEOMETRY]
     for done, camera in enumerate(cameras):
-        projection = project(*(scene.surfels[name] for name in GEOMETRY), camera, scene.near, scene.through_pixel)
+        projection = project(*geometry, camera, scene.near, scene.through_pixel)
         for fragments in fitting_lists(projection):
             found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
             del fragments  # before the next list is made
@@ -86,22 +89,25 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
     half the mean of directions between and around them.
 
     Args:
-        scene: with lean view colours, on the CPU.
-        cameras: training views, on the CPU.
+        scene: with lean view colours.
+        cameras: training views; their device does the work.
+
+    Returns:
+        on the CPU.
     """
     weights, kind = shown_weights(scene, cameras, progress), scene.view_color
-    entry, surfels = VIEW_COLORS[kind], scene.surfels
+    entry, surfels = VIEW_COLORS[kind], {name: value.to(weights.device) for name, value in scene.surfels.items()}
     counts = surfels["view_span"][:, 1].long()
     most, width = int(counts.max()) if len(counts) else 0, entry.lean_width
-    error = torch.full((len(counts), most + 1), torch.inf)
-    base = torch.zeros(len(counts), most + 1, 3)
+    error = weights.new_full((len(counts), most + 1), torch.inf)
+    base = weights.new_zeros(len(counts), most + 1, 3)
     numbers = range(most + 1) if entry.sites is not None else sorted({0, *counts.tolist()})
-    terms = {number: torch.zeros(len(counts), number, width) for number in numbers}
+    terms = {number: weights.new_zeros(len(counts), number, width) for number in numbers}
     for count in numbers:
         group = torch.nonzero(counts == count).squeeze(1)
         error[group, count], base[group, count] = 0.0, surfels["view_base"][group]
         first = surfels["view_span"][group, 0].long()
-        terms[count][group] = surfels["view_terms"][first[:, None] + torch.arange(count)]
+        terms[count][group] = surfels["view_terms"][first[:, None] + torch.arange(count, device=first.device)]
         if count == 0 or len(group) == 0:
             continue
         done = 0
@@ -122,7 +128,7 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
                     terms[number][rows] = t
             done += len(rows)
             progress("weighing the view colours", done, len(group))
-    return ColorChoices(error, base, terms)
+    return ColorChoices(error.cpu(), base.cpu(), {number: values.cpu() for number, values in terms.items()})
 
 
 def _weights(at: Directions, weights: Tensor) -> Tensor:
@@ -166,6 +172,6 @@ def _fewer(
 
 def _lean(base: Tensor, terms: Tensor) -> dict[str, Tensor]:
     n, number = terms.shape[:2]
-    first = number * torch.arange(n)
+    first = number * torch.arange(n, device=base.device)
     span = torch.stack([first, torch.full_like(first, number)], dim=1).int()
     return {"view_base": base, "view_span": span, "view_terms": terms.flatten(0, 1)}

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.pipeline import Baked, reduced
+from bitymi_ns.bake.worthwhile_color import ColorChoices, color_choices
 from bitymi_ns.ops import Bands
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.scene.field import TexelField
@@ -206,3 +208,30 @@ def test_what_a_device_has_learned_can_be_baked(device: torch.device, cpu: Conte
         got = baked.unquantised().render(camera).rgb
     assert want.any() and scene.field.texels.abs().max() > 0.05
     torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu: Context) -> None:
+    """Tiles and view colours are reduced on the device of the views."""
+    trainer = trainer_on(device)
+    for _ in range(START + 3):
+        trainer.advance()
+    baked, cameras = learned(trainer.scene, BakeOptions(tolerance=4.0)), [v.camera for v in scene_and_views()[1]]
+
+    def less(where: torch.device) -> tuple[Baked, ColorChoices]:
+        there = [camera.to(where) for camera in cameras]
+        made = reduced(baked, there)
+        return made, color_choices(made.unquantised(), there)
+
+    got, choices = less(device)
+    with cpu():
+        want, cpu_choices = less(HERE)
+    assert len(want.rows) > 5 and want.packing.texels < baked.packing.texels
+    torch.testing.assert_close(got.rows, want.rows)
+    torch.testing.assert_close(torch.from_numpy(got.packing.tiles), torch.from_numpy(want.packing.tiles))
+    torch.testing.assert_close(got.texels, want.texels, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got.in_front, want.in_front, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got.scene.surfels["view_span"], want.scene.surfels["view_span"])
+    torch.testing.assert_close(got.scene.photographed, want.scene.photographed)
+    assert all(value.device == HERE for value in got.scene.surfels.values())
+    assert choices.error.device == HERE and choices.error.isfinite().any()
+    torch.testing.assert_close(choices.error, cpu_choices.error, rtol=1e-2, atol=1e-4)

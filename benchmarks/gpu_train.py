@@ -99,7 +99,7 @@ def new_scene(capture: Capture, preset: Preset) -> Scene:
         capture.points,
         capture.colours,
         centers,
-        preset.scene.settled("cuda"),
+        preset.scene,
         preset.train,
         bounded,
         image_pixels=pixels,

@@ -13,6 +13,7 @@ import argparse
 import statistics
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -64,14 +65,15 @@ def main() -> int:
     notes = [f"Graphics devices: {'; '.join(adapters())}. Features: {features}."]
     for folder in arguments.bundles:
         bundle = read_bundle(folder, decode=False)
-        there = SceneOnDevice(bundle.scene)
+        plain = replace(bundle.scene, photographed=None)  # one sample per pixel, as the timed frames have
+        there = SceneOnDevice(plain)
         for size in arguments.sizes:
             width, height = (int(part) for part in size.split("x"))
             cameras = around(bundle, width, height)
             cuda = None
             pictures = []
             if card:
-                scene, options = bundle.scene.to("cuda"), Options(torch.device("cuda"), (), (), 5, arguments.runs, 0.0)
+                scene, options = plain.to("cuda"), Options(torch.device("cuda"), (), (), 5, arguments.runs, 0.0)
                 renderer = BakedRenderer(scene, width, height, images=("packed",), graph=True)
                 times = []
                 for camera in cameras:
@@ -82,7 +84,7 @@ def main() -> int:
             for layers in arguments.layers:
                 ms = statistics.fmean(webgpu_milliseconds(there, camera, layers, arguments.runs) for camera in cameras)
                 errors = [
-                    255 * (webgpu.draw(bundle.scene, [camera], None, ("rgb",), layers=layers)["rgb"][0] - picture).abs()
+                    255 * (webgpu.draw(plain, [camera], None, ("rgb",), layers=layers)["rgb"][0] - picture).abs()
                     for camera, picture in zip(cameras, pictures, strict=False)
                 ]
                 mean = statistics.fmean(float(e.mean()) for e in errors) if errors else None

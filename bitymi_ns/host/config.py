@@ -74,7 +74,6 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
-        self.pipeline.model.scene = self.pipeline.model.scene.settled(self.machine.device_type)
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:

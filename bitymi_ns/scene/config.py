@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from bitymi_ns.ops.view_kinds import Kind
 
-Texture = Literal["auto", "hash", "texels", "none"]
+Texture = Literal["hash", "texels", "none"]
 """What colours a surfel beside its view colour."""
 
 
@@ -25,7 +25,7 @@ class SceneConfig:
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Texture = "hash"
     """Residual colours: hash = a field in space, multiresolution hash grid and MLP; texels = texels on every surfel,
-    which learn in the last part of the run; none = surfels alone; auto = texels on the CPU, hash on a GPU."""
+    which learn in the last part of the run; none = surfels alone."""
     levels: int = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: int = 256
@@ -49,12 +49,6 @@ class SceneConfig:
     on a GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
-
-    def settled(self, device_type: str) -> SceneConfig:
-        """With a texture that is trained on such a device in the place of `auto`."""
-        if self.texture != "auto":
-            return self
-        return replace(self, texture="texels" if device_type == "cpu" else "hash")
 
     @property
     def residual_moves_surfels(self) -> bool:

@@ -33,7 +33,7 @@ def build_scene(
         points: [M, 3] world positions; M may be 0.
         colours: [M, 3] in [0, 1].
         camera_centers: [C, 3] world positions of the training cameras.
-        scene_config: the representation; `auto` is that of the CPU, where it is not `settled`.
+        scene_config: the representation.
         train_config: training options.
         bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off, as it is for
             scenes with a small `declared` box.
@@ -48,7 +48,6 @@ def build_scene(
         ValueError: an option is out of range, or there is nothing to start from.
     """
     check_representation(scene_config)
-    scene_config = scene_config.settled("cpu")
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
     means = surfels["means"]
     near = NEAR * scene_extent(camera_centers, means)

@@ -31,7 +31,7 @@ def test_the_presets_are_those_that_are_registered() -> None:
 
 def test_the_default_preset_is_the_declared_defaults_but_for_the_texture() -> None:
     preset = load_preset("bitymi")
-    assert preset == Preset("bitymi", preset.description, scene=SceneConfig(texture="auto"))
+    assert preset == Preset("bitymi", preset.description, scene=SceneConfig(texture="texels"))
 
 
 def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:

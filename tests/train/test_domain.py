@@ -24,12 +24,6 @@ def build(cloud, bounded=False, pixels=0, declared=None, **options):
     return build_scene(*cloud, CENTERS, config, TrainConfig(), bounded, pixels, declared=declared)
 
 
-def test_a_texture_that_is_left_to_the_device():
-    for device, texture in (("cpu", "texels"), ("cuda", "hash")):
-        assert SceneConfig(texture="auto").settled(device).texture == texture
-    assert SceneConfig(texture="none").settled("cuda").texture == "none"
-
-
 def test_an_open_scene_is_contracted_about_its_cameras(cloud) -> None:
     scene, report = build(cloud)
     geometry = scene.field.geometry

@@ -6,13 +6,16 @@ file(GLOB cuda_bindings CONFIGURE_DEPENDS ${CMAKE_CURRENT_SOURCE_DIR}/csrc/bindi
 if(BITYMI_EMULATED_CUDA)
   # The compiler would hand .cu files to nvcc: each is included by a C++ file made here.
   set(emulated_sources ${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/emulator.cpp)
+  set(emulated_kernels ${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/emulator_probe.cpp)
   foreach(kernel ${cuda_kernels})
     get_filename_component(name ${kernel} NAME_WE)
     set(wrapper ${CMAKE_CURRENT_BINARY_DIR}/emulated/${name}.cpp)
     file(CONFIGURE OUTPUT ${wrapper} CONTENT "#include \"cuda/${name}.cu\"\n")
-    list(APPEND emulated_sources ${wrapper})
+    list(APPEND emulated_kernels ${wrapper})
   endforeach()
-  nanobind_add_module(_emulated NB_STATIC NOMINSIZE ${emulated_sources} ${cuda_bindings})
+  # what a card would refuse; the emulator says where
+  set_source_files_properties(${emulated_kernels} PROPERTIES COMPILE_OPTIONS -fsanitize=alignment)
+  nanobind_add_module(_emulated NB_STATIC NOMINSIZE ${emulated_sources} ${emulated_kernels} ${cuda_bindings})
   target_include_directories(_emulated PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
   target_compile_definitions(_emulated PRIVATE BITYMI_EMULATED)
   target_compile_options(_emulated PRIVATE -O2 -Wall -Wextra -ffp-contract=off)

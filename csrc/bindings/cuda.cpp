@@ -6,6 +6,9 @@
 #include "cuda/atlas_texture.h"
 #include "cuda/baked.h"
 #include "cuda/device_check.h"
+#if defined(BITYMI_EMULATED)
+#include "cuda/emulator_probe.h"
+#endif
 #include "cuda/kernels.h"
 #include "cuda/training.h"
 
@@ -124,7 +127,10 @@ void bind_all(nb::module_& m) {
 NB_MODULE(_emulated, m) {
   m.doc() = "The CUDA kernels, thread by thread on the host: for tests.";
   m.def("set_seed", &bt::emulator::set_seed, nanobind::arg("seed"),
-        "Seed of the order in which a block's threads take turns.");
+        "Seed of the order in which blocks and their threads take turns.");
+  m.def("stale_numbers", &bt::emulator::stale_numbers, "Threads that find what another block left in shared memory.");
+  m.def("open_barrier", &bt::emulator::open_barrier, "A kernel whose threads wait for one that does not come.");
+  m.def("read_float4", &bt::emulator::read_float4, nanobind::arg("offset"), "A kernel that may read misaligned.");
 #else
 NB_MODULE(_cuda, m) {
   m.doc() = "CUDA kernels: see bitymi_ns.ops for their meaning.";

@@ -3,6 +3,7 @@
 #undef _FORTIFY_SOURCE  // its longjmp takes a jump to another stack for an error
 #include "cuda/emulator.h"
 
+#include <link.h>
 #include <setjmp.h>
 #include <ucontext.h>
 
@@ -42,16 +43,20 @@ std::mt19937 shuffle;
 jmp_buf scheduler;
 size_t current;
 const std::function<void()>* body;
+bool inside = false;  // of a kernel's thread
+std::string fault;    // of a thread that had to stop
 
 // A switch returns a second time when its side is entered again: no variable of a caller may be at stake.
 __attribute__((noinline)) void enter(Fiber& f) {
   if (_setjmp(scheduler)) return;
+  inside = true;
   if (f.begun) _longjmp(f.place, 1);
   f.begun = true;
   setcontext(&f.context);
 }
 __attribute__((noinline)) void leave(Fiber& f, State state) {
   f.state = state;
+  inside = false;
   if (!_setjmp(f.place)) _longjmp(scheduler, 1);
 }
 
@@ -67,6 +72,31 @@ __attribute__((noinline)) void make(Fiber& f) {
   f.context.uc_stack.ss_size = kStack;
   f.context.uc_link = nullptr;
   makecontext(&f.context, run_threads, 0);
+}
+
+// The shared memory of all kernels: this library's storage of the thread, in which they alone keep anything.
+struct Range {
+  char* begin = nullptr;
+  size_t bytes = 0;
+};
+thread_local int mine = 0;  // so that there is such storage
+int look(dl_phdr_info* library, size_t, void* found) {
+  const auto* at = reinterpret_cast<const char*>(&mine);
+  for (int i = 0; i < library->dlpi_phnum; ++i) {
+    const auto& segment = library->dlpi_phdr[i];
+    auto* begin = static_cast<char*>(library->dlpi_tls_data);
+    if (segment.p_type != PT_TLS || !begin || at < begin || at >= begin + segment.p_memsz) continue;
+    *static_cast<Range*>(found) = {begin, segment.p_memsz};
+    return 1;
+  }
+  return 0;
+}
+Range shared_of_kernels() {
+  Range found;
+  ++mine;
+  dl_iterate_phdr(look, &found);
+  if (!found.begin) throw std::runtime_error("the emulator cannot find the shared memory of kernels");
+  return found;
 }
 
 void wait(State at) { leave(*fibers[current], at); }
@@ -109,7 +139,20 @@ bool open_barriers(size_t threads) {
   }
   return opened;
 }
+
+[[noreturn]] void give_up(const std::string& why) {
+  fibers.clear();  // they would go on in the middle of this kernel
+  fault.clear();
+  throw std::runtime_error(why);
+}
 }  // namespace
+
+void misaligned(const char* file, unsigned line) {
+  const std::string what = std::string(file) + ", line " + std::to_string(line) + ": a misaligned access";
+  if (!inside) throw std::runtime_error(what);
+  fault = what;
+  leave(*fibers[current], State::kDone);
+}
 
 void set_seed(unsigned seed) { shuffle.seed(seed); }
 void* dynamic_shared() { return shared_memory.data(); }
@@ -132,37 +175,49 @@ void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std:
     fibers.push_back(std::make_unique<Fiber>());
     make(*fibers.back());
   }
-  shared_memory.assign(shared / 8 + 1, 0xffffffffffffffffull);  // NaN: nobody may count on zeros
   grid_size = grid;
   body = &thread;
   std::vector<size_t> order(threads);
   for (size_t i = 0; i < threads; ++i) order[i] = i;
-  for (block_index.z = 0; block_index.z < grid.z; ++block_index.z)
-    for (block_index.y = 0; block_index.y < grid.y; ++block_index.y)
-      for (block_index.x = 0; block_index.x < grid.x; ++block_index.x) {
-        for (size_t i = 0; i < threads; ++i) {
-          fibers[i]->state = State::kReady;
-          fibers[i]->index = {unsigned(i % block.x), unsigned(i / block.x % block.y), unsigned(i / block.x / block.y)};
-        }
-        for (;;) {
-          std::shuffle(order.begin(), order.end(), shuffle);
-          for (size_t i : order) {
-            if (fibers[i]->state != State::kReady) continue;
-            current = i;
-            thread_index = fibers[i]->index;
-            enter(*fibers[i]);
-          }
-          const bool finished = std::all_of(fibers.begin(), fibers.begin() + threads,
-                                            [](const auto& f) { return f->state == State::kDone; });
-          if (finished) break;
-          const bool ready = std::any_of(fibers.begin(), fibers.begin() + threads,
-                                         [](const auto& f) { return f->state == State::kReady; });
-          if (!open_barriers(threads) && !ready) {
-            fibers.clear();  // they would go on in the middle of this kernel
-            throw std::runtime_error(std::string(kernel) + ": threads wait at barriers that not all of them reach");
-          }
-        }
+  std::vector<size_t> blocks(size_t(grid.x) * grid.y * grid.z);
+  for (size_t i = 0; i < blocks.size(); ++i) blocks[i] = i;
+  std::shuffle(blocks.begin(), blocks.end(), shuffle);
+  const Range kept = shared_of_kernels();
+  for (size_t b : blocks) {
+    block_index = {unsigned(b % grid.x), unsigned(b / grid.x % grid.y), unsigned(b / grid.x / grid.y)};
+    std::memset(kept.begin, 0xff, kept.bytes);  // NaN: nobody may count on zeros, or on what a block before left
+    shared_memory.assign(shared / 8 + 1, 0xffffffffffffffffull);
+    for (size_t i = 0; i < threads; ++i) {
+      fibers[i]->state = State::kReady;
+      fibers[i]->index = {unsigned(i % block.x), unsigned(i / block.x % block.y), unsigned(i / block.x / block.y)};
+    }
+    for (;;) {
+      std::shuffle(order.begin(), order.end(), shuffle);
+      for (size_t i : order) {
+        if (fibers[i]->state != State::kReady) continue;
+        current = i;
+        thread_index = fibers[i]->index;
+        enter(*fibers[i]);
+        if (!fault.empty()) give_up(std::string(kernel) + ": " + fault);
       }
+      const bool finished =
+          std::all_of(fibers.begin(), fibers.begin() + threads, [](const auto& f) { return f->state == State::kDone; });
+      if (finished) break;
+      const bool ready = std::any_of(fibers.begin(), fibers.begin() + threads,
+                                     [](const auto& f) { return f->state == State::kReady; });
+      if (!open_barriers(threads) && !ready)
+        give_up(std::string(kernel) + ": threads wait at barriers that not all of them reach");
+    }
+  }
 }
 
 }  // namespace bt::emulator
+
+// Called by code that is compiled with -fsanitize=alignment, before an access that a card would refuse.
+struct Access {
+  const char* file;
+  unsigned line, column;
+};
+extern "C" void __ubsan_handle_type_mismatch_v1(const Access* access, uintptr_t) {
+  bt::emulator::misaligned(access->file, access->line);
+}

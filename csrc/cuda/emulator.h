@@ -1,6 +1,7 @@
 // The part of CUDA that our kernels use, on the host: every CUDA thread is a fiber, a block's threads take turns in a
 // shuffled order and switch at barriers and warp steps. A missing barrier shows as a wrong result for some seed, a
-// barrier that not all threads reach as an error. Blocks run one after another. For tests: correct, not fast.
+// barrier that not all threads reach as an error. Blocks run one after another, in a shuffled order too, and each
+// begins with shared memory in which every number is NaN and every index is far off. For tests: correct, not fast.
 #pragma once
 
 #include <cmath>
@@ -36,6 +37,7 @@ void block_barrier();
 // Posts a value to the calling warp and returns those of all 32 lanes (lanes outside the mask: 0).
 const uint64_t* warp_exchange(unsigned mask, uint64_t value);
 int lane();
+void misaligned(const char* file, unsigned line);  // ends the thread, and the kernel with an error
 
 template <class T>
 uint64_t to_bits(T value) {
@@ -56,7 +58,7 @@ T from_bits(uint64_t bits) {
 #define __global__
 #define __device__
 #define __forceinline__ inline
-#define __shared__ static
+#define __shared__ static thread_local  // `launch` finds all of them in the thread's storage
 #define __launch_bounds__(...)
 #define __restrict__
 

@@ -71,7 +71,7 @@ def frames(options: Options, ours: dict[tuple[int, int, int], float]) -> str:
                 what = f"{name}, {times * n:,} Gaussians, {width} x {height}"
 
                 def measure(make: Callable = make, g: dict[str, Tensor] = g, camera: Camera = camera) -> float:
-                    return milliseconds(make(gsplat, g, camera), options)
+                    return milliseconds(make(gsplat, g)(camera), options)
 
                 ms = attempt(what, measure)
                 if ms is None:
@@ -88,22 +88,34 @@ def frames(options: Options, ours: dict[tuple[int, int, int], float]) -> str:
     )
 
 
-def _rasterization(gsplat: Any, g: dict[str, Tensor], camera: Camera, kind: str = "rasterization") -> Callable:
-    function, view = getattr(gsplat, kind), (camera.viewmat[None], camera.K[None], camera.width, camera.height)
-
-    @torch.no_grad()
-    def draw() -> object:
-        return function(*g.values(), *view, sh_degree=3, packed=False)
-
-    return draw
+Frames = Callable[[Camera], Callable[[], Tensor]]
+"""Gives for a camera what draws its view: [H, W, 3]."""
 
 
-def _rasterization_2dgs(gsplat: Any, g: dict[str, Tensor], camera: Camera) -> Callable:
-    return _rasterization(gsplat, g, camera, "rasterization_2dgs")
+def rasterized(kind: str) -> Callable[[Any, dict[str, Tensor]], Frames]:
+    """Frames by a function of gsplat, of the Gaussians as in `gaussians`."""
+
+    def of(gsplat: Any, g: dict[str, Tensor]) -> Frames:
+        function = getattr(gsplat, kind)
+
+        def make(camera: Camera) -> Callable[[], Tensor]:
+            view = (camera.viewmat[None], camera.K[None], camera.width, camera.height)
+
+            @torch.no_grad()
+            def draw() -> Tensor:
+                return function(*g.values(), *view, sh_degree=3, packed=False)[0][0]
+
+            return draw
+
+        return make
+
+    return of
 
 
-def _inference(compression: str) -> Callable:
-    def make(gsplat: Any, g: dict[str, Tensor], camera: Camera) -> Callable:
+def inferred(compression: str) -> Callable[[Any, dict[str, Tensor]], Frames]:
+    """Frames by the inference renderer, of a scene that is packed beforehand."""
+
+    def of(gsplat: Any, g: dict[str, Tensor]) -> Frames:
         from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
 
         scene = GaussianInferenceScene.from_gaussian_tensors(
@@ -111,20 +123,25 @@ def _inference(compression: str) -> Callable:
         )
         renderer = GaussianInferenceRenderer(scene)
 
-        @torch.inference_mode()
-        def draw() -> object:
-            return renderer.render(viewmat=camera.viewmat, K=camera.K, width=camera.width, height=camera.height)
+        def make(camera: Camera) -> Callable[[], Tensor]:
+            view = {"viewmat": camera.viewmat, "K": camera.K, "width": camera.width, "height": camera.height}
 
-        return draw
+            @torch.inference_mode()
+            def draw() -> Tensor:
+                return renderer.render(**view).frame[0, ..., :3]
 
-    return make
+            return draw
+
+        return make
+
+    return of
 
 
-RENDERERS: dict[str, Callable] = {
-    "rasterization": _rasterization,
-    "rasterization_2dgs": _rasterization_2dgs,
-    "inference renderer": _inference("none"),
-    "inference renderer, SH in 16 bytes": _inference("16b"),
+RENDERERS: dict[str, Callable[[Any, dict[str, Tensor]], Frames]] = {
+    "rasterization": rasterized("rasterization"),
+    "rasterization_2dgs": rasterized("rasterization_2dgs"),
+    "inference renderer": inferred("none"),
+    "inference renderer, SH in 16 bytes": inferred("16b"),
 }
 
 

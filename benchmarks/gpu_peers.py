@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from common import number, page, publish, say, table
 from gpu_common import Options, attempt, milliseconds
-from gpu_gsplat import load
+from gpu_gsplat import RENDERERS, Frames, load
 from plain_capture import Capture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -179,46 +179,11 @@ class Gaussians:
         }
 
 
-def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Callable[[Camera], Callable[[], Tensor]]:
-    """Makes frames by `rasterization`."""
-
-    def make(camera: Camera) -> Callable[[], Tensor]:
-        view = (camera.viewmat[None], camera.K[None], camera.width, camera.height)
-
-        @torch.no_grad()
-        def draw() -> Tensor:
-            return gsplat.rasterization(*g.values(), *view, sh_degree=3, packed=False)[0][0]
-
-        return draw
-
-    return make
-
-
-def inferred(gsplat: Any, g: dict[str, Tensor]) -> Callable[[Camera], Callable[[], Tensor]]:
-    """Makes frames by the inference renderer, of a scene packed to half precision."""
-    from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
-
-    name = f"trained{len(g['means'])}"
-    scene = GaussianInferenceScene.from_gaussian_tensors(*g.values(), sh_degree=3, sh_compression="none", id=name)
-    renderer = GaussianInferenceRenderer(scene)
-
-    def make(camera: Camera) -> Callable[[], Tensor]:
-        view = dict(viewmat=camera.viewmat, K=camera.K, width=camera.width, height=camera.height)
-
-        @torch.inference_mode()
-        def draw() -> Tensor:
-            return renderer.render(**view).frame[0, ..., :3]
-
-        return draw
-
-    return make
-
-
 def row(
     name: str,
     count: int,
     seconds: float | None,
-    make: Callable[[Camera], Callable[[], Tensor]],
+    make: Frames,
     capture: Capture,
     cameras: Sequence[Camera],
     times: Sequence[int],
@@ -231,7 +196,7 @@ def row(
     return Row(name, count, seconds, good, frames)
 
 
-def ours(folder: Path, device: torch.device) -> tuple[int, Callable[[Camera], Callable[[], Tensor]]]:
+def ours(folder: Path, device: torch.device) -> tuple[int, Frames]:
     """Surfels of a bundle, and what makes its frames: recorded graphs with 8 bits per channel."""
     bundle = read_bundle(folder, decode=False)
     scene = bundle.scene.to(device)
@@ -344,10 +309,10 @@ def main() -> int:
             g, seconds = trained.finished(), trained.seconds
             del trained
         n = len(g["means"])
-        for name, renderer in (("rasterization", rasterized), ("inference renderer", inferred)):
+        for name in ("rasterization", "inference renderer"):
 
-            def measured(name: str = name, renderer: Callable = renderer, g: dict = g, s: float = seconds) -> Row:
-                made = renderer(gsplat, g)
+            def measured(name: str = name, g: dict = g, s: float = seconds) -> Row:
+                made = RENDERERS[name](gsplat, g)
                 return row(f"gsplat {name}", len(g["means"]), s, made, capture, cameras, arguments.times, options)
 
             if found := attempt(f"{name}, {n:,}", measured):

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,56 +64,49 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         results: folder of the tables.
         data: folder of captures.
         surfels: sizes of the scenes in the tables.
-        steps: of the runs of `train`; None = the preset's.
+        steps: of the runs of `train` and `variants`; None = the preset's.
     """
     length = [] if steps is None else ["--steps", str(steps)]
-    others = [name for name in captures(data) if name != "fox"]
-    tests = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", "--timeout=90", "tests/cuda"]
+    bitymi = ("--presets", "bitymi")
+    pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short"]
     bundles = results / "bundles"
     baked = ("--surfels", "150000", "--runs", "100", "--no-check", "--sections", "baked")
     ncu = ["ncu", "--profile-from-start", "off", "--set", "detailed", "--clock-control", "none", "--page", "details"]
     large = ("--surfels", "150000", "--size", "1297x840")
+    kept = sorted(file.parent for file in bundles.glob("**/bundle.json"))
+
+    def page(name: str, script: str, *words: object) -> list[str]:
+        """A command that also writes its Markdown to a file of the results."""
+        return python(script, *map(str, words), "--output", str(results / name))
+
+    def of_each(what: str, limit: float, commands: Callable[[str], list[list[str]]]) -> list[Step]:
+        """A step for every capture but fox."""
+        return [Step(f"{what}{name}", commands(name), limit) for name in captures(data) if name != "fox"]
+
     return {
         "check": [
             Step("block textures", [[sys.executable, "-c", BLOCKS]], 60),
-            Step("tests", [[*tests, "-k", "not emulated"]], 240),
+            Step("tests", [[*pytest, "--timeout=90", "tests/cuda", "-k", "not emulated"]], 240),
             Step("kernels", [python("card_smoke.py", *large, "--times", "20")], 90),
             Step("sanitizers", [sanitizer(tool, *PROFILED) for tool in SANITIZERS], 150),
         ],
         "tables": [
-            Step(
-                "tables",
-                [
-                    python("gpu.py", "--runs", "100", "--no-check", "--surfels", *surfels)
-                    + ["--output", str(results / "gpu.md")]
-                ],
-                240,
-            ),
+            Step("tables", [page("gpu.md", "gpu.py", "--runs", "100", "--no-check", "--surfels", *surfels)], 240),
         ],
         "fox": [
             Step(
                 "fox",
-                [
-                    python("gpu_train.py", str(data / "fox"), "--presets", "bitymi", "--steps", "3000")
-                    + ["--keep", str(bundles), "--output", str(results / "fox.md")]
-                ],
+                [page("fox.md", "gpu_train.py", data / "fox", *bitymi, "--steps", "3000", "--keep", bundles)],
                 200,
             ),
-            Step(
-                "baked",
-                [
-                    python("gpu.py", *baked, "--bundles", str(bundles / "bitymi-3000"))
-                    + ["--output", str(results / "baked.md")]
-                ],
-                90,
-            ),
+            Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
         ],
         "textures": [
             Step(
                 "textures",
                 [
-                    python("gpu_train.py", str(data / "fox"), "--presets", "bitymi", "--textures", "hash", "texels")
-                    + ["--keep", str(bundles), "--steps", "3000", "--output", str(results / "textures.md")]
+                    page("textures.md", "gpu_train.py", data / "fox", *bitymi, "--textures", "hash", "texels")
+                    + ["--keep", str(bundles), "--steps", "3000"]
                 ],
                 200,
             ),
@@ -125,80 +118,47 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
                 400,
             )
         ],
-        "train": [
-            Step(
-                name,
-                [
-                    python(
-                        "gpu_train.py", str(data / name), "--presets", "bitymi", "--keep", str(bundles / name), *length
-                    )
-                    + ["--output", str(results / f"{name}.md")]
-                ],
-                600,
-            )
-            for name in others
-        ],
-        "variants": [
-            Step(
-                f"variants of {name}",
-                [
-                    python("gpu_train.py", str(data / name), "--presets", "bitymi", "--textures", texture)
-                    + ["--downscale", "2", *options, *length]
-                    + ["--output", str(results / f"{name}-{i}.md")]
-                    for i, (texture, options) in enumerate(VARIANTS)
-                ],
-                450,
-            )
-            for name in others
-        ],
-        "gaussians": [
-            Step(
-                f"Gaussians of {name}",
-                [
-                    python("gpu_peers.py", str(data / name), "--counts", str(count), "--save", str(results / name))
-                    for count in GAUSSIANS
-                ],
-                300,
-            )
-            for name in others
-        ],
-        "peers": [
-            Step(
-                f"peers on {name}",
-                [
-                    python("gpu_peers.py", str(data / name), "--bundles", *map(str, sorted(bundles.glob(f"{name}/*"))))
-                    + ["--gaussians", *(str(results / name / f"{count}.pt") for count in GAUSSIANS)]
-                    + ["--output", str(results / f"{name}-peers.md")]
-                ],
-                120,
-            )
-            for name in others
-        ],
+        "train": of_each(
+            "",
+            600,
+            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, *bitymi, "--keep", bundles / name, *length)],
+        ),
+        "variants": of_each(
+            "variants of ",
+            450,
+            lambda name: [
+                page(f"{name}-{i}.md", "gpu_train.py", data / name, *bitymi, "--textures", texture, "--downscale", "2")
+                + [*options, *length]
+                for i, (texture, options) in enumerate(VARIANTS)
+            ],
+        ),
+        "gaussians": of_each(
+            "Gaussians of ",
+            300,
+            lambda name: [
+                python("gpu_peers.py", str(data / name), "--counts", str(count), "--save", str(results / name))
+                for count in GAUSSIANS
+            ],
+        ),
+        "peers": of_each(
+            "peers on ",
+            120,
+            lambda name: [
+                page(f"{name}-peers.md", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
+                + ["--gaussians", *(str(results / name / f"{count}.pt") for count in GAUSSIANS)]
+            ],
+        ),
         "kernels": [
             Step(
                 f"kernels of bundles, {size}",
-                [
-                    python("card_smoke.py", "--sections", "--size", size, "--times", "20", "--bundles")
-                    + [str(file.parent) for file in sorted(bundles.glob("**/bundle.json"))]
-                ],
+                [python("card_smoke.py", "--sections", "--size", size, "--times", "20", "--bundles", *map(str, kept))],
                 60,
             )
             for size in ("1297x840", "3840x2160")
         ],
         "webgpu": [
-            Step(
-                "webgpu tests",
-                [[sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "--timeout=60", "tests/ops/webgpu"]],
-                60,
-            ),
-            Step(
-                "webgpu",
-                [
-                    python("gpu_webgpu.py", *map(str, sorted(bundles.glob("bitymi*"))))
-                    + ["--output", str(results / "webgpu.md")]
-                ],
-                90,
-            ),
+            Step("webgpu tests", [[*pytest, "--timeout=60", "tests/ops/webgpu"]], 60),
+            Step("webgpu", [page("webgpu.md", "gpu_webgpu.py", *sorted(bundles.glob("bitymi*")))], 90),
         ],
     }
 

@@ -17,7 +17,7 @@ each frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -121,8 +121,9 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
     return baked.to(device), camera
 
 
-def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:
-    """A line of the table, means over the cameras; and the milliseconds of the recorded, packed frame."""
+def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
+    """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of each column of the
+    table from `prepare` to `packed, waited for` ("alone")."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
     sums = dict.fromkeys(("pairs", "fragments", "prepare", "bin", "draw", "frame", "graph", "packed", "alone"), 0.0)
@@ -145,7 +146,12 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         for stage, run in cases:
             sums[stage] += milliseconds(run, options)
         sums["alone"] += with_launches(packed.run, options)
-    mean = {key: value / len(cameras) for key, value in sums.items()}
+    return {key: value / len(cameras) for key, value in sums.items()}
+
+
+def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:
+    """A line of the table; and the milliseconds of the recorded, packed frame."""
+    width, height, mean = cameras[0].width, cameras[0].height, measured(scene, cameras, options)
     say(f"baked, {name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
     pixels, draw = width * height, 1e-3 * mean["draw"]
     row = [

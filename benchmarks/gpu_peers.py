@@ -22,6 +22,7 @@ from typing import Any
 
 import torch
 from common import number, page, publish, say, table
+from gpu_baked import measured
 from gpu_common import Options, attempt, milliseconds
 from gpu_gsplat import RENDERERS, Frames, load
 from plain_capture import Capture, load_capture
@@ -29,14 +30,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.ops.constants import SH_C0
 from bitymi_ns.ops.ssim import ssim
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.init import neighbour_distance, scene_extent
+from bitymi_ns.train.losses import cc_psnr, photometric, psnr
 from bitymi_ns.train.views import View, training_order
 
-SH0 = 0.28209479177387814  # of the constant harmonic
 RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 
 
@@ -57,13 +59,6 @@ class Row:
     seconds: float | None
     quality: tuple[float, float, float]
     frames: dict[int, float]
-
-
-def larger(camera: Camera, times: int) -> Camera:
-    """The camera with so many times the pixels along each side."""
-    K = camera.K.clone()
-    K[:2] *= times
-    return Camera(camera.viewmat, K, times * camera.width, times * camera.height)
 
 
 def quality(draw: Callable[[Camera], Tensor], views: Sequence[View], device: torch.device) -> tuple[float, ...]:
@@ -96,9 +91,9 @@ class Gaussians:
         """
         self._gsplat = gsplat
         centres = torch.stack([view.camera.center for view in capture.train])
-        extent = 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())
+        extent = scene_extent(centres, capture.points)
         self.parameters = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(value.to(device)) for name, value in self._first(capture, most).items()}
+            {name: torch.nn.Parameter(value.to(device)) for name, value in self._first(capture, most, extent).items()}
         )
         rates = {**RATES, "means": RATES["means"] * extent}
         optimizers = {
@@ -118,8 +113,7 @@ class Gaussians:
             view = views[training_order(len(views), 0, step)]
             rgb, information = self._draw(view.camera, min(3, step // max(1, min(1000, steps // 10))))
             target = view.target(None, device)
-            loss = 0.8 * (rgb - target).abs().mean() + 0.2 * (1 - ssim(rgb, target))
-            loss = loss + 0.01 * torch.sigmoid(self.parameters["opacities"]).mean()
+            loss = photometric(rgb, target, 0.2) + 0.01 * torch.sigmoid(self.parameters["opacities"]).mean()
             loss = loss + 0.01 * torch.exp(self.parameters["scales"]).mean()
             loss.backward()
             for optimizer in optimizers.values():
@@ -132,20 +126,17 @@ class Gaussians:
         self.seconds = time.perf_counter() - start
 
     @staticmethod
-    def _first(capture: Capture, most: int) -> dict[str, Tensor]:
-        from scipy.spatial import cKDTree
-
+    def _first(capture: Capture, most: int, extent: float) -> dict[str, Tensor]:
         chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
         points, colours = capture.points[chosen], capture.colours[chosen]
-        distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)
-        size = torch.from_numpy(distances[:, 1:]).float().square().mean(1).sqrt().clamp_min(1e-6)
+        size = neighbour_distance(points, extent).clamp_min(1e-6)
         n = len(points)
         return {
             "means": points.clone(),
             "scales": torch.log(0.1 * size)[:, None].repeat(1, 3),
             "quats": torch.randn(n, 4, generator=torch.Generator().manual_seed(1)),
             "opacities": torch.logit(torch.full((n,), 0.5)),
-            "sh0": ((colours - 0.5) / SH0)[:, None],
+            "sh0": ((colours - 0.5) / SH_C0)[:, None],
             "shN": torch.zeros(n, 15, 3),
         }
 
@@ -191,44 +182,15 @@ def row(
 ) -> Row:
     """Measures one way to draw."""
     good = quality(lambda camera: make(camera)(), capture.held_out, options.device)
-    frames = {k: timed(make, [larger(camera, k) for camera in cameras], options) for k in times}
+    frames = {k: timed(make, [camera.scaled(k) for camera in cameras], options) for k in times}
     say(f"{name}, {count:,}: {good[0]:.2f} dB, " + ", ".join(f"{ms:.3f} ms at {k} x" for k, ms in frames.items()))
     return Row(name, count, seconds, good, frames)
 
 
-def ours(folder: Path, device: torch.device) -> tuple[int, Frames]:
-    """Surfels of a bundle, and what makes its frames: recorded graphs with 8 bits per channel."""
-    bundle = read_bundle(folder, decode=False)
-    scene = bundle.scene.to(device)
-
-    def make(camera: Camera) -> Callable[[], Tensor]:
-        drawn = BakedRenderer(scene, camera.width, camera.height, images=("packed",), graph=True)
-        drawn.draw([camera])
-        shape = (camera.height, camera.width)
-
-        def draw() -> Tensor:
-            drawn.run()
-            return drawn.images["packed"][0].view(torch.uint8).reshape(*shape, 4)[..., :3] / 255
-
-        draw.timed = drawn.run  # type: ignore[attr-defined]  # the frame alone
-        return draw
-
-    return len(bundle), make
-
-
-def by_stage(folder: Path, cameras: Sequence[Camera], options: Options) -> str:
-    """What the stages of our frames take, and of how much, means over the cameras."""
-    scene = read_bundle(folder, decode=False).scene.to(options.device)
-    drawn = BakedRenderer(scene, cameras[0].width, cameras[0].height, images=("packed",))
-    sums: dict[str, float] = {"pairs": 0.0, "fragments": 0.0}
-    for camera in cameras:
-        drawn.draw([camera])
-        sums["pairs"] += drawn.workspace.pairs
-        sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
-        for stage in (Stage.PREPARE, Stage.BIN, Stage.DRAW):
-            ms = milliseconds(lambda stage=stage: drawn.run(stage), options)
-            sums[f"{stage.name} ms"] = sums.get(f"{stage.name} ms", 0.0) + ms
-    return ", ".join(f"{name} {value / len(cameras):,.3f}" for name, value in sums.items())
+def packed_picture(scene: BakedScene, camera: Camera) -> Tensor:
+    """[H, W, 3] of a frame with 8 bits per channel."""
+    drawn = BakedRenderer(scene, camera.width, camera.height, images=("packed",)).draw([camera])["packed"][0]
+    return drawn.view(torch.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
 
 
 def report(rows: Sequence[Row], capture: Capture, times: Sequence[int], baked: int) -> str:
@@ -286,16 +248,16 @@ def main() -> int:
         publish(text, arguments.output, silent=silent)
 
     for folder in arguments.bundles:
-        count, make = ours(folder, device)
-        good = quality(lambda camera, make=make: make(camera)(), capture.held_out, device)
-        frames = {
-            k: timed(lambda camera, make=make: make(camera).timed, [larger(c, k) for c in cameras], options)
-            for k in arguments.times
-        }
-        say(f"{folder.name}: {good[0]:.2f} dB, {frames}")
+        bundle = read_bundle(folder, decode=False)
+        scene = bundle.scene.to(device)
+        good = quality(lambda camera, scene=scene: packed_picture(scene, camera), capture.held_out, device)
+        frames = {}
         for k in arguments.times:
-            say(f"at {k} x: {by_stage(folder, [larger(c, k) for c in cameras], options)}")
-        rows.append(Row(folder.name, count, None, good, frames))
+            means = measured(scene, [camera.scaled(k) for camera in cameras], options)
+            frames[k] = means["packed"]
+            say(f"{folder.name} at {k} x: " + ", ".join(f"{name} {value:,.3f}" for name, value in means.items()))
+        say(f"{folder.name}: {good[0]:.2f} dB")
+        rows.append(Row(folder.name, len(bundle), None, good, frames))
         baked += 1
         write()
     gsplat, why = load()
@@ -311,11 +273,11 @@ def main() -> int:
         n = len(g["means"])
         for name in ("rasterization", "inference renderer"):
 
-            def measured(name: str = name, g: dict = g, s: float = seconds) -> Row:
+            def drawn(name: str = name, g: dict = g, s: float = seconds) -> Row:
                 made = RENDERERS[name](gsplat, g)
                 return row(f"gsplat {name}", len(g["means"]), s, made, capture, cameras, arguments.times, options)
 
-            if found := attempt(f"{name}, {n:,}", measured):
+            if found := attempt(f"{name}, {n:,}", drawn):
                 rows.append(found)
             write()
     write(silent=False)

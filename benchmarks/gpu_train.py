@@ -27,8 +27,7 @@ from plain_capture import Capture, load_capture
 
 from bitymi_ns import bundle
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
-from bitymi_ns.host.preset import Preset, load_preset
-from bitymi_ns.presets import preset_dir
+from bitymi_ns.host.preset import Preset, PresetError, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene
@@ -124,11 +123,7 @@ def chosen(name: str, texture: str | None, options: Sequence[str]) -> tuple[str,
             group = group.setdefault(key, {})
         group[last] = yaml.safe_load(value)
     label = "-".join([name, *(change.rpartition(".")[2].replace("=", "-") for change in changes)])
-    with tempfile.TemporaryDirectory() as folder:
-        for file in preset_dir().glob("*.yaml"):
-            (Path(folder) / file.name).write_text(file.read_text("utf8"), "utf8")
-        (Path(folder) / "changed.yaml").write_text(yaml.safe_dump({"base": name, **values}), "utf8")
-        return label, load_preset("changed", Path(folder))
+    return label, load_preset(name, changes=values)
 
 
 def waits_of(trainer: Trainer, steps: int) -> float:
@@ -285,9 +280,12 @@ def main() -> int:
     what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     notes = [f"Device: {what}.", f"Frames: median of about {arguments.runs} after {arguments.warm_up}."]
     results, failed = [], False
-    runs = [(name, texture) for name in arguments.presets for texture in arguments.textures or (None,)]
-    for preset_name, texture in runs:
-        name, preset = chosen(preset_name, texture, arguments.options)
+    textures = arguments.textures or (None,)
+    try:
+        runs = [chosen(name, texture, arguments.options) for name in arguments.presets for texture in textures]
+    except PresetError as error:
+        parser.error(str(error))
+    for name, preset in runs:
         steps = arguments.steps or preset.trainer.iterations
         points = min(arguments.points, steps)
         try:
@@ -296,7 +294,7 @@ def main() -> int:
             traceback.print_exc()
             notes.append(f"{name} failed: {' '.join(str(error).split())[:400]}")
             failed = True
-        last = (preset_name, texture) == runs[-1]
+        last = name == runs[-1][0]
         text = page(f"Training on a card: {arguments.data.name}", report(results, capture), notes)
         publish(text, arguments.output, silent=not last)
     return int(failed)

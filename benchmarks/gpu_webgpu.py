@@ -18,14 +18,13 @@ from pathlib import Path
 
 import torch
 from common import number, page, publish, say, table
-from gpu_baked import around
-from gpu_common import Options, milliseconds
+from gpu_baked import around, measured
+from gpu_common import Options
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.webgpu.device import adapters, device
 from bitymi_ns.ops.webgpu.on_device import SceneOnDevice
-from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 HEADER = ("bundle", "surfels", "size", "layers", "WebGPU ms", "CUDA ms", "WebGPU / CUDA", "mean error / 255", "largest")
@@ -74,12 +73,7 @@ def main() -> int:
             pictures = []
             if card:
                 scene, options = plain.to("cuda"), Options(torch.device("cuda"), (), (), 5, arguments.runs, 0.0)
-                renderer = BakedRenderer(scene, width, height, images=("packed",), graph=True)
-                times = []
-                for camera in cameras:
-                    renderer.draw([camera])
-                    times.append(milliseconds(renderer.run, options))
-                cuda = statistics.fmean(times)
+                cuda = measured(scene, cameras, options)["packed"]
                 pictures = [scene.render(camera).rgb.cpu() for camera in cameras]
             for layers in arguments.layers:
                 ms = statistics.fmean(webgpu_milliseconds(there, camera, layers, arguments.runs) for camera in cameras)

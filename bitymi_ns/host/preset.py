@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
@@ -70,15 +71,20 @@ class Preset:
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
-def load_preset(name: str, folder: Path | None = None) -> Preset:
+def load_preset(name: str, folder: Path | None = None, changes: Mapping[str, Any] | None = None) -> Preset:
     """Read the preset `name` from `folder` (default: the installed presets).
+
+    Args:
+        name: of the file.
+        folder: of the files.
+        changes: laid over the file, as it is over its base.
 
     Raises:
         PresetError: the file is missing or is not a valid preset.
     """
     folder = preset_dir() if folder is None else folder
     path = folder / f"{name}.yaml"
-    values = _read_with_base(path, folder, ())
+    values = _merged(_read_with_base(path, folder, ()), changes or {})
     return build(Preset, {**values, "name": name}, path.name, "")
 
 
@@ -103,7 +109,7 @@ def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[s
     return _merged(_read_with_base(folder / f"{base}.yaml", folder, (*above, path)), values)
 
 
-def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     result = dict(below)
     for key, value in above.items():
         if isinstance(value, dict) and isinstance(result.get(key), dict):

@@ -8,6 +8,7 @@
 #include <string>
 
 #include "cuda/baked_stages.h"
+#include "cuda/warp.h"
 #include "cuda/workspace.h"
 
 namespace bt::cuda {
@@ -63,10 +64,9 @@ __device__ Footprint& footprint_in(FootprintRoom& room) { return *reinterpret_ca
 
 // At most so many tiles are listed for a surfel.
 __device__ int most_tiles(const Footprint& of, const BakedFrame& f) {
-  const Interval<float> x = columns_of(of.bounds);
-  const float pad = of.bounds.ellipse ? of.pad : 0;
-  const int left = of.bounds.whole ? 0 : pixel_from(of.cx + x.x0 - pad, f.width) / kTile,
-            right = of.bounds.whole ? f.tiles_x - 1 : pixel_to(of.cx + x.x1 + pad, f.width) / kTile;
+  const Interval<float> x = columns_of(of);
+  const int left = of.bounds.whole ? 0 : pixel_from(x.x0, f.width) / kTile,
+            right = of.bounds.whole ? f.tiles_x - 1 : pixel_to(x.x1, f.width) / kTile;
   return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
 }
 
@@ -179,8 +179,8 @@ __global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
     if (others) last = atomicAdd(m.other_tiles, __popc(others));
   }
   begin = __shfl_sync(kFullMask, begin, kWarp - 1) + before;
-  first = __shfl_sync(kFullMask, first, kWarp - 1) + __popc(longs & ((1u << lane) - 1));
-  last = __shfl_sync(kFullMask, last, kWarp - 1) + __popc(others & ((1u << lane) - 1));
+  first = __shfl_sync(kFullMask, first, kWarp - 1) + count_below(longs, lane);
+  last = __shfl_sync(kFullMask, last, kWarp - 1) + count_below(others, lane);
   if (!in) return;
   m.ranges[2 * tile] = begin, m.ranges[2 * tile + 1] = begin + count;
   m.order[is_long ? first : f.tiles - 1 - last] = uint32_t(tile);

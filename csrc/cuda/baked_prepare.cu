@@ -82,11 +82,8 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
       const Footprint area = footprint<Kernel>(row, v.height);
-      const PlaneBounds<float>& e = area.bounds;
-      const Interval<float> x = columns_of(e);
-      const float pad = e.ellipse ? area.pad : 0;
-      seen = level.visible && area.top <= area.bottom &&
-             (e.whole || (area.cx + x.x1 + pad >= 0 && area.cx + x.x0 - pad <= v.width));
+      const Interval<float> x = columns_of(area);
+      seen = level.visible && area.top <= area.bottom && (area.bounds.whole || (x.x1 >= 0 && x.x0 <= v.width));
       z = geom[kZ];
     }
     if (seen) {

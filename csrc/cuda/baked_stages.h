@@ -99,6 +99,13 @@ BT_HD Footprint footprint(const float* row, int height) {
   return f;
 }
 
+// From where to where the pixels lie that it can touch; of a footprint that is not everywhere.
+BT_HD Interval<float> columns_of(const Footprint& f) {
+  const Interval<float> x = columns_of(f.bounds);
+  const float pad = f.bounds.ellipse ? f.pad : 0;
+  return {f.cx + x.x0 - pad, f.cx + x.x1 + pad};
+}
+
 // A row of tiles: the pixels that can be touched in each of its bands of four rows, and the tiles of these.
 struct TileRow {
   int from[kBands], to[kBands];  // pixels, none when from > to

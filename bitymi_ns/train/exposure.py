@@ -22,6 +22,7 @@ from bitymi_ns.train.agreement import measure_agreement
 from bitymi_ns.train.config import ExposureKind
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.optimizers import set_rate
+from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import View
 
 LIMIT = 2.0
@@ -120,6 +121,22 @@ class Exposure:
         gains = torch.zeros(12, dtype=torch.bool, device=row.device)
         gains[_diagonal(row)] = True
         return torch.where(gains, torch.where(gains, row, 0.0).exp(), row).view(3, 4)
+
+    @torch.no_grad()
+    def average(self, processes: Processes) -> None:
+        """Makes the gradients of this process's photographs those of the mean loss of all photographs of the step."""
+        if self.table is None:
+            return
+        rows = self.table.new_zeros(len(self.table), self.table.shape[1] + 1)
+        if self.table.grad is not None:
+            own = self.table.grad.coalesce()
+            rows[own.indices()[0]] = torch.cat([own.values(), own.values().new_ones(len(own.values()), 1)], 1)
+        processes.sum(rows)
+        shown = rows[:, -1].nonzero().flatten()
+        if len(shown) > 0:
+            values = rows[shown, :-1] / processes.views
+            sizes = self.table.shape
+            self.table.grad = torch.sparse_coo_tensor(shown[None], values, sizes, check_invariants=False)
 
     def step(self, rate: float) -> None:
         """Learns from the gradients of a step's loss, which it clears.

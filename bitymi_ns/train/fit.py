@@ -16,6 +16,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import TrainingData, View, training_order
 
@@ -62,7 +63,13 @@ class Trainer:
     """
 
     def __init__(
-        self, scene: Scene, views: Sequence[View], config: TrainConfig, max_steps: int, extent: float | None = None
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        config: TrainConfig,
+        max_steps: int,
+        extent: float | None = None,
+        processes: Processes = ALONE,
     ) -> None:
         """
         Args:
@@ -71,6 +78,7 @@ class Trainer:
             config: training options.
             max_steps: length of the run; the schedules depend on it.
             extent: scene extent in world units; default: from the cameras.
+            processes: of the run, and how many views each looks at in a step; all are given the same.
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")
@@ -80,22 +88,23 @@ class Trainer:
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
         pixels = sum(view.camera.width * view.camera.height for view in views)
-        self.training = Training(
-            scene, TrainingData(views, extent, pixels, len(scene)), self.optimizers, config, max_steps
-        )
+        data = TrainingData(views, extent, pixels, len(scene))
+        self.training = Training(scene, data, self.optimizers, config, max_steps, processes=processes)
         self.step = 0
         self._views = len(views)
         self._terms: list[Tensor] = []
 
     def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
-        """Do one step: the terms of its loss, the rendered view, and what the strategy did after it."""
+        """Do one step: the terms of the loss of its (last) view, that view, and what the strategy did after it."""
         self.training.begin(self.step)
         forget_gradients(self.optimizers.values())
-        view = self.training.view(training_order(self._views, self.config.seed, self.step))
-        terms, output = self.training.losses(view)
-        learning = [term for term in terms.values() if term.requires_grad]
-        if learning:
-            torch.autograd.backward(learning, [_one(term) for term in learning])
+        for number in self.training.processes.numbers(self.step):
+            view = self.training.view(training_order(self._views, self.config.seed, number))
+            terms, output = self.training.losses(view)
+            learning = [term for term in terms.values() if term.requires_grad]
+            if learning:
+                torch.autograd.backward(learning, [_one(term) for term in learning])
+        self.training.combine()
         step(self.optimizers.values())
         report = self.training.finish()
         self._terms = [term.detach() for term in terms.values()]

@@ -35,6 +35,7 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.resize import replace_rows
 from bitymi_ns.train.views import ReducedViews, judging_background
 
@@ -77,6 +78,7 @@ class Guard:
         config: TrainConfig,
         announce: Callable[[str], None] = warnings.warn,
         exposure: Exposure | None = None,
+        processes: Processes = ALONE,
     ) -> None:
         """
         Args:
@@ -85,7 +87,9 @@ class Guard:
             config: training options.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
             exposure: restored, too; None = there are no corrections.
+            processes: of the run.
         """
+        self.processes = processes
         self.exposure = exposure
         self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
         self.schedule, self.config, self.announce = schedule, config, announce
@@ -134,7 +138,8 @@ class Guard:
         if not self.on or self._states:
             return
         self._views = views
-        epochs = -(-self.window // len(views)) * len(views)
+        epoch = len(views) // math.gcd(len(views), self.processes.views)  # steps in which all are seen equally often
+        epochs = -(-self.window // epoch) * epoch
         self.window = max(self.window, min(epochs, self.schedule.max_steps // SHARE_OF_RUN))
         if math.isnan(self._limit):
             self._limit = max(self._loss_of(views, 1.0), self._loss_of(views, 1.0, blank=True))
@@ -158,7 +163,7 @@ class Guard:
                 output = self.scene.render(view.camera.to(device), background=background, field_mode="frozen")
                 drawn = view.shown(output.rgb, output.alpha, background)
             losses.append(photometric(drawn, target, self.config.loss.ssim_weight, view.mask))
-        return float(torch.stack(losses).mean())
+        return self.processes.mean(float(torch.stack(losses).mean()))
 
     def _convert(self, step: int) -> None:
         """Express what was measured so far as losses at the resolution of the next step."""

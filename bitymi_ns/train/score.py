@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.views import View, judging_background
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | Non
 
 
 @torch.no_grad()
-def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) -> Scores:
+def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, processes: Processes = ALONE) -> Scores:
     """Render the views and score every surfel (the score s_d of the paper and FastGS's prune score).
 
     Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight.
@@ -68,13 +69,14 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
         scene: N surfels.
         views: K views, at the size in which they are to be judged; none gives zero scores.
         config: training options.
+        processes: each renders its share of the views.
     """
     n = len(scene)
     device = scene.surfels["means"].device
     total = torch.zeros(n, dtype=torch.int64, device=device)
     weighted = torch.zeros(n, dtype=torch.float64, device=device)
     background = judging_background(config.background, device)
-    for view in (view.to(device) for view in views):
+    for view in (view.to(device) for view in views[processes.rank :: processes.count]):
         target = view.target(background, device)
         output = scene.render(view.camera, background=background, field_mode="frozen")
         rgb = view.shown(output.rgb, output.alpha, background)
@@ -84,5 +86,6 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig) 
         total += counts
         weighted += loss.double() * counts
         del output  # with its fragments, before the next view makes its own
+    processes.sum(total, weighted)
     importance = torch.div(total, max(1, len(views)), rounding_mode="floor")
     return Scores(importance, normalise(weighted).float())

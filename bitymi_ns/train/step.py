@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -20,6 +19,7 @@ from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.losses import objective
 from bitymi_ns.train.optimizers import set_rate
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.resize import ResizeHook
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
@@ -72,11 +72,14 @@ def view_losses(
 class Training:
     """What a training step needs beside the scene, and what it does. The order of a step:
 
-    `begin` -> zero the gradients -> `losses` -> backward of their sum -> step of the optimisers -> `finish`.
+    `begin` -> zero the gradients -> `losses` -> backward of their sum -> `combine` -> optimisers -> `finish`.
+
+    A step of several processes looks at several views, and does what one process would with the mean of their losses.
+    Every process calls everything here at the same steps. `losses` and backward are called for each of its views.
 
     Attributes:
         step: index of the step that was begun last.
-        schedule, strategy, guard, texels, watch: of the run.
+        schedule, strategy, guard, texels, watch, processes: of the run.
         exposure: how the training photographs differ in their colours; decided when the first step begins.
         clock: time between `begin` and `finish`.
     """
@@ -90,6 +93,7 @@ class Training:
         max_steps: int,
         on_resize: ResizeHook | None = None,
         announce: Callable[[str], None] = warnings.warn,
+        processes: Processes = ALONE,
     ) -> None:
         """
         Args:
@@ -100,27 +104,31 @@ class Training:
             max_steps: length of the run; the schedules depend on it.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
+            processes: of the run.
 
         Raises:
             ValueError: a training option is out of its range.
         """
-        self.scene, self.optimizers, self.config = scene, optimizers, config
+        self.scene, self.optimizers, self.config, self.processes = scene, optimizers, config, processes
         textured = scene.config.texture == "texels"
         self.schedule = Schedule(config, max_steps, data.extent, textured)
         self.schedule.reset_opacity()
         for name in optimizers:
             self.schedule.lr(name, 0)
-        self.strategy = Strategy(config, self.schedule, data.extent, on_resize, data.image_pixels, data.first_surfels)
+        self.strategy = Strategy(
+            config, self.schedule, data.extent, on_resize, data.image_pixels, data.first_surfels, processes
+        )
         self.exposure = Exposure(config.exposure, data.exif_stops)
         self.schedule.lr("exposure", 0)
-        self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure)
-        self.texels = LearningTexels(scene, self.schedule, config.texels)
+        self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure, processes)
+        self.texels = LearningTexels(scene, self.schedule, config.texels, processes)
         self.watch = LossWatch()
         self.clock = Stopwatch()
         self.step = 0
         self._full_size = data.views
-        self._output: RenderOutput | None = None
-        self._photometric = torch.tensor(math.nan)
+        self._outputs: list[RenderOutput] = []
+        self._photometric: list[Tensor] = []
+        self._alike = processes.count == 1
 
     @functools.cached_property
     def views(self) -> ReducedViews:
@@ -137,10 +145,18 @@ class Training:
         self.step = step
         if not self.exposure.decided:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
+        if not self._alike:
+            self._start_alike()
         if self.texels.begin(step, self.views):
             self.guard.start_from_here()
         self.guard.before(step, self.views)
         self._set_rates()
+
+    def _start_alike(self) -> None:
+        self._alike = True
+        self.processes.like_first(self.scene.state_dict().values())
+        exposure = self.processes.from_first(self.exposure.state_dict(), self.scene.surfels["means"].device)
+        self.exposure.load_state_dict(exposure, len(self._full_size))
 
     def _set_rates(self) -> None:
         for name, optimizer in self.optimizers.items():
@@ -154,15 +170,33 @@ class Training:
         """
         while True:
             self.texels.prepare(self.step, view, self.guard.factor)
+            diverged: TrainingDiverged | None = None
             try:
                 terms, output = view_losses(self.scene, view, self.schedule, self.step, self.config, self.watch)
             except TrainingDiverged as error:
-                self.watch.forget()
-                self.guard.failed(self.step, error)
-                self._set_rates()
-            else:
-                self._output, self._photometric = output, terms["photometric"].detach()
+                diverged = error
+            problem = self.processes.problem(None if diverged is None else str(diverged))
+            if problem is None:
+                self._outputs.append(output)
+                self._photometric.append(terms["photometric"].detach())
                 return terms, output
+            self.watch.forget()
+            self.guard.failed(self.step, diverged or TrainingDiverged(problem))
+            self._set_rates()
+
+    def combine(self) -> None:
+        """After the backward passes: the gradients become those of the mean loss of all views of the step.
+
+        Raises:
+            ProcessLost: another process has ended.
+        """
+        if self.processes.views == 1:
+            return
+        groups = (group for optimizer in self.optimizers.values() for group in optimizer.param_groups)
+        learned = [parameter for group in groups for parameter in group["params"]]
+        self.processes.average_gradients([*learned, *self.texels.gathered], len(self.scene))
+        self.exposure.average(self.processes)
+        self.texels.step()
 
     def finish(self) -> dict[str, float]:
         """After the optimisers: densify, prune, look for divergence, stop the clock.
@@ -173,14 +207,14 @@ class Training:
         Raises:
             TrainingDiverged: the run has gone back too often, or may not.
         """
-        step, output = self.step, self._output
-        assert output is not None, "a step is finished after its losses"
-        self._output = None
+        step, outputs, photometric = self.step, self._outputs, self._photometric
+        assert outputs, "a step is finished after its losses"
+        self._outputs, self._photometric = [], []
         self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step))
         if not self.schedule.densification_over(step):
-            self.strategy.accumulate(output)
-        broken = output.projection.broken
-        del output  # with its fragments, before the strategy draws views of its own
+            self.strategy.accumulate(*outputs)
+        loss, broken = self._together(photometric, [output.projection.broken for output in outputs])
+        del outputs  # with their fragments, before the strategy draws views of its own
         factor = self.schedule.resolution_factor(step)
         try:
             report = self.strategy.step(
@@ -189,11 +223,20 @@ class Training:
         except TrainingDiverged as error:  # the optimisers broke the field or all surfels; no loss has shown it yet
             report = self.guard.failed(step, error)
         else:
-            report |= self.guard.after(step, self._photometric, broken)
+            report |= self.guard.after(step, loss, broken)
         if "rolled_back" in report:
             self.watch.forget()
         self.clock.stop()
         return report
+
+    def _together(self, losses: list[Tensor], broken: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Mean loss of the views of the step, and most surfels that one of them could not draw."""
+        if self.processes.views == 1:
+            return losses[0], broken[0]
+        loss, most = torch.stack(losses).sum(), torch.stack(broken).amax(0)
+        self.processes.sum(loss)
+        self.processes.maximum(most)
+        return loss / self.processes.views, most
 
     def state_dict(self) -> dict[str, Any]:
         """What decides, beside the scene and its optimisers, how the run goes on."""

@@ -25,6 +25,7 @@ from bitymi_ns.ops.picture_cuda import note_centers
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.rotations import tangents
 from bitymi_ns.train.schedules import Schedule
@@ -66,6 +67,7 @@ class Strategy:
         on_resize: ResizeHook | None = None,
         image_pixels: int = 0,
         first_surfels: int = 0,
+        processes: Processes = ALONE,
     ) -> None:
         """
         Args:
@@ -75,8 +77,10 @@ class Strategy:
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
             first_surfels: that training started with, for `densify.growth`.
+            processes: of the run.
         """
         self.config = config
+        self.processes = processes
         self.schedule = schedule
         self.extent = extent
         self.on_resize = on_resize
@@ -102,9 +106,27 @@ class Strategy:
             setattr(self, name, state[name].detach().clone().float())
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))
 
+    def accumulate(self, *outputs: RenderOutput) -> None:
+        """Note the statistics of the training views of a step, here and in all other processes; call it after the
+        backward pass."""
+        if self.processes.views == 1:
+            self._note(*outputs)
+            return
+        before = {name: getattr(self, name) for name in STATISTICS}
+        self._clear(0, torch.device("cpu"))
+        for output in outputs:
+            self._note(output)
+        self.processes.sum(self.grad_sum, self.abs_grad_sum, self.visible_count)
+        self.processes.maximum(self.max_radius)
+        if len(before["grad_sum"]) == 0:
+            return
+        for name, value in before.items():
+            join = torch.maximum if name == "max_radius" else torch.add
+            setattr(self, name, join(value.to(self.grad_sum.device), getattr(self, name)))
+
     @torch.no_grad()
-    def accumulate(self, output: RenderOutput) -> None:
-        """Note the statistics of one training view; call it after the backward pass.
+    def _note(self, output: RenderOutput) -> None:
+        """Add the statistics of one training view.
 
         Reads `projection.mean2d_grad` and `mean2d_absgrad` ([N, 2], pixels), `visible` [N] and `radii` [N, 2].
         """
@@ -300,7 +322,8 @@ class Strategy:
         return (race / weights).topk(k, largest=False).indices
 
     def _scores(self, scene: Scene, views: DrawViews) -> Scores:
-        return multi_view_scores(scene, views(self.config.densify.views, self.generator), self.config)
+        drawn = views(self.config.densify.views, self.generator)
+        return multi_view_scores(scene, drawn, self.config, self.processes)
 
     def _remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
         if not bool(pruned.any()):

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
+from torch.utils.hooks import RemovableHandle
 
 from bitymi_ns.ops import TexelDescent, add_list_coverage, fitting_lists, project
 from bitymi_ns.ops.constants import SUPPORT
@@ -17,6 +19,7 @@ from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_project
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.losses import numbers
 from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.rotations import tangents
 
 if TYPE_CHECKING:
@@ -38,14 +41,16 @@ slowly."""
 class LearningTexels:
     """The part of a run in which texels learn."""
 
-    def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig) -> None:
+    def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
         """
         Args:
             scene: gets a `TexelField` when the part begins.
             schedule: of the run.
             options: see `TexelConfig`.
+            processes: of the run.
         """
-        self.scene, self.schedule, self.options = scene, schedule, options
+        self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
+        self._rate: RemovableHandle | None = None
 
     def begin(self, step: int, views: ReducedViews) -> bool:
         """Gives the surfels their tiles where this step is the first that needs them; whether it was."""
@@ -54,7 +59,12 @@ class LearningTexels:
         most = max(FEWEST_VIEWS, round(self.options.views * (self.schedule.max_steps - self.schedule.texels_start)))
         count = min(most, len(views))
         some = OnDemand(count, lambda i: views.at(i * len(views) // count, 1.0))
-        self.scene.field = blank_texels(self.scene, some, len(views), self.options)
+        field = blank_texels(self.scene, some, len(views), self.options) if self.processes.first else None
+        if self.processes.count > 1:
+            device = self.scene.surfels["means"].device
+            found = self.processes.from_first(None if field is None else field.state_dict(), device)
+            field = TexelField(found["size"], found["extent"], found["texels"], found["share"])
+        self.scene.field = field
         return True
 
     def prepare(self, step: int, view: View, factor: float) -> None:
@@ -67,7 +77,27 @@ class LearningTexels:
         if isinstance(field, TexelField):
             # the loss is a mean, the step wants a sum
             rate = factor * self.schedule.texel_rate(step) * numbers(view.image, view.mask)
-            field.descent = TexelDescent(field.share, rate)
+            if self.processes.views == 1:
+                field.descent = TexelDescent(field.share, rate)
+                return
+            field.descent = None  # several views move the texels together, in `step`
+            if self._rate is not None:
+                self._rate.remove()
+            self._rate = field.texels.register_hook(lambda gradient: gradient * rate)
+
+    @property
+    def gathered(self) -> list[Parameter]:
+        """The texels, where the views of a step move them together."""
+        field = self.scene.field
+        return [field.texels] if self.processes.views > 1 and isinstance(field, TexelField) else []
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Moves the texels by the mean of what each view of the step would have moved them by."""
+        field = self.scene.field
+        if isinstance(field, TexelField) and field.texels.grad is not None:
+            field.texels.addcmul_(field.share[:, None], field.texels.grad, value=-1.0)
+            field.texels.grad = None
 
 
 @torch.no_grad()

@@ -44,7 +44,7 @@ class Bench:
         self.asked = []
         monkeypatch.setattr(module, "multi_view_scores", self._scores)
 
-    def _scores(self, scene, views, config):
+    def _scores(self, scene, views, config, processes):
         # rows are known by their x: scores stay with their surfels when rows were dropped before
         rows = scene.surfels["means"][:, 0].detach().nan_to_num(0).round().long()
         return Scores(self.importance[rows], self.prune[rows])

@@ -1,0 +1,168 @@
+"""The processes of a run, each of which looks at views of its own: the one place where they speak to each other.
+
+Every process holds the whole scene and makes every decision itself. What decisions rest on is made alike here: sums
+over all processes, or what the first one found. They speak through torch.distributed's default group, which needs gloo
+for tensors on the CPU, and nccl for those on cards.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+
+class ProcessLost(RuntimeError):
+    """Another process of the run has ended, or does not answer."""
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Those of a run, as one of them sees them. Alone, nothing here does anything.
+
+    Attributes:
+        rank: number of this process; 0 is the first, which alone writes and prints.
+        count: of processes.
+        each: views that a process looks at in a step, one after the other.
+    """
+
+    rank: int = 0
+    count: int = 1
+    each: int = 1
+
+    @classmethod
+    def joined(cls, each: int = 1) -> Processes:
+        """Those of torch.distributed's default group; this one alone where there is none."""
+        if not (dist.is_available() and dist.is_initialized()):
+            return cls(each=each)
+        return cls(dist.get_rank(), dist.get_world_size(), each)
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that writes and prints."""
+        return self.rank == 0
+
+    @property
+    def views(self) -> int:
+        """How many views a step of all processes looks at."""
+        return self.count * self.each
+
+    def numbers(self, step: int) -> range:
+        """Places, in the order of the training views, of those that this process looks at in a step."""
+        start = step * self.views + self.rank * self.each
+        return range(start, start + self.each)
+
+    # what decisions rest on
+
+    def any(self, condition: bool) -> bool:
+        """Whether the condition holds for a process."""
+        return bool(self._largest([int(condition)])[0])
+
+    def problem(self, own: str | None) -> str | None:
+        """The problem of the first process that has one; None where none has."""
+        if self.count == 1 or not self.any(own is not None):
+            return own
+        found: list[str | None] = [None] * self.count
+        with _answering():
+            dist.all_gather_object(found, own)
+        return next(text for text in found if text is not None)
+
+    def mean(self, value: float) -> float:
+        """Mean over the processes of a number that all have, to within rounding."""
+        if self.count == 1:
+            return value
+        total = torch.tensor(value, dtype=torch.float64)
+        self.sum(total)
+        return float(total) / self.count
+
+    def from_first(self, state: Any, device: torch.device | str) -> Any:
+        """What the first process gives: tensors, numbers and text, on a device; the others may give None."""
+        if self.count == 1:
+            return state
+        packed = io.BytesIO()
+        if self.first:
+            torch.save(state, packed)
+        box = [packed.getvalue()]
+        with _answering():
+            dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
+        return state if self.first else torch.load(io.BytesIO(box[0]), map_location=device, weights_only=True)
+
+    def like_first(self, tensors: Iterable[Tensor]) -> None:
+        """Gives tensors the values that they have in the first process."""
+        if self.count == 1:
+            return
+        with _answering(), torch.no_grad():
+            for tensor in tensors:
+                dist.broadcast(tensor, src=0)
+
+    # sums
+
+    def sum(self, *tensors: Tensor) -> None:
+        """Replaces tensors by their sums over the processes, the same bits in all of them."""
+        self._reduce(tensors, dist.ReduceOp.SUM)
+
+    def maximum(self, tensor: Tensor) -> None:
+        """Replaces a tensor by its largest values over the processes."""
+        self._reduce([tensor], dist.ReduceOp.MAX)
+
+    @torch.no_grad()
+    def average_gradients(self, parameters: Sequence[Tensor], surfels: int) -> None:
+        """Replaces gradients that were summed over the views of this process by their means over all views of the step.
+
+        A parameter that no view moves keeps having none.
+
+        Args:
+            parameters: the same in all processes, with dense gradients.
+            surfels: number of them in the scene, to be compared: the processes have to agree before they add.
+
+        Raises:
+            RuntimeError: the processes have come apart.
+        """
+        *moved, most, least = self._largest([*(int(p.grad is not None) for p in parameters), surfels, -surfels])
+        if most != -least:
+            raise RuntimeError(
+                f"the processes of the run have come apart: one has {most:,} surfels, another {-least:,}. Their "
+                "checkpoints up to here can be resumed; please report this"
+            )
+        gradients = []
+        for parameter, there in zip(parameters, moved, strict=True):
+            if there and parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            if parameter.grad is not None:
+                gradients.append(parameter.grad)
+        self.sum(*gradients)
+        if gradients:
+            torch._foreach_div_(gradients, float(self.views))
+
+    def _largest(self, values: Sequence[int]) -> list[int]:
+        if self.count == 1:
+            return list(values)
+        found = torch.tensor(values, dtype=torch.int64)
+        self.maximum(found)
+        return found.tolist()
+
+    def _reduce(self, tensors: Sequence[Tensor], how: Any) -> None:
+        if self.count == 1:
+            return
+        with _answering():
+            for work in [dist.all_reduce(tensor, how, async_op=True) for tensor in tensors]:
+                work.wait()
+
+
+ALONE = Processes()
+
+
+@contextmanager
+def _answering() -> Iterator[None]:
+    """Says in a word what torch's errors of a connection mean."""
+    try:
+        yield
+    except RuntimeError as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ProcessLost(f"another process of the run has ended, or does not answer ({said})") from error

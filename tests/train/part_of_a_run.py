@@ -1,0 +1,72 @@
+"""One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT [STEP AT WHICH IT ENDS]."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import DensifyConfig, ExposureKind, TexelConfig, TrainConfig
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.processes import Processes, ProcessLost
+
+STEPS = 60
+LOST = 3
+
+
+def options(exposure: ExposureKind) -> TrainConfig:
+    """Densifications, a reset, final prunes, and texels from step 36 on."""
+    densify = DensifyConfig(
+        max_surfels=300, min_interval=1, min_reset_interval=1, pixels_per_surfel=0, views=5, reset_interval=9_000
+    )
+    return TrainConfig(densify=densify, background="random", exposure=exposure, texels=TexelConfig(start=18_000))
+
+
+def train(inputs: dict[str, Any], processes: Processes, ends: int = STEPS) -> dict[str, Any]:
+    """The run's end, and what it looked like on the way: a digest of all parameters every ten steps."""
+    config, field = SceneConfig(texture=inputs["texture"]), None
+    if config.texture == "hash":
+        field = HashField(config, (0.0, 0.0, 0.0), 1.5, False, 10, torch.Generator().manual_seed(processes.rank))
+    trainer = Trainer(
+        Scene(config, inputs["surfels"], field), inputs["views"], options(inputs["exposure"]), STEPS, 3.0, processes
+    )
+    digests, reports = [], []
+    while trainer.step < STEPS:
+        if trainer.step == ends:
+            os._exit(1)
+        *_, report = trainer.advance()
+        reports.append(report)
+        if trainer.step % 10 == 0:
+            bits = [value.numpy().tobytes() for value in trainer.scene.state_dict().values()]
+            digests.append(hashlib.sha256(b"".join(bits)).hexdigest())
+    return {"digests": digests, "reports": reports, "state": trainer.state_dict()}
+
+
+def main() -> None:
+    folder, rank, count = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    ends = int(sys.argv[4]) if len(sys.argv) > 4 else STEPS
+    torch.set_num_threads(1)
+    inputs = torch.load(folder / "inputs.pt", weights_only=False)
+    dist.init_process_group(
+        "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=count, timeout=timedelta(seconds=60)
+    )
+    try:
+        result = train(inputs, Processes.joined(), ends)
+    except ProcessLost as error:
+        print(error, file=sys.stderr)
+        sys.exit(LOST)
+    torch.save(result, folder / f"end-{rank}.pt")
+    dist.destroy_process_group()
+
+
+if __name__ == "__main__":
+    main()

@@ -27,6 +27,7 @@ from bitymi_ns.train.coverage import views_without_surfels
 from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import TrainingData, View
 
@@ -34,7 +35,7 @@ from bitymi_ns.train.views import TrainingData, View
 class TrainingRun:
     """Ties `Training` to nerfstudio's loop. Order of a step there:
 
-    `before` -> the data manager's `next_train` -> `losses` -> backward -> optimisers -> `after`.
+    `before` -> the data manager's `next_train` -> `losses` -> backward -> `Training.combine` -> optimisers -> `after`.
     """
 
     def __init__(
@@ -76,9 +77,11 @@ class TrainingRun:
         )
         optimizers = attributes.optimizers.optimizers
         try:
-            self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn)
+            processes = Processes(trainer.local_rank, trainer.world_size)
+            self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
+        attributes.optimizers.before_step = self.training.combine
         self.capture = capture_print(self.datamanager.train_dataset)
         self._random_state: Tensor | None = None
         if resume_state:
@@ -99,7 +102,10 @@ class TrainingRun:
         }
         self._held_back = False  # whether it was said that densification meets its bound
         for sentence in bounds.short_run(
-            self.training.schedule, len(self.datamanager.train_dataset), scene.config.texture == "hash"
+            self.training.schedule,
+            len(self.datamanager.train_dataset),
+            scene.config.texture == "hash",
+            processes.views,
         ):
             say(sentence)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time

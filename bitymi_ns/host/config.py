@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,6 +39,7 @@ class BitymiTrainerConfig(TrainerConfig):
     """Configuration of a training run."""
 
     _target: type = field(default_factory=lambda: BitymiTrainer)
+    processes = 1  # of the run; no field: --machine.num-devices says it, which nerfstudio is not to see
     vis: Literal[
         "none",
         "viewer",
@@ -74,10 +75,24 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
+        self._check_machine()
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The trainer of a process; that of the first starts the others."""
+        return super().setup(**{**kwargs, "world_size": self.processes})
+
+    def _check_machine(self) -> None:
+        machine = self.machine
+        if machine.num_machines != 1:
+            fail(f"a run is of one machine, not {machine.num_machines} (--machine.num-machines)")
+        if machine.num_devices < 1:
+            fail(f"--machine.num-devices must be at least 1, not {machine.num_devices}")
+        if machine.device_type == "cuda" and machine.num_devices > torch.cuda.device_count():
+            fail(f"there are {torch.cuda.device_count()} GPUs here, not {machine.num_devices} (--machine.num-devices)")
 
     def print_to_terminal(self) -> None:
         """Nothing: nerfstudio would print every option here, before anything is checked. All of them are in config.yml,
@@ -95,6 +110,8 @@ class BitymiTrainerConfig(TrainerConfig):
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         except OSError as error:
             fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
+        # what follows in nerfstudio would start the processes its own way, see `several`
+        self.processes, self.machine = self.machine.num_devices, replace(self.machine, num_devices=1)
         say(self.summary())
 
     def summary(self) -> str:
@@ -126,6 +143,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def length(self) -> str:
         """The number of steps and the device, with the reason where the run is shorter than on a GPU."""
         text = f"{self.max_num_iterations:,} steps on {self.machine.device_type}"
+        if self.processes > 1:
+            text += f", each on {self.processes} views by as many processes"
         short = self.max_num_iterations == self.default_iterations_cpu != self.default_iterations
         if self.machine.device_type == "cpu" and short:
             why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"

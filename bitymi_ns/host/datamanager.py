@@ -33,6 +33,7 @@ from bitymi_ns.host.poses import check_cloud, check_places, orienting_all, warn_
 from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
+from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import View, training_order
 
 FEW_VIEWS = 10
@@ -249,8 +250,9 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return OnDemand(len(self.eval_dataset), self.eval_view)
 
     def train_index(self, step: int) -> int:
-        """The training view of a step."""
-        return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, step)
+        """The training view of a step of this process."""
+        (number,) = Processes(self.local_rank, self.world_size).numbers(step)
+        return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
     def next_train(self, step: int) -> tuple[View, dict[str, Any]]:  # type: ignore[override]
         """The view of a step, as training wants it (`step_view`)."""

@@ -14,6 +14,12 @@ from bitymi_ns.host.errors import fail, warn
 class BitymiPipeline(VanillaPipeline):
     """Data manager and model, as nerfstudio pairs them."""
 
+    def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
+        # as if alone: nerfstudio would wrap the model, to add gradients of parameters that keep their size
+        super().__init__(*args, **kwargs)
+        self.world_size = self.datamanager.world_size = world_size
+        self.datamanager.local_rank = local_rank
+
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the parameters of a checkpoint."""
         try:

@@ -18,7 +18,9 @@ from bitymi_ns import files
 from bitymi_ns.host import checkpoints, run_folder
 from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.quiet import quiet_host, quiet_warnings, step_bar
+from bitymi_ns.host.several import Others
 from bitymi_ns.train import optimizers
+from bitymi_ns.train.processes import Processes, ProcessesApart, ProcessLost
 
 if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler
@@ -32,12 +34,20 @@ class _StopAfterStep(Exception):
 
 
 class TogetherOptimizers(Optimizers):
-    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time."""
+    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time.
+
+    Attributes:
+        before_step: called before each step, with all gradients there.
+    """
+
+    before_step: Callable[[], None] | None = None
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         optimizers.forget_gradients(self.optimizers[group] for group in param_groups)
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        if self.before_step is not None:
+            self.before_step()
         clipped = any(self.config[group]["optimizer"].max_norm is not None for group in param_groups)
         if clipped or grad_scaler.is_enabled():
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
@@ -46,11 +56,16 @@ class TogetherOptimizers(Optimizers):
 
 
 class BitymiTrainer(Trainer):
-    """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one."""
+    """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one.
+
+    In a run of several processes each has one, in step with the others; that of the first is as it would be alone.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         with quiet_host():
             super().__init__(*args, **kwargs)
+        self.processes = Processes(self.local_rank, self.world_size)
+        self._others: Others | None = None
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         self._stop_requested = False
@@ -68,13 +83,15 @@ class BitymiTrainer(Trainer):
             CONSOLE.print(line, soft_wrap=True)
         # after all other callbacks of a step: the state is then complete and can be saved
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
+        if self.processes.count > 1 and self.processes.first:
+            self._others = Others(self.config, self.processes.count)
 
     def setup_optimizers(self) -> Optimizers:
         return TogetherOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def _end_of_step(self, step: int) -> None:
         self._show_step(step)
-        if self._stop_requested:
+        if self.processes.any(self._stop_requested):
             raise _StopAfterStep
 
     def _load_checkpoint(self) -> None:
@@ -85,7 +102,8 @@ class BitymiTrainer(Trainer):
                 path = checkpoints.path_of(config.load_dir, step)
             else:
                 path = Path(config.load_checkpoint)
-            files.remove_unfinished(path.parent.parent)  # of the run that was killed
+            if self.processes.first:
+                files.remove_unfinished(path.parent.parent)  # of the run that was killed
             self._restore(checkpoints.load(path, config.pipeline.model.scene), path)
             say(f"Resuming after step {self._start_step - 1} from {path}")
         config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
@@ -103,9 +121,19 @@ class BitymiTrainer(Trainer):
 
     def train(self) -> None:
         """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
+        orderly = False
         try:
             self._train_to_the_end()
+            orderly = True
+        except ProcessLost:
+            if self._others is None:
+                raise
+            self._others.explain()
+        except ProcessesApart as error:
+            fail(f"training cannot go on at step {self.step}: {error}.", error)
         finally:
+            if self._others is not None:
+                self._others.end(orderly)
             run_folder.leave(self.base_dir)
 
     def _train_to_the_end(self) -> None:
@@ -116,8 +144,9 @@ class BitymiTrainer(Trainer):
                 "larger --max-num-iterations."
             )
             return
-        # of every parameter a checkpoint holds the value and Adam's two moments
-        run_folder.check_space(self.base_dir, 3 * sum(p.nbytes for p in self.pipeline.parameters() if p.requires_grad))
+        if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
+            learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]
+            run_folder.check_space(self.base_dir, 3 * sum(learned))
         if self._start_step > 0:
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         restore_handler = self._catch_interrupt()

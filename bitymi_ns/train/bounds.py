@@ -9,13 +9,14 @@ from bitymi_ns.train.init import PointReport
 from bitymi_ns.train.schedules import Schedule
 
 
-def short_run(schedule: Schedule, views: int, field: bool = True) -> list[str]:
+def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int = 1) -> list[str]:
     """The rules for short runs that are in force, and whether the run sees all of its photographs.
 
     Args:
         schedule: of the run.
         views: number of training views.
         field: whether the texture is a field.
+        at_once: views that a step looks at.
     """
     found = []
     if schedule.short_run_gain > 1.0:
@@ -27,10 +28,11 @@ def short_run(schedule: Schedule, views: int, field: bool = True) -> list[str]:
             rare = f"learns on 1 of {schedule.freeze_every} steps once it is frozen"
             parts.append(f"the texture field {rare if schedule.freeze_every > 1 else 'is never frozen'}")
         found.append(f"Rules for runs of fewer than {REFERENCE_STEPS:,} steps: {'; '.join(parts)}.")
-    if schedule.max_steps < views:
+    seen = schedule.max_steps * at_once
+    if seen < views:
         found.append(
-            f"A run of {schedule.max_steps:,} steps sees {schedule.max_steps:,} of the {views:,} training photographs, "
-            "each once. Train for longer with --max-num-iterations."
+            f"A run of {schedule.max_steps:,} steps sees {seen:,} of the {views:,} training photographs, each once. "
+            "Train for longer with --max-num-iterations."
         )
     return found
 

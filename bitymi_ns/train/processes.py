@@ -22,6 +22,10 @@ class ProcessLost(RuntimeError):
     """Another process of the run has ended, or does not answer."""
 
 
+class ProcessesApart(RuntimeError):
+    """The processes of the run have scenes that differ."""
+
+
 @dataclass(frozen=True)
 class Processes:
     """Those of a run, as one of them sees them. Alone, nothing here does anything.
@@ -122,13 +126,14 @@ class Processes:
             surfels: number of them in the scene, to be compared: the processes have to agree before they add.
 
         Raises:
-            RuntimeError: the processes have come apart.
+            ProcessesApart: they do not.
+            ProcessLost: another process has ended.
         """
         *moved, most, least = self._largest([*(int(p.grad is not None) for p in parameters), surfels, -surfels])
         if most != -least:
-            raise RuntimeError(
-                f"the processes of the run have come apart: one has {most:,} surfels, another {-least:,}. Their "
-                "checkpoints up to here can be resumed; please report this"
+            raise ProcessesApart(
+                f"the processes of the run have come apart: one has {most:,} surfels, another {-least:,}. Go on from "
+                "the newest checkpoint, with one process if it happens again, and please report it"
             )
         gradients = []
         for parameter, there in zip(parameters, moved, strict=True):

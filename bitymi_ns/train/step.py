@@ -141,22 +141,20 @@ class Training:
 
     def begin(self, step: int) -> None:
         """Start the clock and set the learning rates of a step."""
+        if not self._alike:  # waits for the others, which is no training time
+            self.processes.like_first(self.scene.state_dict().values())
         self.clock.start()
         self.step = step
         if not self.exposure.decided:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
         if not self._alike:
-            self._start_alike()
+            self._alike = True
+            found = self.processes.from_first(self.exposure.state_dict(), self.scene.surfels["means"].device)
+            self.exposure.load_state_dict(found, len(self._full_size))
         if self.texels.begin(step, self.views):
             self.guard.start_from_here()
         self.guard.before(step, self.views)
         self._set_rates()
-
-    def _start_alike(self) -> None:
-        self._alike = True
-        self.processes.like_first(self.scene.state_dict().values())
-        exposure = self.processes.from_first(self.exposure.state_dict(), self.scene.surfels["means"].device)
-        self.exposure.load_state_dict(exposure, len(self._full_size))
 
     def _set_rates(self) -> None:
         for name, optimizer in self.optimizers.items():
@@ -188,7 +186,7 @@ class Training:
         """After the backward passes: the gradients become those of the mean loss of all views of the step.
 
         Raises:
-            ProcessLost: another process has ended.
+            ProcessesApart, ProcessLost: see `Processes.average_gradients`.
         """
         if self.processes.views == 1:
             return

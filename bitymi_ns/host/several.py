@@ -1,0 +1,172 @@
+"""A run of several processes on one machine: starts those beside the first one, and ends them.
+
+nerfstudio's own start of several processes needs CUDA, and wraps the model in torch's DistributedDataParallel, which
+knows no parameters that change their size. So the process that the user started is the first of the run: it reads and
+checks the capture, holds the run folder, prints, evaluates and saves as it would alone. The others are started when all
+that is done, and write into folders of their own that are thrown away.
+"""
+
+from __future__ import annotations
+
+import atexit
+import copy
+import multiprocessing
+import os
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import torch
+import torch.distributed as dist
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns.host.errors import fail
+from bitymi_ns.train.processes import ProcessLost
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
+
+    from bitymi_ns.host.config import BitymiTrainerConfig
+
+TIMEOUT = timedelta(minutes=30)
+"""How long a process waits for another that is there but does not answer. One that has ended is noticed at once."""
+PATIENCE = 10.0
+"""Seconds in which a process that is lost is expected to say why."""
+HOST = "127.0.0.1"
+
+
+class Others:
+    """The processes of a run beside this first one."""
+
+    def __init__(self, config: BitymiTrainerConfig, count: int) -> None:
+        """Starts them and waits until they are there.
+
+        Args:
+            config: of the run, with its length.
+            count: of all processes of the run.
+
+        Raises:
+            InputError: one has ended already.
+        """
+        self._cards = config.machine.device_type == "cuda"
+        self._scratch = tempfile.TemporaryDirectory()
+        self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)
+        context = multiprocessing.get_context("spawn")
+        self._processes: list[BaseProcess] = [
+            context.Process(target=_work, args=(self._of(config, rank), rank, count, self._store.port), daemon=True)
+            for rank in range(1, count)
+        ]
+        atexit.register(self.end)
+        with _environment(PYTHONWARNINGS="ignore"):  # those of nerfstudio's import were shown once
+            for process in self._processes:
+                process.start()
+        keys = [_here(rank) for rank in range(1, count)]
+        while not self._store.check(keys):
+            if not all(process.is_alive() for process in self._processes):
+                self.explain()
+            time.sleep(0.05)
+        _join(self._store, 0, count, config.machine.device_type)
+
+    def _of(self, config: BitymiTrainerConfig, rank: int) -> BitymiTrainerConfig:
+        """The configuration of another process: it writes nothing that stays, shows nothing and evaluates nothing."""
+        own = copy.deepcopy(config)
+        own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
+        return own
+
+    def explain(self) -> NoReturn:
+        """Ends the run with what the process said that was lost.
+
+        Raises:
+            InputError: always.
+        """
+        until, count = time.monotonic() + PATIENCE, len(self._processes) + 1
+        while True:
+            for rank, process in enumerate(self._processes, 1):
+                told = self._store.check([_why(rank)])
+                if told or not process.is_alive():
+                    why = self._store.get(_why(rank)).decode() if told else f"exit status {process.exitcode}"
+                    fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
+            if time.monotonic() > until:
+                minutes = round(TIMEOUT.total_seconds() / 60)
+                fail(f"the {count} processes of this run do not hear each other any more, or not within {minutes} min")
+            time.sleep(0.05)
+
+    def end(self, orderly: bool = False) -> None:
+        """Ends the other processes; a second call changes nothing.
+
+        Args:
+            orderly: the run is over for all of them: let them end themselves.
+        """
+        atexit.unregister(self.end)
+        processes, self._processes = self._processes, []
+        for process in processes:
+            if orderly:
+                process.join(PATIENCE)
+            process.kill()
+            process.join()
+        self._scratch.cleanup()
+        # a card may wait for one that is lost: then the end of this process is the remedy
+        if processes and dist.is_initialized() and (orderly or not self._cards):
+            dist.destroy_process_group()
+
+
+@contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    """Environment variables for the processes that are started meanwhile."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _here(rank: int) -> str:
+    return f"here {rank}"
+
+
+def _why(rank: int) -> str:
+    return f"why {rank}"
+
+
+def _join(store: dist.Store, rank: int, count: int, device_type: str) -> None:
+    """Enters torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
+    backend = "gloo"
+    if device_type == "cuda":
+        torch.cuda.set_device(rank)
+        backend = "cpu:gloo,cuda:nccl"
+    else:  # all of them have the same cores
+        torch.set_num_threads(max(1, torch.get_num_threads() // count))
+    dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=TIMEOUT)
+
+
+def _work(config: BitymiTrainerConfig, rank: int, count: int, port: int) -> None:
+    """What a process beside the first one does."""
+    from nerfstudio.scripts.train import train_loop
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # before and after training the first process decides
+        signal.signal(number, signal.SIG_IGN)
+    CONSOLE.quiet = True
+    store = dist.TCPStore(HOST, port, count, is_master=False, timeout=TIMEOUT)
+    try:
+        store.set(_here(rank), "1")
+        _join(store, rank, count, config.machine.device_type)
+        train_loop(rank, count, config)  # with the seed of the first process
+        dist.destroy_process_group()
+    except ProcessLost:  # the first process has ended, or says what is wrong
+        sys.exit(1)
+    except BaseException as error:
+        said = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
+        with suppress(RuntimeError):  # the first process has ended
+            store.set(_why(rank), said)
+        sys.exit(1)

@@ -1,0 +1,112 @@
+"""`ns-train --machine.num-devices 2` on the CPU: what it leaves, how it goes on, what it says when a process ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch.distributed as dist
+from nerfstudio.scripts import train as ns_train
+from nerfstudio.utils.eval_utils import eval_setup
+
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.curve import FILE
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.several import Others
+from bitymi_ns.host.trainer import BitymiTrainer
+from tests.e2e.conftest import STEPS, small_run
+from tests.e2e.runs import Start, checkpoint, different
+
+
+def two(config: BitymiTrainerConfig) -> BitymiTrainerConfig:
+    config.machine.num_devices = 2
+    return config
+
+
+def at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Any) -> None:
+    """Have the first process do something before a step."""
+    iterate = BitymiTrainer.train_iteration
+
+    def train_iteration(self: BitymiTrainer, current: int) -> Any:
+        if current == step:
+            action(self)
+        return iterate(self, current)
+
+    monkeypatch.setattr(BitymiTrainer, "train_iteration", train_iteration)
+
+
+@pytest.fixture(scope="module")
+def pair(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
+    """A finished run of two processes. Not to be changed."""
+    config = two(small_run(room, tmp_path_factory.mktemp("outputs")))
+    ns_train.main(config)
+    return config
+
+
+@pytest.mark.slow
+def test_two_processes_leave_the_run_of_one(pair: BitymiTrainerConfig) -> None:
+    folder = pair.get_base_dir()
+    assert not dist.is_initialized()
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "config.yml", "dataparser_transforms.json", "nerfstudio_models", FILE
+    ]  # fmt: skip
+    points = [json.loads(line) for line in (folder / FILE).read_text().splitlines()]
+    assert [p["step"] for p in points] == [20, 40, STEPS]
+    config, pipeline, _, step = eval_setup(folder / "config.yml")
+    assert step == STEPS - 1 and config.machine.num_devices == 2
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert metrics["psnr"] == pytest.approx(points[-1]["psnr"], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_both_and_the_resumed_run_ends_bit_for_bit_alike(
+    pair: BitymiTrainerConfig, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = two(start(name="interrupted"))
+    at_step(monkeypatch, 44, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        ns_train.main(config)
+    assert stopped.value.code == 130
+    monkeypatch.undo()
+    resumed = two(start(name="resumed"))
+    resumed.load_dir = config.get_checkpoint_dir()
+    ns_train.main(resumed)
+    assert different(checkpoint(pair, STEPS - 1), checkpoint(resumed, STEPS - 1)) == []
+
+
+@pytest.mark.slow
+def test_a_process_that_ends_ends_the_run_with_a_message(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = two(start(name="killed"))
+    at_step(monkeypatch, 25, lambda trainer: trainer._others._processes[0].kill())
+    with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: exit status -9"):
+        ns_train.main(config)
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]
+    assert not dist.is_initialized()
+
+
+@pytest.mark.slow
+def test_what_goes_wrong_in_another_process_is_told(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoiled(self: Others, config: BitymiTrainerConfig, rank: int) -> BitymiTrainerConfig:
+        own = of(self, config, rank)
+        own.pipeline.datamanager.data = own.pipeline.datamanager.dataparser.data = Path("/not/there")
+        return own
+
+    of = Others._of
+    monkeypatch.setattr(Others, "_of", spoiled)
+    with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: bitymi: .*/not/there"):
+        ns_train.main(two(start(name="spoiled")))
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [("num_devices", 0, "num-devices must be at least 1"), ("num_machines", 2, "a run is of one machine, not 2")],
+)
+def test_machines_that_a_run_cannot_have(start: Start, option: str, value: int, message: str) -> None:
+    config = start(name="machine")
+    setattr(config.machine, option, value)
+    with pytest.raises(InputError, match=message):
+        ns_train.main(config)

@@ -21,6 +21,7 @@ ROOTS: dict[str, Any] = {
     "ns-export ... --": BakeOptions(),
 }
 ELSEWHERE = {
+    "--machine.num-devices",
     "--max-num-iterations",
     "--pipeline.model.train.first-surfels",
     "ns-export ... --exact",

@@ -119,7 +119,7 @@ class TrainingRun:
             cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1]))
             learns = scene.config.texture == "texels"
             pixels = config.texels.pixels_per_texel if learns else 0.0
-            state_training(scene, cameras, self.training.strategy.most, pixels)
+            state_training(scene, cameras, self.training.strategy.most, pixels, processes.count)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

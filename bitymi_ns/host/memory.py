@@ -55,7 +55,9 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     return min(int(MARGIN * most), bound or MOST)
 
 
-def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int, pixels_per_texel: float = 0.0) -> None:
+def state_training(
+    scene: Scene, cameras: Sequence[Camera], most_surfels: int, pixels_per_texel: float = 0.0, processes: int = 1
+) -> None:
     """Say what a training run will take.
 
     Args:
@@ -63,6 +65,7 @@ def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int, p
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
         pixels_per_texel: of texels that will learn, each of which some view shows; 0 = none will.
+        processes: of the run, each of which takes as much.
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
@@ -72,7 +75,7 @@ def state_training(scene: Scene, cameras: Sequence[Camera], most_surfels: int, p
     if pixels_per_texel > 0:
         needed += PER_TEXEL * VIEWS_OF_TEXELS * fragments / pixels_per_texel
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
-    _state("Training", needed, cameras, f"{advice} {max(1, fragments // 4)}")
+    _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
 
 
 def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0) -> None:

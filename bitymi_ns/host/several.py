@@ -33,7 +33,7 @@ from bitymi_ns.train.processes import ProcessLost
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
-    from bitymi_ns.host.config import BitymiTrainerConfig
+    from nerfstudio.engine.trainer import TrainerConfig
 
 TIMEOUT = timedelta(minutes=30)
 """How long a process waits for another that is there but does not answer. One that has ended is noticed at once."""
@@ -45,7 +45,7 @@ HOST = "127.0.0.1"
 class Others:
     """The processes of a run beside this first one."""
 
-    def __init__(self, config: BitymiTrainerConfig, count: int) -> None:
+    def __init__(self, config: TrainerConfig, count: int) -> None:
         """Starts them and waits until they are there.
 
         Args:
@@ -74,7 +74,7 @@ class Others:
             time.sleep(0.05)
         _join(self._store, 0, count, config.machine.device_type)
 
-    def _of(self, config: BitymiTrainerConfig, rank: int) -> BitymiTrainerConfig:
+    def _of(self, config: TrainerConfig, rank: int) -> TrainerConfig:
         """The configuration of another process: it writes nothing that stays, shows nothing and evaluates nothing."""
         own = copy.deepcopy(config)
         own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
@@ -150,7 +150,7 @@ def _join(store: dist.Store, rank: int, count: int, device_type: str) -> None:
     dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=TIMEOUT)
 
 
-def _work(config: BitymiTrainerConfig, rank: int, count: int, port: int) -> None:
+def _work(config: TrainerConfig, rank: int, count: int, port: int) -> None:
     """What a process beside the first one does."""
     from nerfstudio.scripts.train import train_loop
 

@@ -15,7 +15,7 @@ import torch
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import surfels_from_points
-from bitymi_ns.train.processes import ALONE, Processes
+from bitymi_ns.train.processes import ALONE, Processes, ProcessesApart
 from tests.train import part_of_a_run
 from tests.train.part_of_a_run import LOST, STEPS, train
 
@@ -107,3 +107,9 @@ def test_one_process_alone_asks_nobody():
     two = Processes(each=2)
     two.average_gradients([parameter], 5)
     assert torch.equal(parameter.grad, value / 2) and two.views == 2
+
+
+def test_processes_that_have_come_apart_do_not_add_their_gradients(monkeypatch):
+    monkeypatch.setattr(Processes, "_largest", lambda self, values: [1, 7, -6])  # another one has 6 surfels
+    with pytest.raises(ProcessesApart, match="one has 7 surfels, another 6"):
+        Processes(0, 2).average_gradients([torch.nn.Parameter(torch.rand(3))], 7)

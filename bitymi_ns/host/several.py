@@ -40,20 +40,18 @@ TIMEOUT = timedelta(minutes=30)
 PATIENCE = 10.0
 """Seconds in which a process that is lost is expected to say why."""
 HOST = "127.0.0.1"
+LOST = 3
+"""Exit status of a process that ends because another one has."""
 
 
 class Others:
     """The processes of a run beside this first one."""
 
     def __init__(self, config: TrainerConfig, count: int) -> None:
-        """Starts them and waits until they are there.
-
+        """
         Args:
             config: of the run, with its length.
             count: of all processes of the run.
-
-        Raises:
-            InputError: one has ended already.
         """
         self._cards = config.machine.device_type == "cuda"
         self._scratch = tempfile.TemporaryDirectory()
@@ -64,6 +62,14 @@ class Others:
             for rank in range(1, count)
         ]
         atexit.register(self.end)
+
+    def start(self) -> None:
+        """Starts them and waits until they are there.
+
+        Raises:
+            InputError: one has ended already.
+        """
+        count = len(self._processes) + 1
         with _environment(PYTHONWARNINGS="ignore"):  # those of nerfstudio's import were shown once
             for process in self._processes:
                 process.start()
@@ -72,7 +78,7 @@ class Others:
             if not all(process.is_alive() for process in self._processes):
                 self.explain()
             time.sleep(0.05)
-        _join(self._store, 0, count, config.machine.device_type)
+        _join(self._store, 0, count, self._cards)
 
     def _of(self, config: TrainerConfig, rank: int) -> TrainerConfig:
         """The configuration of another process: it writes nothing that stays, shows nothing and evaluates nothing."""
@@ -90,7 +96,7 @@ class Others:
         while True:
             for rank, process in enumerate(self._processes, 1):
                 told = self._store.check([_why(rank)])
-                if told or not process.is_alive():
+                if told or process.exitcode not in (None, LOST):
                     why = self._store.get(_why(rank)).decode() if told else f"exit status {process.exitcode}"
                     fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
             if time.monotonic() > until:
@@ -107,6 +113,8 @@ class Others:
         atexit.unregister(self.end)
         processes, self._processes = self._processes, []
         for process in processes:
+            if process.pid is None:  # not started
+                continue
             if orderly:
                 process.join(PATIENCE)
             process.kill()
@@ -139,10 +147,10 @@ def _why(rank: int) -> str:
     return f"why {rank}"
 
 
-def _join(store: dist.Store, rank: int, count: int, device_type: str) -> None:
+def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
     """Enters torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
     backend = "gloo"
-    if device_type == "cuda":
+    if cards:
         torch.cuda.set_device(rank)
         backend = "cpu:gloo,cuda:nccl"
     else:  # all of them have the same cores
@@ -160,11 +168,11 @@ def _work(config: TrainerConfig, rank: int, count: int, port: int) -> None:
     store = dist.TCPStore(HOST, port, count, is_master=False, timeout=TIMEOUT)
     try:
         store.set(_here(rank), "1")
-        _join(store, rank, count, config.machine.device_type)
+        _join(store, rank, count, config.machine.device_type == "cuda")
         train_loop(rank, count, config)  # with the seed of the first process
         dist.destroy_process_group()
-    except ProcessLost:  # the first process has ended, or says what is wrong
-        sys.exit(1)
+    except ProcessLost:  # another one has ended, and the first one says why
+        sys.exit(LOST)
     except BaseException as error:
         said = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
         with suppress(RuntimeError):  # the first process has ended

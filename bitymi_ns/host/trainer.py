@@ -83,8 +83,6 @@ class BitymiTrainer(Trainer):
             CONSOLE.print(line, soft_wrap=True)
         # after all other callbacks of a step: the state is then complete and can be saved
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
-        if self.processes.count > 1 and self.processes.first:
-            self._others = Others(self.config, self.processes.count)
 
     def setup_optimizers(self) -> Optimizers:
         return TogetherOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
@@ -150,8 +148,11 @@ class BitymiTrainer(Trainer):
         if self._start_step > 0:
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         restore_handler = self._catch_interrupt()
-        self.config.max_num_iterations = total - self._start_step
         try:
+            if self.processes.count > 1 and self.processes.first:
+                self._others = Others(self.config, self.processes.count)
+                self._others.start()
+            self.config.max_num_iterations = total - self._start_step
             with quiet_warnings(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
         except _StopAfterStep:

@@ -16,7 +16,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.curve import FILE
 from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.several import Others
 from bitymi_ns.host.trainer import BitymiTrainer
 from tests.e2e.conftest import STEPS, small_run
 from tests.e2e.runs import Start, checkpoint, different
@@ -86,19 +85,6 @@ def test_a_process_that_ends_ends_the_run_with_a_message(start: Start, monkeypat
         ns_train.main(config)
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]
     assert not dist.is_initialized()
-
-
-@pytest.mark.slow
-def test_what_goes_wrong_in_another_process_is_told(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    def spoiled(self: Others, config: BitymiTrainerConfig, rank: int) -> BitymiTrainerConfig:
-        own = of(self, config, rank)
-        own.pipeline.datamanager.data = own.pipeline.datamanager.dataparser.data = Path("/not/there")
-        return own
-
-    of = Others._of
-    monkeypatch.setattr(Others, "_of", spoiled)
-    with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: bitymi: .*/not/there"):
-        ns_train.main(two(start(name="spoiled")))
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ class Limit:
 
 QUALITY = Limit("more", 0.05, relative=False, digits=3)
 LIMITS = {
-    "psnr_neural": QUALITY,
+    "psnr_trained": QUALITY,
     "psnr_baked": QUALITY,
     "bundle_bytes": Limit("less", 0.03),
     "surfels": Limit("less", 0.03),
@@ -80,7 +80,7 @@ LIMITS = {
     "frame": Limit("less", 0.15, digits=4, timed=True),
 }
 UNITS = {
-    "psnr_neural": "PSNR neural, dB",
+    "psnr_trained": "PSNR trained, dB",
     "psnr_baked": "PSNR baked, dB",
     "bundle_bytes": "bundle, bytes",
     "surfels": "surfels",
@@ -163,7 +163,7 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     )
     aside = calibration.every(10)
     _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, settings.steps, callback=aside))
-    neural, fragments, _ = evaluate(scene, capture.views, config)
+    trained, fragments, _ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
         learning = Learning(tune=TuneOptions.of_learned(settings.tuning), train=config)
@@ -182,7 +182,7 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
         units.append(unit)
         quality.append(psnr(image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")))
     return {
-        "psnr_neural": neural,
+        "psnr_trained": trained,
         "psnr_baked": statistics.fmean(quality),
         "bundle_bytes": size,
         "surfels": len(scene),
@@ -204,7 +204,7 @@ def run_job(data: Path, downscale: int, settings: Settings) -> dict[str, float]:
     seeds = [run_seed(capture, seed, settings, calibration) for seed in range(settings.seeds)]
     means = {key: statistics.fmean(figures[key] for figures in seeds) for key in seeds[0]}
     means["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    means["psnr_spread"] = statistics.pstdev(figures["psnr_neural"] for figures in seeds)
+    means["psnr_spread"] = statistics.pstdev(figures["psnr_trained"] for figures in seeds)
     means["calibration_seconds"] = statistics.median(calibration.seconds)
     return means
 

@@ -62,10 +62,10 @@ if [ ! -f "$out/bundle/bundle.json" ]; then
   rm -rf "$out/eval-baked.json" "$out/renders/baked"
 fi
 
-if [ ! -f "$out/eval-neural.json" ]; then
+if [ ! -f "$out/eval-trained.json" ]; then
   say "Evaluating the trained model"
-  ns-eval --load-config "$run/config.yml" --output-path "$out/eval-neural.json" \
-    --render-output-path "$out/renders/neural"
+  ns-eval --load-config "$run/config.yml" --output-path "$out/eval-trained.json" \
+    --render-output-path "$out/renders/trained"
 fi
 
 if [ ! -f "$out/eval-baked.json" ]; then
@@ -75,7 +75,7 @@ if [ ! -f "$out/eval-baked.json" ]; then
 fi
 
 say "Writing the report"
-bitymi report "$out/eval-neural.json" "$out/eval-baked.json" "$run" "$out/renders" --output-dir "$out/report"
+bitymi report "$out/eval-trained.json" "$out/eval-baked.json" "$run" "$out/renders" --output-dir "$out/report"
 
 view=bitymi
 [ ! -x .venv/bin/bitymi ] || view=.venv/bin/bitymi

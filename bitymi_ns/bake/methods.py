@@ -140,7 +140,8 @@ class ToleranceBake:
 @dataclass(frozen=True)
 class FineBake:
     """What a polish starts from: as many texels as the views can tell apart, whatever the field has learned, and all of
-    the view colours. A tile has at most a texel for every `pixels_per_texel` pixels of the view that shows most of it.
+    the view colours. A tile has at most a texel for every `pixels_per_texel` pixels that its surfel makes up of the
+    view that shows most of it.
     """
 
     final: ClassVar[bool] = False

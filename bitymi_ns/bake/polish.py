@@ -38,8 +38,9 @@ class PolishOptions(TuneOptions):
     share: float = 0.4
     """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
     checks: int = 10
-    pixels_per_texel: float = 2.0
-    """A tile starts with at most a texel for so many pixels of the view that shows most of it."""
+    pixels_per_texel: float = 0.25
+    """A tile starts with at most a texel for so many pixels that its surfel makes up of the view that shows most of
+    it."""
 
     def check(self) -> None:
         """Refuses values that make no sense."""

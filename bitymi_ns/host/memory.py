@@ -17,6 +17,7 @@ from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY, Scene
+from bitymi_ns.train.texels import SMALLEST
 from bitymi_ns.train.views import REDUCED_BYTES
 
 COUNTED_VIEWS = 3
@@ -34,8 +35,8 @@ PER_SURFEL = 3000
 
 PER_TEXEL = 60
 """Bytes in training: the texel, how far it moves, and the two states that a run could go back to."""
-VIEWS_OF_TEXELS = 4
-"""All texels together are about as many as those of so many views: 2.6 to 3.7 were measured."""
+VIEWS_OF_TEXELS = 12
+"""Beside the smallest tiles, all texels together are as many as those of so many views: 3.5 to 11 were measured."""
 
 
 @torch.no_grad()
@@ -64,16 +65,17 @@ def state_training(
         scene: as the run finds it.
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
-        pixels_per_texel: of texels that will learn, each of which some view shows; 0 = none will.
+        pixels_per_texel: of texels that will learn; 0 = none will.
         processes: of the run, each of which takes as much.
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     needed = PROGRAM + kept + PER_PIXEL * pixels + PER_FRAGMENT * fragments
-    needed += PER_SURFEL * max(len(scene), most_surfels)
+    surfels = max(len(scene), most_surfels)
+    needed += PER_SURFEL * surfels
     if pixels_per_texel > 0:
-        needed += PER_TEXEL * VIEWS_OF_TEXELS * fragments / pixels_per_texel
+        needed += PER_TEXEL * (SMALLEST**2 * surfels + VIEWS_OF_TEXELS * pixels / pixels_per_texel)
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
     _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
 

@@ -54,7 +54,7 @@ class Setting:
 
     Attributes:
         knob, value: which, and where it stands.
-        renderer: `neural` (the field at every fragment) or `baked`.
+        renderer: `trained` (the field at every fragment) or `baked`.
         render: camera -> [H, W, 3].
         bytes: of the atlas in the format that is stored; None where the knob does not change it.
         exact: whether the others are measured against this one.
@@ -174,7 +174,7 @@ class Knobs:
         self.bound = float(self.scene.config.weight_bound)
         self.has_learned = isinstance(self.scene.field, TexelField)
 
-    def neural(self, camera: Camera, bound: float | None = None) -> Tensor:
+    def trained(self, camera: Camera, bound: float | None = None) -> Tensor:
         """The trained scene, not baked."""
         with torch.no_grad():
             return self.scene.render(
@@ -216,7 +216,9 @@ class Knobs:
         if "weight_bound" in wanted and textured:
             values = sorted({*WEIGHT_BOUNDS, self.bound})
             yield [
-                Setting("weight_bound", v, "neural", lambda c, v=v: self.neural(c, v), None, v == 0.0, v == self.bound)
+                Setting(
+                    "weight_bound", v, "trained", lambda c, v=v: self.trained(c, v), None, v == 0.0, v == self.bound
+                )
                 for v in values
             ]
         if {"weight_bound", "transmittance", "format", "resolution"} & set(wanted):
@@ -257,7 +259,7 @@ class Knobs:
 
     def _of_the_bake(self, knob: str, values: Sequence[float], default: float) -> list[Setting]:
         """Against the field itself; texels as 32-bit floats, so that the format's error is not in it."""
-        settings = [Setting(knob, "field", "neural", self.neural, None, True)]
+        settings = [Setting(knob, "field", "trained", self.trained, None, True)]
         for value in sorted({*values, default}):
             baked = self._bake(**{knob: value})
             draw = self._draw(self.exact_texels(baked))

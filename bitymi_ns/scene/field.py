@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -155,6 +155,9 @@ class TexelField(nn.Module):
         texels: [T, 3] residual colours to start from, tile after tile as in `TexelTiles.of_sizes`.
         share: [T] how far a texel moves in a step, see `TexelDescent`; None = they are not stepped.
     """
+
+    STEADY: ClassVar = ("size", "extent", "share")
+    """Buffers that training replaces and never writes into, so that copies of the scene may share them."""
 
     def __init__(self, size: Tensor, extent: Tensor, texels: Tensor, share: Tensor | None = None) -> None:
         super().__init__()

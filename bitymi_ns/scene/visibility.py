@@ -20,7 +20,8 @@ class Visibility:
     Attributes:
         transmittance: [N] float32 in [0, 1], the largest one in front of a blended fragment of the surfel, over all
             views: a fragment's weight is sigma T; the kernel gives sigma, this gives T. 0 for one that no view blends.
-        pixels: [N] int32, in how many pixels the view that shows most of the surfel gives it a residual.
+        pixels: [N] float32, how many pixels of the view that shows most of the surfel it makes up: the sum of its
+            blending weights, of those that get a residual. A pixel is shared among its layers by weight.
         seen: [V, N] bool, whether the view blends a fragment of the surfel.
     """
 
@@ -60,7 +61,7 @@ def visibility(
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
     largest = means.new_zeros(len(means))
-    pixels = torch.zeros(len(means), dtype=torch.int32, device=means.device)
+    pixels = torch.zeros_like(largest)
     seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
         here = torch.zeros_like(pixels)
@@ -69,9 +70,10 @@ def visibility(
             in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
             rows = fragments.surfel.long()
             largest.scatter_reduce_(0, rows, in_front, "amax")
-            here.index_add_(0, rows, (fragments.weight >= weight_bound).to(here.dtype))
+            textured = torch.where(fragments.weight >= weight_bound, fragments.weight, 0.0)
+            here.index_add_(0, rows, textured.to(here.dtype))
             seen[done - 1, rows] = True
-            del fragments, in_front, rows  # before the next list is made
+            del fragments, in_front, rows, textured  # before the next list is made
         pixels = torch.maximum(pixels, here)
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, seen)

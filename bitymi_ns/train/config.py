@@ -160,8 +160,8 @@ class TexelConfig(TexelSteps):
     as the training views see it; 30,000 or more = there is no such part."""
     surfel_rates: float = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
-    pixels_per_texel: float = 2.0
-    """A tile has at most a texel for so many pixels of the view that shows most of it."""
+    pixels_per_texel: float = 0.25
+    """A tile has at most a texel for so many pixels that its surfel makes up of the view that shows most of it."""
     largest: int = 64
     """Largest side of a tile, texels, a power of two."""
     views: float = 0.25

@@ -278,8 +278,13 @@ class Guard:
         return {"rolled_back": float(step - origin), "rates": self.factor, "surfels": float(len(self.scene))}
 
     def _capture(self) -> dict[str, Any]:
+        # what never changes in place is kept once for all states: a long run has more texels than anything else
+        steady = [f"field.{name}" for name in TexelField.STEADY] if isinstance(self.scene.field, TexelField) else []
         return {
-            "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
+            "scene": {
+                name: value.detach() if name in steady else value.detach().clone()
+                for name, value in self.scene.state_dict().items()
+            },
             "optimizers": {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),
             "exposure": None if self.exposure is None else self.exposure.state_dict(),

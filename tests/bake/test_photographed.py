@@ -22,9 +22,7 @@ def test_rates_are_geometric_means_over_the_views() -> None:
     row = photographed(BakeInput(surfels, cameras, 0.2, 0.02, False))
     assert row.tolist() == [[0.0, 0.0, 0.0, pytest.approx(focal / (4 * 8 * 4) ** (1 / 3))]]
     seen = torch.tensor([[False], [True], [False]])
-    row = photographed(
-        BakeInput(surfels, cameras, 0.2, 0.02, False, Visibility(torch.ones(1), torch.ones(1, dtype=torch.int32), seen))
-    )
+    row = photographed(BakeInput(surfels, cameras, 0.2, 0.02, False, Visibility(torch.ones(1), torch.ones(1), seen)))
     assert row[0, 3] == pytest.approx(focal / 8)
 
 

@@ -59,7 +59,8 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     monkeypatch.setattr(memory, "PER_TEXEL", 1e6)
     memory.state_training(one, [camera], 0, pixels_per_texel=2.0)
     few, many = said(capsys).split("Training will take")[1:]
-    assert gigabytes(many) - gigabytes(few) == pytest.approx(2e-3 * memory.MARGIN * count, rel=0.1)
+    texels = memory.SMALLEST**2 * len(one) + memory.VIEWS_OF_TEXELS * camera.width * camera.height / 2.0
+    assert gigabytes(many) - gigabytes(few) == pytest.approx(1e-3 * texels, rel=0.1)
     large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs alone: more than are kept
     monkeypatch.setattr(memory, "most_fragments", lambda *_: 0)
     needed = []

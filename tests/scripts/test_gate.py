@@ -11,7 +11,7 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 GOOD = {
-    "psnr_neural": 20.0, "psnr_baked": 21.0, "bundle_bytes": 1000.0, "surfels": 100.0, "fragments_per_pixel": 10.0,
+    "psnr_trained": 20.0, "psnr_baked": 21.0, "bundle_bytes": 1000.0, "surfels": 100.0, "fragments_per_pixel": 10.0,
     "peak_mb": 500.0, "train": 80.0, "bake": 40.0, "frame": 0.5,
 }  # fmt: skip
 
@@ -38,15 +38,15 @@ def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *meas
 def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     baseline = tmp_path / "gate.json"
     run(gate, monkeypatch, baseline, {}, accept=True)
-    assert json.loads(baseline.read_text())["scenes"]["room"]["psnr_neural"] == 20.0
+    assert json.loads(baseline.read_text())["scenes"]["room"]["psnr_trained"] == 20.0
     assert run(gate, monkeypatch, baseline, {}) == 1
-    assert run(gate, monkeypatch, baseline, {"psnr_neural": 25.0, "bundle_bytes": 10.0, "train": 1.0}) == 1
+    assert run(gate, monkeypatch, baseline, {"psnr_trained": 25.0, "bundle_bytes": 10.0, "train": 1.0}) == 1
 
 
 @pytest.mark.parametrize(
     ("figure", "passes", "fails"),
     [
-        ("psnr_neural", 19.96, 19.94),
+        ("psnr_trained", 19.96, 19.94),
         ("psnr_baked", 20.96, 20.94),
         ("bundle_bytes", 1029.0, 1031.0),
         ("surfels", 102.9, 103.1),
@@ -81,12 +81,12 @@ def test_times_are_taken_again_and_not_judged_elsewhere(
     run(gate, monkeypatch, baseline, {}, accept=True)
     assert run(gate, monkeypatch, baseline, {"train": 200.0}, {}) == 2
     with pytest.raises(SystemExit, match="1 of 9"):
-        run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_neural": 21.0}, {"train": 120.0})
+        run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_trained": 21.0}, {"train": 120.0})
     stated = json.loads(baseline.read_text())
     baseline.write_text(json.dumps({**stated, "processor": "another one"}))
-    assert run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_neural": 19.91}) == 1
+    assert run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_trained": 19.91}) == 1
     with pytest.raises(SystemExit, match="1 of 9"):
-        run(gate, monkeypatch, baseline, {"psnr_neural": 19.89})
+        run(gate, monkeypatch, baseline, {"psnr_trained": 19.89})
     with pytest.raises(SystemExit, match="1 of 9"):
         run(gate, monkeypatch, baseline, {"surfels": 200.0})
 

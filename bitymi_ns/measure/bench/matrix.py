@@ -121,8 +121,8 @@ class Stage:
 
     @property
     def form(self) -> str:
-        """The bundle's name, or `neural` for the trained scene."""
-        return self.bundle.name if self.bundle else "neural"
+        """The bundle's name, or `trained` for the trained scene."""
+        return self.bundle.name if self.bundle else "trained"
 
     def __str__(self) -> str:
         what = {"train": "training", "eval": f"evaluation ({self.form})", "export": f"export ({self.form})"}

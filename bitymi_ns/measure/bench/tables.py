@@ -88,27 +88,27 @@ def results_table(matrix: Matrix, cells: Cells) -> tuple[str, list[str]]:
     lines, commits = [], []
     for run in matrix.runs():
         train = cells.get(Stage(run, "train").key)
-        neural = cells.get(Stage(run, "eval").key)
+        trained = cells.get(Stage(run, "eval").key)
         for bundle in (None, *matrix.bundles):
             cell = cells.get(Stage(run, "eval", bundle).key)
             if cell is None:
                 continue
             results = cell["value"]["results"]
             exported = cells.get(Stage(run, "export", bundle).key) if bundle else None
-            delta = difference(results["psnr"] - neural["value"]["results"]["psnr"]) if bundle and neural else ""
+            delta = difference(results["psnr"] - trained["value"]["results"]["psnr"]) if bundle and trained else ""
             cost = train["value"] if train and bundle is None else {}
             size = exported["value"]["bytes"] if exported else None
-            lines.append(_line(run, bundle.name if bundle else "neural", results, cost, size, delta))
+            lines.append(_line(run, bundle.name if bundle else "trained", results, cost, size, delta))
             commits += [c["made"]["commit"] for c in (train, cell, exported) if c]
     return _without_empty(HEADER, lines), commits
 
 
 BUNDLE_HEADER = (
     "scene", "row", "bundle", "surfels", "sites per surfel", "one colour", "texels per surfel", "atlas bytes",
-    "of the first", "dPSNR", "PSNR to neural", "dFLIP", "render ms", "tile error p99", "colour error p99",
+    "of the first", "dPSNR", "PSNR to trained", "dFLIP", "render ms", "tile error p99", "colour error p99",
 )  # fmt: skip
 BUNDLE_NOTES = (
-    "dPSNR and dFLIP: against the photographs, bundle minus trained scene; PSNR to neural: bundle against trained "
+    "dPSNR and dFLIP: against the photographs, bundle minus trained scene; PSNR to trained: bundle against trained "
     "scene on the held-out views, as the exporter measures it.",
     "Tile error: root mean square of a tile against the field as stored, in 8-bit steps, 99th percentile.",
     "Sites per surfel: what is left of the view colour (or coefficients, lobes); one colour: share of the surfels with "
@@ -123,14 +123,14 @@ def bundles_table(matrix: Matrix, cells: Cells) -> str:
 
     lines = []
     for run in matrix.runs():
-        neural = cells.get(Stage(run, "eval").key)
+        trained = cells.get(Stage(run, "eval").key)
         first: float | None = None
         for bundle in matrix.bundles:
             exported = cells.get(Stage(run, "export", bundle).key)
             cell = cells.get(Stage(run, "eval", bundle).key)
-            if exported is None or cell is None or neural is None:
+            if exported is None or cell is None or trained is None:
                 continue
-            results, before = cell["value"]["results"], neural["value"]["results"]
+            results, before = cell["value"]["results"], trained["value"]["results"]
             statistics = Statistics.model_validate(exported["value"]["statistics"], strict=False)
             kept, texels = statistics.surfels.kept, statistics.texels
             texels = None if texels is None else texels.after_cap_by_views if texels.kept is None else texels.kept

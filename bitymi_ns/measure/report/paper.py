@@ -109,7 +109,7 @@ def _empty(width: int) -> Row:
 
 def table_1(data: dict[str, Any], rows: list[Evaluation]) -> Table:
     """Atlas storage formats."""
-    header = ("Format", "Bytes / texel", "Mean atlas MB", "ΔPSNR vs. neural")
+    header = ("Format", "Bytes / texel", "Mean atlas MB", "ΔPSNR vs. trained")
     lines = [Row((f"{PUBLISHED} ({data['hardware']}), 18 Mip-NeRF 360 splits",), section=True)]
     for entry in data["quantization"]:
         cells = (str(entry["bytes_per_texel"]), entry["mean_atlas_mb"], entry["delta_psnr"] or MISSING)
@@ -220,9 +220,9 @@ def table_6(data: dict[str, Any], rows: list[Evaluation]) -> Table:
     figures = ("PSNR", "SSIM", "LPIPS", "N", "FPS")
     header = ("Scene", *(f"{name} {form}" for form in ("w/", "w/o") for name in figures))
     lines = []
-    for baked, title in ((False, "Pre-baking (neural renderer)"), (True, "Post-baking (BC7 atlas)")):
+    for baked, title in ((False, "Trained scene"), (True, "Baked bundle")):
         lines.append(Row((f"{title}: {PUBLISHED.lower()} ({data['hardware']})",), section=True))
-        for scene, pair in data["per_scene"]["baked" if baked else "neural"].items():
+        for scene, pair in data["per_scene"]["baked" if baked else "trained"].items():
             lines.append(Row((scene, *(text for side in pair for text in _texts(side, PRINTED)))))
         lines.append(Row((f"{title}: {HERE.lower()}",), section=True))
         stage = [r for r in rows if r.baked == baked and (not baked or r.atlas_format in ("bc7", ""))]

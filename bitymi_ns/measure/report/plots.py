@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from bitymi_ns.measure.report.drawing import Plot, Sheet, Theme, draw, line_color, log_when_wide
 from bitymi_ns.measure.report.knob_plots import knob_sheets
 from bitymi_ns.measure.report.pareto import front
-from bitymi_ns.measure.report.records import Curve, Evaluation, Records, neural_parent
+from bitymi_ns.measure.report.records import Curve, Evaluation, Records, trained_parent
 
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Marks of baked evaluations, one per format."""
@@ -117,7 +117,7 @@ def _scatter_sheet(metric: Metric, cost: Cost, evaluations: list[Evaluation], co
             color = line_color(theme, colors[e.method])
             px, py = points[id(e)]
             if e.baked:
-                parent = neural_parent(e, drawn) if cost.arrows else None
+                parent = trained_parent(e, drawn) if cost.arrows else None
                 if parent is not None:
                     qx, qy = points[id(parent)]
                     axes.plot([qx, px], [qy, py], color=color, linewidth=0.9, alpha=0.55, zorder=2)

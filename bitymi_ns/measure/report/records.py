@@ -29,7 +29,7 @@ class Evaluation:
 
     Attributes:
         scene: the experiment's name; evaluations are compared within one scene.
-        method: method name without any mark of baking, so that a bundle shares it with its neural parent.
+        method: method name without any mark of baking, so that a bundle shares it with its trained parent.
         baked: whether the images came from a baked bundle.
         label: the name shown in tables, unique within its scene and stage after `disambiguate`.
         results: finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...).
@@ -343,11 +343,11 @@ def _with_delta(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation:
 
 
 def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
-    """PSNR of a baked evaluation minus that of its neural parent."""
+    """PSNR of a baked evaluation minus that of its trained parent."""
     known = row.get("psnr_delta")
     if known is not None:
         return known
-    parent = neural_parent(row, evaluations)
+    parent = trained_parent(row, evaluations)
     before, after = (parent.get("psnr") if parent else None), row.get("psnr")
     return None if before is None or after is None else after - before
 
@@ -374,8 +374,8 @@ def disambiguate(records: Records) -> None:
                     items[i] = replace(items[i], label=f"{items[i].label} ({suffix})")
 
 
-def neural_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
-    """The neural evaluation that a baked one is compared with.
+def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
+    """The trained evaluation that a baked one is compared with.
 
     That of the same run where that is known; else of the same scene and method, and of several the one whose file lies
     in the same folder. None when that leaves a doubt.

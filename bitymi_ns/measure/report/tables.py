@@ -8,7 +8,7 @@ from typing import Literal
 
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
-from bitymi_ns.measure.report.records import Curve, Evaluation, Records, neural_parent, psnr_delta
+from bitymi_ns.measure.report.records import Curve, Evaluation, Records, psnr_delta, trained_parent
 
 MISSING = "–"
 
@@ -85,7 +85,7 @@ def _fps(row: Evaluation) -> float | None:
 
 
 def _atlas_mb(row: Evaluation) -> float | None:
-    return row.results.get("atlas_bytes", 0.0) / 1e6 or None  # a neural row has no atlas, not one of 0 MB
+    return row.results.get("atlas_bytes", 0.0) / 1e6 or None  # a trained row has no atlas, not one of 0 MB
 
 
 COLUMNS = (
@@ -104,11 +104,11 @@ COLUMNS = (
 )
 """The paper's columns and the run-time figures beside them."""
 
-STAGES = {False: "Pre-baking (neural renderer)", True: "Post-baking (atlas)"}
+STAGES = {False: "Trained scene", True: "Baked bundle"}
 
 NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
-    "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus neural, in dB. ± seeds: standard "
+    "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard "
     "deviation of the PSNR over seeds. ccPSNR: after an affine fit of each view's colours to its photograph, so that "
     "exposure and white balance do not count. Bold: best of its scene."
 )
@@ -236,14 +236,14 @@ def quality_tables(records: Records) -> list[Table]:
 
 
 def summary(records: Records, limit: int = 8) -> list[str]:
-    """A sentence for each baked evaluation with a neural parent; none when there are more than `limit`."""
+    """A sentence for each baked evaluation with a trained parent; none when there are more than `limit`."""
     lines = []
     for row in sorted(records.evaluations, key=lambda e: (e.scene, e.label)):
         delta = psnr_delta(row, records.evaluations)
-        parent = neural_parent(row, records.evaluations)
+        parent = trained_parent(row, records.evaluations)
         if parent is None or delta is None:
             continue
-        parts = [f"{parent.results['psnr']:.2f} dB neural, {row.results['psnr']:.2f} dB baked ({signed(delta)})"]
+        parts = [f"{parent.results['psnr']:.2f} dB trained, {row.results['psnr']:.2f} dB baked ({signed(delta)})"]
         before, after = parent.get("render_ms"), row.get("render_ms")
         if before and after:
             parts.append(

@@ -38,18 +38,18 @@ def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matri
     assert cells[5]["value"]["points"][0]["knob"] == "r_max"
     for cell in cells:
         assert cell["made"]["machine"] and cell["made"]["versions"]["python"] and cell["made"]["command"]
-    log = (work / "logs" / "fox" / "bitymi").glob("*/train-neural.log")
+    log = (work / "logs" / "fox" / "bitymi").glob("*/train-trained.log")
     assert "passive" in next(log).read_text()
 
 
 def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix.chains()[1:2])
-    train, neural, export, baked, pictures, knobs = fakes.calls()
+    train, trained, export, baked, pictures, knobs = fakes.calls()
     assert train.startswith("ns-train bitymi ") and train.endswith("captures/fox")
     for words in ("--machine.seed 1", "--pipeline.model.train.seed 1", "--max-num-iterations 100", "--vis none"):
         assert words in train
     assert export.startswith("ns-export bitymi-atlas --load-config ") and export.endswith("--format bc7")
-    assert neural.startswith("ns-eval --load-config ") and "/bundles/" in baked
+    assert trained.startswith("ns-eval --load-config ") and "/bundles/" in baked
     assert pictures.startswith("bitymi bench pictures ") and knobs.startswith("bitymi bench knobs ")
 
 
@@ -152,7 +152,7 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path:
 def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_path: Path) -> None:
     (fakes.folder / "ns-eval").write_text("#!/bin/sh\nexit 0\n")
     (failure, *_) = run_chains(tmp_path / "work", matrix.chains()[:1])
-    assert "evaluation (neural)" in failure and "no figures" in failure
+    assert "evaluation (trained)" in failure and "no figures" in failure
 
 
 def test_two_benchmarks_do_not_work_on_one_run(fakes, matrix: Matrix, tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def test_the_display_counts_finished_and_failed_cells(matrix: Matrix, tmp_path: 
         assert len(display.pending) == 2
     text = out.getvalue()
     assert "1 of 6 cells are finished already" in text
-    assert "evaluation (neural): 2 min" in text and "export (bc7): failed" in text and "left out" in text
+    assert "evaluation (trained): 2 min" in text and "export (bc7): failed" in text and "left out" in text
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(4.2, "4 s"), (300, "5 min"), (7200, "2.0 h")])

@@ -157,7 +157,7 @@ def test_a_plan_by_the_command(
     words = ("local", "--data", capture("fox"), "--steps", 10, "--plan", "ablation", "--pictures", 0)
     assert run(*words, "--work", tmp_path / "w") == 0
     out = capsys.readouterr().out
-    assert "| fox | falloff 0.001 | neural |" in out and len(fakes.calls()) == 20
+    assert "| fox | falloff 0.001 | trained |" in out and len(fakes.calls()) == 20
 
 
 def test_failures_end_with_status_1(

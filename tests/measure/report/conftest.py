@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-# scene, method: PSNR, SSIM, FLIP, surfels, milliseconds of the neural renderer
+# scene, method: PSNR, SSIM, FLIP, surfels, milliseconds of the trained renderer
 RUNS = {
     ("fox", "bitymi"): (27.413, 0.871, 0.118, 18_942, 61.7),
     ("fox", "bitymi-quality"): (27.902, 0.879, 0.113, 27_310, 88.4),
     ("snowmiku", "bitymi"): (31.055, 0.944, 0.071, 11_207, 48.9),
     ("snowmiku", "bitymi-quality"): (31.618, 0.949, 0.068, 16_550, 66.0),
 }
-# format: change of PSNR, bytes per texel, share of the neural renderer's milliseconds
+# format: change of PSNR, bytes per texel, share of the trained renderer's milliseconds
 FORMATS = {"fp16": (0.001, 6, 0.24), "uint8": (-0.004, 4, 0.22), "bc7": (-0.031, 1, 0.23)}
 
 
@@ -66,7 +66,7 @@ def write_results(root: Path) -> Path:
         shared = {"ssim": ssim, "flip": flip, "surfels": surfels, "fragments_per_pixel": 14.2}
         evals = root / "evals" / scene
         evals.mkdir(parents=True, exist_ok=True)
-        neural = evaluation(
+        trained = evaluation(
             scene,
             method,
             str(run / "nerfstudio_models/step-000002999.ckpt"),
@@ -75,7 +75,7 @@ def write_results(root: Path) -> Path:
             atlas_bytes=0,
             **shared,
         )
-        (evals / f"{method}.json").write_text(json.dumps(neural, indent=2))
+        (evals / f"{method}.json").write_text(json.dumps(trained, indent=2))
         for name, (delta, texel, share) in FORMATS.items():
             baked = evaluation(
                 scene,
@@ -90,7 +90,7 @@ def write_results(root: Path) -> Path:
         if method == "bitymi":
             phase = 0.5 * list(RUNS).index((scene, method))  # other photographs in every scene
             for index in range(7):
-                view(root / "renders" / scene / "neural" / f"eval_img_{index:04d}.png", index, 0.04, phase)
+                view(root / "renders" / scene / "trained" / f"eval_img_{index:04d}.png", index, 0.04, phase)
                 view(root / "renders" / scene / "bc7" / f"eval_img_{index:04d}.png", index, 0.05, phase)
     (root / "outputs" / "transforms.json").write_text('{"frames": []}')
     return root

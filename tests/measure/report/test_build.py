@@ -37,7 +37,7 @@ def test_full_report(results: Path, tmp_path: Path):
     assert len(pictures(html)) == 2 * len(PLOTS) + 2 * 3 * 5
     assert html.index("Worst view of 7") < html.index("Median view of 7") < html.index("Best view of 7")
     assert html.index("Best view of 7") < html.index("Quality and speed")
-    for text in ("27.41", "−0.031", "Pre-baking (neural renderer)", "Mean of 2 scenes", "18,942"):
+    for text in ("27.41", "−0.031", "Trained scene", "Mean of 2 scenes", "18,942"):
         assert text in html and text in markdown
     assert "LPIPS" not in html and "nan" not in markdown.lower()
     for name in PLOTS:
@@ -96,7 +96,7 @@ def test_report_inside_the_folder_that_it_reads(results: Path):
 
 def test_broken_files_of_a_folder_are_noted(results: Path, tmp_path: Path):
     (results / "evals" / "fox" / "broken.json").write_text('{"results": {"psnr": 2')
-    (results / "renders" / "fox" / "neural" / "eval_img_0000.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
+    (results / "renders" / "fox" / "trained" / "eval_img_0000.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
     html = build([results], tmp_path / "report").read_text("utf8")
     assert "broken.json is not valid JSON" in html and "eval_img_0000.png is not an image" in html
 

@@ -100,7 +100,7 @@ def work(tmp_path: Path) -> Path:
 
 def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) -> None:
     (work / "evals").mkdir()
-    (work / "evals" / "neural.json").write_text('{"results": {"psnr": 1.0}}')
+    (work / "evals" / "trained.json").write_text('{"results": {"psnr": 1.0}}')
     records = collect([tmp_path], tmp_path / "report")
     assert [e.results["psnr"] for e in records.evaluations] == pytest.approx([25.0, 24.9, 25.2, 25.1])
     assert [e.label for e in records.evaluations[:2]] == ["bitymi, seed 0", "bitymi, bc7, seed 0"]
@@ -111,8 +111,8 @@ def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) ->
 
 
 def test_means_over_seeds_with_their_spread(work: Path, tmp_path: Path) -> None:
-    neural, baked = over_seeds(collect([work], tmp_path / "report").evaluations)
-    assert neural.label == "bitymi (2 seeds)" and neural.results["psnr"] == pytest.approx(25.1)
+    trained, baked = over_seeds(collect([work], tmp_path / "report").evaluations)
+    assert trained.label == "bitymi (2 seeds)" and trained.results["psnr"] == pytest.approx(25.1)
     assert baked.results["psnr_seeds"] == pytest.approx(0.1414, abs=1e-3) and baked.seeds == 2
     assert baked.label == "bitymi, bc7 (2 seeds)"
 
@@ -239,7 +239,7 @@ def test_published_figures_are_the_papers() -> None:
     data = published()
     assert [len(data[k]) for k in ("quantization", "comparison", "falloff", "view_colors")] == [3, 10, 3, 3]
     scenes = data["per_scene"]
-    assert list(scenes["neural"]) == list(scenes["baked"]) and len(scenes["baked"]) == 13
+    assert list(scenes["trained"]) == list(scenes["baked"]) and len(scenes["baked"]) == 13
     for stage in scenes.values():
         for pair in stage.values():
             assert [len(side) for side in pair] == [5, 5]

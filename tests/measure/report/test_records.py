@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.measure.report.collect import collect
-from bitymi_ns.measure.report.records import ReportError, evaluation_from, neural_parent, read_json, read_jsonl
+from bitymi_ns.measure.report.records import ReportError, evaluation_from, read_json, read_jsonl, trained_parent
 
 
 def make(scene="fox", method="bitymi", checkpoint="", source="a/eval.json", **results):
@@ -37,7 +37,7 @@ def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
         ("bitymi", "/data/bundler/2025/nerfstudio_models/step-1.ckpt", 0, False),
     ],
 )
-def test_baked_or_neural(method: str, checkpoint: str, atlas_bytes: int, baked: bool):
+def test_baked_or_trained(method: str, checkpoint: str, atlas_bytes: int, baked: bool):
     row = make(method=method, checkpoint=checkpoint, atlas_bytes=atlas_bytes, psnr=20.0)
     assert row.baked is baked
     assert row.method == "bitymi"
@@ -54,14 +54,14 @@ def test_label_of_a_bundle_names_its_format():
     assert row.label == "bitymi, bc7"
 
 
-def test_neural_parent_is_of_the_same_folder_when_there_are_several():
-    first, second = make(source="run1/neural.json", psnr=20.0), make(source="run2/neural.json", psnr=21.0)
+def test_trained_parent_is_of_the_same_folder_when_there_are_several():
+    first, second = make(source="run1/trained.json", psnr=20.0), make(source="run2/trained.json", psnr=21.0)
     baked = make(source="run2/baked.json", atlas_bytes=1, psnr=20.9)
-    assert neural_parent(baked, [first, second, baked]) is second
+    assert trained_parent(baked, [first, second, baked]) is second
     elsewhere = make(source="run3/baked.json", atlas_bytes=1)
-    assert neural_parent(elsewhere, [first, second]) is None
-    assert neural_parent(first, [first, second]) is None
-    assert neural_parent(make(scene="lego", source="run1/x.json", atlas_bytes=1), [first, second]) is None
+    assert trained_parent(elsewhere, [first, second]) is None
+    assert trained_parent(first, [first, second]) is None
+    assert trained_parent(make(scene="lego", source="run1/x.json", atlas_bytes=1), [first, second]) is None
 
 
 def test_curve_keeps_the_last_line_of_a_repeated_step_and_leaves_out_a_cut_last_line(tmp_path: Path):

@@ -28,11 +28,11 @@ def test_layout_before_and_after_baking():
     ]
     (table,) = quality_tables(Records(rows))
     assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Points ↓", "ms ↓", "FPS ↑", "Atlas MB ↓", "ΔPSNR")
-    before, neural, after, baked = table.rows
+    before, trained, after, baked = table.rows
     assert before.section and after.section
-    assert neural.cells == ("bitymi", "27.40", "0.120", "12,345", "50.0", "20.0", "–", "–")
+    assert trained.cells == ("bitymi", "27.40", "0.120", "12,345", "50.0", "20.0", "–", "–")
     assert baked.cells == ("bitymi", "27.38", "0.120", "12,345", "10.0", "100", "2.50", "−0.020")
-    assert neural.best == {1} and baked.best == {4, 5}  # a column without a difference has no best
+    assert trained.best == {1} and baked.best == {4, 5}  # a column without a difference has no best
 
 
 def test_missing_values_are_dashes_and_never_best():
@@ -55,7 +55,7 @@ def test_summary_says_what_baking_changed():
         make(psnr=26.99, render_ms=10.0, atlas_bytes=3_000_000, method="bitymi-bundle"),
     ]
     (line,) = summary(Records(rows))
-    assert "27.00 dB neural, 26.99 dB baked (−0.010)" in line
+    assert "27.00 dB trained, 26.99 dB baked (−0.010)" in line
     assert "50.0 ms to 10.0 ms per view (5.0× as fast)" in line and "3.00 MB" in line
 
 

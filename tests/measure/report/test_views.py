@@ -25,20 +25,20 @@ def write(folder: Path, name: str, errors: list[float], tint: float = 0.0) -> li
 
 
 def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path: Path) -> None:
-    neural = write(tmp_path, "neural", [0.1, 0.3, 0.2, 0.05, 0.15])
+    trained = write(tmp_path, "trained", [0.1, 0.3, 0.2, 0.05, 0.15])
     baked = write(tmp_path, "baked", [0.1, 0.3, 0.2, 0.01, 0.15])
-    (compared,), others, notes = compare_views([*baked, *neural])
-    assert (others, notes, compared.title) == ([], [], "neural, baked")
+    (compared,), others, notes = compare_views([*baked, *trained])
+    assert (others, notes, compared.title) == ([], [], "trained, baked")
     titles = [view.title for view in compared.views]
     assert titles == ["Worst view of 5: number 1", "Median view of 5: number 4", "Best view of 5: number 3"]
     for view in compared.views:
         photograph, *renders = [[picture.caption for picture in column] for column in view.columns]
         assert photograph == ["photograph"]
-        assert [error for _, error in renders] == ["error of neural", "error of baked"]
+        assert [error for _, error in renders] == ["error of trained", "error of baked"]
         assert all((p.width, p.height) == (8, 6) for column in view.columns for p in column)
     # of 8-bit pictures: errors of 12 and 2 steps
     best = [column[0].caption for column in compared.views[2].columns]
-    assert best == ["photograph", "neural: 26.55 dB", "baked: 42.11 dB"]
+    assert best == ["photograph", "trained: 26.55 dB", "baked: 42.11 dB"]
     html = page_of(views=[compared])
     assert html.count("<figure>") == 15 and html.count('<div class="views">') == 3
 

@@ -19,11 +19,10 @@ from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.statistics import Rounding, ViewColorError
 from bitymi_ns.bake.surfel_codes import code_surfels
 from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
-from bitymi_ns.bake.texel_scene import TexelScene, TexelViews, coverage
+from bitymi_ns.bake.texel_scene import TexelScene
 from bitymi_ns.bake.worthwhile_color import color_choices
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2
@@ -126,8 +125,7 @@ class Coder:
         if baked.texels is not None:
             texels = TexelScene(baked, background)
             self._tiles, self._texels = texels.tiles, texels.texels
-            traced = TexelViews(texels, learned, MemoryBudget(0))
-            self._weights = coverage(texels, traced, progress, squared=True)[:, 0]
+            self._weights = texels.coverage(learned, progress, squared=True)[:, 0]
 
     @property
     def measured(self) -> bool:

@@ -14,7 +14,7 @@ from torch import Tensor
 from bitymi_ns.bake.looks import FEWEST_VIEWS, Looks, gain, look, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
-from bitymi_ns.bake.texel_scene import TexelScene, TexelViews, coverage
+from bitymi_ns.bake.texel_scene import TexelScene
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
@@ -24,7 +24,7 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import numbers, photometric
-from bitymi_ns.train.memory import MemoryBudget, OnDemand
+from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling
 from bitymi_ns.train.views import View, training_order
@@ -185,7 +185,7 @@ def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progres
     """The state that shows the set-aside views best, and the looks at these."""
     options = run.options
     looks = Looks(options, run.psnr(held_in, progress), run.state())
-    seen = coverage(run.texels, TexelViews(run.texels, views, MemoryBudget(0)), progress)
+    seen = run.texels.coverage(views, progress)
     share, attempts = (1.0 / (seen + options.prior)).squeeze(1), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]

@@ -14,6 +14,7 @@ from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.ops import (
     Fragments,
+    Projection,
     TexelFragments,
     TexelTiles,
     add_texel_coverage,
@@ -27,7 +28,9 @@ from bitymi_ns.ops import (
 )
 from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.scene.visibility import add_coverage
 from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View, shown
 
@@ -96,13 +99,25 @@ class TexelScene:
         constants = torch.where(bare[:, None], texels[self.tiles.first], self._baked.mean_residual)
         return self._baked.with_mean_residual(constants).with_texels(pages)
 
+    def projection(self, camera: Camera) -> Projection:
+        """Of the surfels into a view, on the CPU."""
+        scene = self._baked.scene
+        geometry = (scene.surfels[name] for name in GEOMETRY)
+        return project(*geometry, camera.to("cpu"), scene.near, scene.through_pixel)
+
+    def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
+        """What `coverage` gives, to rounding, of views of which nothing is kept: their colours are not worked out."""
+        total, bound = torch.zeros_like(self.texels), self._baked.scene.weight_bound
+        for index, view in enumerate(views):
+            add_coverage(self.projection(view.camera), self.tiles, view.mask, bound, total, squared)
+            progress("tracing the training views", index + 1, len(views))
+        return total[:, :1]
+
     @torch.no_grad()
     def view(self, view: View) -> TexelView:
         """Traces a view."""
-        scene, camera = self._baked.scene, view.camera.to("cpu")
-        p = scene.surfels
-        geometry = (p[name] for name in GEOMETRY)
-        projection = project(*geometry, camera, scene.near, scene.through_pixel)
+        scene, projection = self._baked.scene, self.projection(view.camera)
+        p, camera = scene.surfels, projection.camera
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
         drawn: list[Tensor] = []
 

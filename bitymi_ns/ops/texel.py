@@ -265,7 +265,7 @@ def _backward_memory(texels: Tensor, surfels: int, sums_texels: bool) -> dict[st
 
 
 def add_list_coverage(
-    fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor
+    fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor, squared: bool = False
 ) -> None:
     """What `add_texel_coverage` adds, of a fragment list as it was traced; on either device.
 
@@ -275,8 +275,11 @@ def add_list_coverage(
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
         bound: fragments of weight below this count as nothing.
         total: [T, 3] of the fragments' dtype, dense, added to, alike in all columns.
+        squared: the weights' squares.
     """
     counts = dense(fragments.weight, total)
+    if squared:
+        counts = counts.square()
     if mask is not None:
         counts = counts * mask.reshape(-1)[fragments.pixel.long()]
     share, base = total.new_ones(len(total)), total.new_zeros(fragments.surfels, 3)

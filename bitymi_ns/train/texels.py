@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.utils.hooks import RemovableHandle
 
-from bitymi_ns.ops import TexelDescent, add_list_coverage, fitting_lists, project
+from bitymi_ns.ops import TexelDescent, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
-from bitymi_ns.scene.visibility import Visibility, visibility
+from bitymi_ns.scene.visibility import Visibility, add_coverage, visibility
 from bitymi_ns.train.losses import numbers
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.processes import ALONE, Processes
@@ -188,13 +188,7 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     total = torch.zeros_like(field.texels)
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
-        camera, mask, top = view.camera.to(total.device), view.mask, 0
+        camera = view.camera.to(total.device)
         projection = project(*geometry, camera, scene.near, scene.config.through_pixel)
-        if mask is not None:
-            mask = mask.to(total.device).reshape(camera.height, camera.width)
-        for fragments in fitting_lists(projection):
-            rows = None if mask is None else mask[top : top + fragments.height]
-            add_list_coverage(fragments, field.tiles, rows, scene.config.weight_bound, total)
-            top += fragments.height
-            del fragments  # before the next list is made
+        add_coverage(projection, field.tiles, view.mask, scene.config.weight_bound, total)
     return total[:, 0]

@@ -33,6 +33,8 @@ MOST_PRICE = 8.0 / 255**2
 exposure, and does not hide that of rounding; and texels learn little behind steps above the 5.9 of 255 that this is."""
 TEXEL_SHARE = 0.5
 """Of the error that a bit is worth elsewhere, what it is worth in texels, which are tuned after it."""
+ENOUGH = 0.002
+"""Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
 LEAST_ERROR = 1e-7
 """Mean square error that is always allowed, of colours from 0 to 1: 70 dB."""
 _SEARCH = 7
@@ -47,7 +49,8 @@ class Compact:
     Attributes:
         share: how much it may add to the mean square error of the pictures against the training photographs, as a share
             of it, before the texels are tuned; less where the price would be above `MOST_PRICE`.
-        most_bytes: as small as it takes for surfels and texels to be no more than this; None = `share` decides.
+        most_bytes: as small as it takes for surfels and texels to be no more than this, or smaller where more would add
+            no more than `ENOUGH` of the error; None = `share` decides.
         psnr: as small as it may be for the training photographs to be shown at so many dB, before the texels are tuned;
             None = `share` decides.
         views: training views that are drawn, spread over all.
@@ -205,7 +208,13 @@ def chosen(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
         ValueError: as `compacted` does.
     """
     if options.most_bytes is not None:
-        found = _search(coder, lambda priced: priced.bytes > 0.97 * options.most_bytes, progress, upper=True)
+        enough = coder.error + max(LEAST_ERROR, ENOUGH * coder.error) if coder.measured else -math.inf
+        found = _search(
+            coder,
+            lambda priced: priced.bytes > 0.97 * options.most_bytes or priced.error <= enough,
+            progress,
+            upper=True,
+        )
         if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:
             raise ValueError(
                 f"{options.most_bytes:,} bytes are too few for {len(found.baked.rows):,} surfels, which take "

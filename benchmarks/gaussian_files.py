@@ -142,6 +142,7 @@ def main() -> int:
         "--forms", nargs="+", default=["ply", "compressed.ply", "sog", "spz"],
         help="SUFFIX[:BANDS[:PERCENT]] (%(default)s)",
     )  # fmt: skip
+    parser.add_argument("--downscale", type=int, default=1, help="of the photographs (%(default)s)")
     parser.add_argument("--principal", nargs=2, type=float, metavar=("X", "Y"), help="in pixels")
     parser.add_argument("--background", nargs=3, type=float, default=[0.0, 0.0, 0.0], metavar=("R", "G", "B"))
     parser.add_argument(
@@ -150,7 +151,10 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    judge, transform = Judge(load(options.data, 1), options.principal, options.background), Transform(options.transform)
+    judge, transform = (
+        Judge(load(options.data, options.downscale), options.principal, options.background),
+        Transform(options.transform),
+    )
     options.work.mkdir(parents=True, exist_ok=True)
     results = Results(options.work / "gaussians.jsonl")
     notes = [] if options.own is None else [judge.against(read_gaussians(options.own[0]), Path(options.own[1]))]

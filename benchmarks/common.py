@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 if importlib.util.find_spec("bitymi_ns") is None:  # not installed, or not yet: gpu.py builds it
     sys.path.append(str(Path(__file__).resolve().parent.parent))
@@ -14,7 +17,18 @@ from bitymi_ns.measure.bench.process import CommandFailed, say
 from bitymi_ns.measure.bench.tables import difference, number, page
 from bitymi_ns.measure.markdown import table
 
-__all__ = ["CommandFailed", "difference", "number", "page", "publish", "read_curve", "say", "table"]
+T = TypeVar("T")
+__all__ = ["CommandFailed", "cpu_milliseconds", "difference", "number", "page", "publish", "read_curve", "say", "table"]
+
+
+def cpu_milliseconds(run: Callable[[], T], repeats: int) -> tuple[T, float]:
+    """What a call returns, and the least milliseconds of the thread over some calls; one before them makes room."""
+    times, result = [], run()
+    for _ in range(repeats):
+        start = time.thread_time()
+        result = run()
+        times.append(1e3 * (time.thread_time() - start))
+    return result, min(times)
 
 
 def publish(text: str, output: Path | None, silent: bool = False) -> None:

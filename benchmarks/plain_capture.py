@@ -1,9 +1,10 @@
-"""A capture with a transforms.json read without nerfstudio: photographs, poses and the sparse points."""
+"""Captures read without nerfstudio, with a transforms.json or one for each split: photographs, poses and points."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,15 @@ class Capture:
         train, held_out: views; every `interval`-th photograph is held out, the first one too.
         points: [M, 3] sparse points.
         colours: [M, 3] in [0, 1].
+        middle, scale: [3] float64; a point x of the capture's own frame lies at (x - middle) scale.
     """
 
     train: list[View]
     held_out: list[View]
     points: Tensor
     colours: Tensor
+    middle: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+    scale: float = 1.0
 
     @property
     def views(self) -> list[View]:
@@ -70,7 +74,33 @@ def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture
     points, colours = _points(folder / meta["ply_file_path"]) if "ply_file_path" in meta else (torch.zeros(0, 3),) * 2
     points = ((points.double() - middle) * scale).float()
     held_out = [view for i, view in enumerate(views) if i % interval == 0]
-    return Capture([view for i, view in enumerate(views) if i % interval], held_out, points, colours)
+    train = [view for i, view in enumerate(views) if i % interval]
+    return Capture(train, held_out, points, colours, middle, scale)
+
+
+def load_split_capture(folder: Path, points: str, downscale: int = 1) -> Capture:
+    """Reads a capture of the Blender data set's kind: transforms_train.json, and transforms_test.json with the views
+    that are held out. The frame stays; photographs keep their alpha.
+
+    Args:
+        folder: with both files.
+        points: name of the PLY file of the points to start from.
+        downscale: whole factor by which photographs are reduced.
+    """
+    middle, splits = torch.zeros(3, dtype=torch.float64), []
+    for split in ("train", "test"):
+        meta, views = json.loads((folder / f"transforms_{split}.json").read_text("utf8")), []
+        for frame in meta["frames"]:
+            image = Image.open((folder / frame["file_path"]).with_suffix(".png")).convert("RGBA")
+            size = (image.width // downscale, image.height // downscale)
+            picture = np.array(image if downscale == 1 else image.resize(size, Image.Resampling.BOX))
+            focal = 0.5 * image.width / math.tan(0.5 * meta["camera_angle_x"])
+            values = {"w": image.width, "h": image.height, "fl_x": focal, "fl_y": focal}
+            values |= {"cx": 0.5 * image.width, "cy": 0.5 * image.height}
+            pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
+            views.append(View(_camera(values, pose, middle, 1.0, *size), torch.from_numpy(picture)))
+        splits.append(views)
+    return Capture(*splits, *_points(folder / points))
 
 
 def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, width: int, height: int) -> Camera:

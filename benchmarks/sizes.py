@@ -17,9 +17,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 
@@ -27,7 +26,7 @@ os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")
 
 import numpy as np
 import torch
-from common import number, page, publish, say, table
+from common import cpu_milliseconds, number, page, publish, say, table
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from torch import Tensor
@@ -43,7 +42,6 @@ from bitymi_ns.train.evaluate import evenly_spaced
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View, as_float, reduce_image
 
-Draw = Callable[[Camera], Tensor]
 SIZES = ("scene", "size", "before", "now", "averaged", "to avg", "before, ms", "now, ms", "samples", "blended, million")
 FLICKER = ("scene", "to size", "before", "now", "averaged", "before, off", "now, off", "worst step", "averaged there")
 MEASURED = FLICKER[2:7]
@@ -98,16 +96,6 @@ class Bundle:
         return reduce_image(image, camera.width, camera.height)
 
 
-def timed(fn: Draw, camera: Camera, repeats: int) -> tuple[Tensor, float]:
-    """What is drawn, and milliseconds of the thread."""
-    times = []
-    for _ in range(repeats + 1):  # the first one makes room
-        start = time.thread_time()
-        image = fn(camera)
-        times.append(1e3 * (time.thread_time() - start))
-    return image, min(times[1:])
-
-
 def sizes(bundle: Bundle, wanted: list[float], repeats: int) -> list[list[str]]:
     """Lines of the first table."""
     rows = []
@@ -116,8 +104,8 @@ def sizes(bundle: Bundle, wanted: list[float], repeats: int) -> list[list[str]]:
         for i, view in enumerate(bundle.views):
             camera = view.camera.scaled(size)
             photo = bundle.photograph(i, camera)
-            before, before_ms = timed(bundle.before, camera, repeats)
-            now, now_ms = timed(bundle.now, camera, repeats)
+            before, before_ms = cpu_milliseconds(partial(bundle.before, camera), repeats)
+            now, now_ms = cpu_milliseconds(partial(bundle.now, camera), repeats)
             truth = bundle.averaged(camera, size)
             overdraw = bundle.scene.render(camera, maps=True).overdraw
             values = (

@@ -32,6 +32,8 @@ MOST_PRICE = 8.0 / 255**2
 exposure, and does not hide that of rounding; and texels learn little behind steps above the 5.9 of 255 that this is."""
 TEXEL_SHARE = 0.5
 """Of the error that a bit is worth elsewhere, what it is worth in texels, which are tuned after it."""
+ENOUGH = 0.002
+"""Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
 LEAST_ERROR = 1e-7
 """Mean square error that is always allowed, of colours from 0 to 1: 70 dB."""
 _SEARCH = 7
@@ -46,7 +48,8 @@ class Compact:
     Attributes:
         share: how much it may add to the mean square error of the pictures against the training photographs, as a share
             of it, before the texels are tuned; less where the price would be above `MOST_PRICE`.
-        most_bytes: as small as it takes for surfels and texels to be no more than this; None = `share` decides.
+        most_bytes: as small as it takes for surfels and texels to be no more than this, or smaller where more would add
+            no more than `ENOUGH` of the error; None = `share` decides.
         psnr: as small as it may be for the training photographs to be shown at so many dB, before the texels are tuned;
             None = `share` decides.
         views: training views that are drawn, spread over all.
@@ -188,12 +191,31 @@ def compacted(
         ValueError: an option is out of range, or what is asked for cannot be had.
     """
     options = options or Compact()
-    coder = Coder(baked, views, background, options, progress, device)
+    return chosen(Coder(baked, views, background, options, progress, device), options, progress)
+
+
+def chosen(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[Baked, TexelCodeOptions]:
+    """What `compacted` returns, of what is measured already.
+
+    Args:
+        coder: measured with options that differ at most in what decides the price.
+        options: see `Compact`.
+        progress: called on the way.
+
+    Raises:
+        ValueError: as `compacted` does.
+    """
     if options.most_bytes is not None:
-        found = _search(coder, lambda priced: priced.bytes > 0.97 * options.most_bytes, progress, upper=True)
+        enough = coder.error + max(LEAST_ERROR, ENOUGH * coder.error) if coder.measured else -math.inf
+        found = _search(
+            coder,
+            lambda priced: priced.bytes > 0.97 * options.most_bytes or priced.error <= enough,
+            progress,
+            upper=True,
+        )
         if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:
             raise ValueError(
-                f"{options.most_bytes:,} bytes are too few for {len(baked.rows):,} surfels, which take "
+                f"{options.most_bytes:,} bytes are too few for {len(found.baked.rows):,} surfels, which take "
                 f"{found.baked.codes.surfels.nbytes():,}: ask for more, or train with fewer surfels"
             )
     elif not coder.measured:
@@ -208,14 +230,21 @@ def compacted(
     else:
         allowed = coder.error + max(LEAST_ERROR, options.share * coder.error)
         found = _search(coder, lambda priced: priced.error <= allowed, progress, most=MOST_PRICE)
-    rounded, coding = found.baked, found.coding
-    assert rounded.codes is not None
+    baked, coding = kept_at(coder, found)
     if options.most_bytes is not None:
-        coding = replace(coding, most_bytes=options.most_bytes - rounded.codes.surfels.nbytes())
-    mse = found.error - coder.error if coder.measured else None
+        assert baked.codes is not None
+        coding = replace(coding, most_bytes=options.most_bytes - baked.codes.surfels.nbytes())
+    return baked, coding
+
+
+def kept_at(coder: Coder, priced: Priced) -> tuple[Baked, TexelCodeOptions]:
+    """The bake at a price, which states what it costs, and how its texels are to be coded."""
+    rounded = priced.baked
+    assert rounded.codes is not None
+    mse = priced.error - coder.error if coder.measured else None
     rounding = Rounding(mse=mse if mse is None else max(0.0, mse), steps=dict(rounded.codes.surfels.steps))
     statistics = rounded.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(rounded))
-    return replace(rounded, statistics=statistics), coding
+    return replace(rounded, statistics=statistics), priced.coding
 
 
 LEAST_TEXEL_BYTES = 1000

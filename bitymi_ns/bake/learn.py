@@ -14,6 +14,7 @@ from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
 from bitymi_ns.bake.polish import PolishOptions, polish_scene
+from bitymi_ns.bake.texel_codes import TexelCodeOptions
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
@@ -92,13 +93,31 @@ def bake_and_learn(
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
-    tune = learning.tune
     if learning.compact is not None:  # its texels are decoded to 8 bits: nothing has to be encoded to state their error
         options = replace(options, format="uint8")
     baked = baked_and_reduced(scene, cameras, photographs, background, options, learning, progress, held_out)
     coding = None
     if learning.compact is not None:
         baked, coding = compacted(baked, photographs, background, learning.compact, progress, device_of(cameras))
+    return stored(baked, cameras, photographs, background, learning.tune, coding, progress, held_out)
+
+
+def stored(
+    baked: Baked,
+    cameras: Sequence[Camera],
+    photographs: Sequence[View],
+    background: Tensor,
+    tune: TuneOptions | None,
+    coding: TexelCodeOptions | None = None,
+    progress: Progress = no_progress,
+    held_out: Sequence[View] = (),
+) -> Baked:
+    """The last part of `bake_and_learn`, with its arguments: texels are tuned and encoded, and their error is stated.
+
+    Args:
+        baked: of `baked_and_reduced`, or of that what `compact.compacted` made.
+        coding: from there, how texels are coded.
+    """
     if tune is not None and baked.texels is not None:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
     if baked.codes is not None and baked.codes.texels is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,6 +29,11 @@ LEAST_WEIGHT = 1e-12
 """Of a direction: a surfel that no view shows has a colour, too."""
 VIEW_SHARE = 0.5
 """Of the error, that the training views count; the rest are directions between and around them."""
+
+BLIND = 4
+"""Directions from so many of the nearest views that do not show the surfel count, too."""
+BLIND_SHARE = 0.1
+"""Of what a view would show of the surfel from there, that these count: a view beside them may look at it."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,8 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
 
     Terms are left out and the others fitted as in `lean_color`, but the error is that of the pictures: squared, of
     max(f_view + 0.5, 0), in every view times what it shows of the surfel. Half of it is that in the training views,
-    half the mean of directions between and around them.
+    half the mean of directions between and around them. Beside these, views that pass close by a surfel without looking
+    at it count by what they would show of it: the next view does look, and has nothing else to go by.
 
     Args:
         scene: with lean view colours.
@@ -111,11 +117,14 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
         if count == 0 or len(group) == 0:
             continue
         done = 0
-        for at in view_directions(surfels["means"][group], weights[:, group] > 0, centers_of(cameras, error)):
+        centers = centers_of(cameras, error)
+        for at in view_directions(surfels["means"][group], weights[:, group] > 0, centers):
             rows = group[at.rows]
             own = {name: surfels[name][rows] for name in ("view_base", "view_span")}
+            blind, counts_blind = _blind(surfels["means"][rows], weights[:, rows], centers, scene.near)
+            weight = torch.cat([_weights(at, weights[:, rows]), counts_blind], dim=1)
+            at = replace(at, unit=torch.cat([at.unit, blind], dim=1))
             target = shown_at(kind, {**own, "view_terms": surfels["view_terms"]}, at.unit)
-            weight = _weights(at, weights[:, rows])
             fewer = range(1, count) if entry.sites is not None else range(0)
             sites = (base[rows, count], terms[count][rows])
             for number, b, t in [_one_color(target, weight, entry), *_fewer(at, weight, target, sites, fewer)]:
@@ -137,6 +146,24 @@ def _weights(at: Directions, weights: Tensor) -> Tensor:
     rest = at.valid.shape[1] - at.views
     between = (1 - VIEW_SHARE) * of_views.sum(1, keepdim=True) / max(1, rest)
     return torch.cat([VIEW_SHARE * of_views, between.expand(-1, rest)], dim=1)
+
+
+def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
+    """Directions [n, BLIND, 3] from the nearest views that do not show a surfel, and how much each counts: by what the
+    views that do show would show from there, by the square of the distance; none from where there is no such view.
+
+    Args:
+        means: [n, 3].
+        weights: [V, n] of the views.
+        centers: [V, 3] float64.
+        near: nearest depth that is drawn.
+    """
+    offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
+    square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
+    from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)
+    nearest = square.masked_fill(shows, torch.inf).topk(min(BLIND, len(centers)), largest=False)
+    unit = F.normalize(offset.gather(1, nearest.indices[..., None].expand(-1, -1, 3)), dim=2)
+    return unit.to(means), (BLIND_SHARE * from_unit[:, None] / nearest.values).to(means)
 
 
 def _one_color(target: Tensor, weight: Tensor, entry: ViewColor) -> tuple[int, Tensor, Tensor]:

@@ -32,6 +32,7 @@ from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, dump
+from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
@@ -226,6 +227,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             bundle.info.statistics.held_out = held_out
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
+        self.state_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:
             self._write_extras(bundle, views, datamanager.eval_views)
 

@@ -29,6 +29,11 @@ _NAMES = {
 }
 """Columns of the PLY file of 3DGS, in its order; f_rest has all of red, then green, then blue."""
 
+_REST = tuple(3 * (n * n - 1) for n in range(1, 5))
+"""How many columns f_rest has, with harmonics up to degree 0, 1, 2 and 3."""
+_UNIT_LENGTH = 1e-6
+"""Rotations that differ by no more from it are left as they are."""
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -101,17 +106,29 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def read_gaussians(path: str | Path) -> Gaussians:
-    """Reads a file of `write_gaussians`.
+    """Reads a PLY file of 3DGS, of `write_gaussians` or of other programs: its harmonics may end at any degree, normals
+    may be left out, and rotations may have any length but 0.
 
     Raises:
         ply.PlyError: it is another kind of PLY, a column is missing, or a value is not finite.
     """
     columns = ply.parse_ply(Path(path).read_bytes())["vertex"]
-    missing = [name for names in _NAMES.values() for name in names if name not in columns]
+    of_file = {**_NAMES, "rest": tuple(name for name in _NAMES["rest"] if name in columns)}
+    del of_file["normals"]
+    missing = [name for names in of_file.values() for name in names if name not in columns]
+    if len(of_file["rest"]) not in _REST:
+        missing.append(_NAMES["rest"][len(of_file["rest"])])
     if missing:
         raise ply.PlyError(f"the column {missing[0]} is missing")
-    found = {group: torch.from_numpy(np.stack([columns[n] for n in names], 1)) for group, names in _NAMES.items()}
-    coefficients = torch.cat([found["dc"][:, None], found["rest"].unflatten(1, (3, -1)).transpose(1, 2)], dim=1)
-    return Gaussians(
-        found["means"], found["quats"], found["log_scales"], found["opacity_logits"][:, 0], coefficients.contiguous()
-    )
+    count = len(columns["x"])
+    found = {
+        group: torch.from_numpy(np.stack([columns[n] for n in names], 1)) if names else torch.zeros(count, 0)
+        for group, names in of_file.items()
+    }
+    coefficients = torch.zeros(count, harmonics.TERMS, 3)
+    coefficients[:, 0] = found["dc"]
+    rest = found["rest"].unflatten(1, (3, len(of_file["rest"]) // 3)).transpose(1, 2)
+    coefficients[:, 1 : 1 + rest.shape[1]] = rest
+    length = found["quats"].norm(dim=1, keepdim=True)
+    quats = torch.where((length - 1).abs() > _UNIT_LENGTH, found["quats"] / length, found["quats"])
+    return Gaussians(found["means"], quats, found["log_scales"], found["opacity_logits"][:, 0], coefficients)

@@ -9,7 +9,17 @@ import pytest
 import torch
 
 from bitymi_ns.bake import Baked, TuneOptions, tune_atlas
-from bitymi_ns.bake.compact import MOST_PRICE, TEXEL_SHARE, Coder, Compact, compacted, with_coded_texels
+from bitymi_ns.bake.compact import (
+    ENOUGH,
+    MOST_PRICE,
+    START,
+    TEXEL_SHARE,
+    Coder,
+    Compact,
+    chosen,
+    compacted,
+    with_coded_texels,
+)
 from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bake.texel_codes import TexelCodeOptions
 from bitymi_ns.bundle import check_files, export
@@ -91,6 +101,15 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: li
     assert most / 2 < tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes() <= most
     with pytest.raises(ValueError, match="are too few for 60 surfels"):
         compacted(truth, views, BACKGROUND, Compact(most_bytes=300))
+
+
+def test_bytes_that_buy_nothing_are_not_spent(truth: Baked, views: list[View]) -> None:
+    coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
+    kept, coding = chosen(coder, Compact(most_bytes=10**9))
+    assert ENOUGH * coder.error < kept.statistics.rounding.mse < 10 * ENOUGH * coder.error
+    size = kept.codes.surfels.nbytes() + with_coded_texels(kept, coding).codes.texels.nbytes()
+    assert size < 0.8 * coder.at(START / 1000).bytes
+    assert coding.most_bytes == 10**9 - kept.codes.surfels.nbytes()
 
 
 def test_without_views_the_reference_steps_are_taken(truth: Baked) -> None:

@@ -78,3 +78,21 @@ def test_what_costs_nothing_is_left_out_and_what_shows_is_kept(colored, cameras)
     assert int(counts[~seen].sum()) <= int(scene.surfels["view_span"][~seen, 1].sum())
     assert bool((choices.error[seen][:, 0] >= 0).all())
     assert bool((counts <= scene.surfels["view_span"][:, 1]).all())
+
+
+def test_views_that_pass_close_by_count_though_they_look_elsewhere(colored, cameras) -> None:
+    """Such a view shows nothing, and so adds what the colour may be wrong by from there."""
+    scene = colored("sv")
+    weights = shown_weights(scene, cameras)
+    row = int(weights.sum(0).argmax())
+    turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # the other way round
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = turned @ cameras[0].viewmat[:3, :3]
+    center = scene.surfels["means"][row] + 0.05 * torch.nn.functional.normalize(
+        cameras[0].center - scene.surfels["means"][row], dim=0
+    ).roll(1)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    blind = replace(cameras[0], viewmat=viewmat)
+    assert float(shown_weights(scene, [blind])[0, row]) == 0.0
+    before, after = (color_choices(scene, views).error[:, 0] for views in (cameras, [*cameras, blind]))
+    assert float(after[row]) > 1.5 * float(before[row])

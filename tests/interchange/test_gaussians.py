@@ -31,6 +31,27 @@ def test_the_columns_are_those_of_3dgs_in_its_order(surfels, tmp_path: Path) -> 
     assert [columns[f"f_rest_{i}"][0] for i in (0, 14, 15, 44)] == [100.0, 114.0, 200.0, 314.0]
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_files_of_other_programs_are_read(surfels, tmp_path: Path, degree: int) -> None:
+    coefficients, terms = torch.randn(5, 16, 3), (degree + 1) ** 2
+    g = gaussians_of(baked(surfels(5), "sv"), coefficients)
+    write_gaussians(tmp_path / "a.ply", g)
+    columns = ply.parse_ply((tmp_path / "a.ply").read_bytes())["vertex"]
+    few = {name: value for name, value in columns.items() if not name.startswith(("f_rest", "n"))}
+    rest = coefficients[:, 1:terms].transpose(1, 2).flatten(1)
+    few |= {f"f_rest_{i}": rest[:, i].numpy() for i in range(rest.shape[1])}
+    few |= {f"rot_{i}": 3 * columns[f"rot_{i}"] for i in range(4)}
+    ply.write_ply(tmp_path / "b.ply", few)
+    found = read_gaussians(tmp_path / "b.ply")
+    assert torch.equal(found.harmonics[:, :terms], coefficients[:, :terms]) and not found.harmonics[:, terms:].any()
+    assert torch.allclose(found.quats, g.quats, atol=1e-6)
+    if degree:
+        del few["f_rest_1"]
+        ply.write_ply(tmp_path / "b.ply", few)
+        with pytest.raises(ply.PlyError, match="f_rest"):
+            read_gaussians(tmp_path / "b.ply")
+
+
 def test_a_missing_column_is_named(tmp_path: Path) -> None:
     ply.write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
     with pytest.raises(ply.PlyError, match="the column y"):

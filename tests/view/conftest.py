@@ -28,10 +28,16 @@ def view() -> Camera:
 
 
 def write(
-    folder: Path, format: str = "bc7", count: int = 120, compact: bool = False, seen: bool = False, **options: object
+    folder: Path,
+    format: str = "bc7",
+    count: int = 120,
+    compact: bool = False,
+    seen: bool = False,
+    poster: bool = False,
+    **options: object,
 ) -> Path:
     """A bundle of the bake's test scene, with a camera and its photograph; `compact`: of version 3;
-    `seen`: photographed by this camera, so that it is drawn for the size of a view."""
+    `seen`: photographed by this camera, so that it is drawn for the size of a view; `poster`: with a poster."""
     made = real_scene(make_surfels, count=count)
     camera = view()
     picture = io.BytesIO()
@@ -54,7 +60,7 @@ def write(
         baked = bake(made, [camera] if seen else [], options=BakeOptions(format=format, **options))
         if compact:
             baked = with_coded_texels(*compacted(baked, [], torch.zeros(3)))
-        export(baked, folder, extra_files=extra)
+        export(baked, folder, extra_files=extra, first=camera if poster else None)
     return folder
 
 

@@ -28,7 +28,10 @@ SCREEN = (WIDTH, HEIGHT)
 SHOWN = "!document.getElementById('poster').hidden"
 STATE = "document.documentElement.dataset.state"
 LINK = "#p=0,-3,0&r=1,0,0,0,1,0&t=0,0,0&l=500,500,250,250,500,500"
-BARE = "for (const id of ['page', 'top', 'panel', 'menu', 'notice']) document.getElementById(id).style.visibility = 'hidden'"
+BARE = (
+    "for (const id of ['page', 'top', 'panel', 'menu', 'notice'])"
+    "document.getElementById(id).style.visibility = 'hidden'"
+)
 
 
 def held_back(site: Site, name: str, until: Path) -> Site:

@@ -7,14 +7,16 @@ connection and every answer wait for a round trip. It slows down the decoder's w
 the page on a small canvas; where graphics are drawn in software, drawing takes seconds, so the table states beside the
 picture's time when the last byte that it needs was sent.
 
-Columns: bytes sent, and seconds from asking for the page, until the first picture (of a compact bundle surfels with
-their mean colours) and until the picture with all texels; `bytes at` is when the last of the needed bytes was sent.
+Columns: bytes sent, and seconds from asking for the page, until the poster, until the first picture (of a compact
+bundle surfels with their mean colours) and until the picture with all texels; `bytes at` is when the last of the needed
+bytes was sent. While the poster comes, surfels do, too: its bytes are all that went until it was there.
 """
 
 from __future__ import annotations
 
 import argparse
 import gzip
+import math
 import sys
 import threading
 import time
@@ -30,25 +32,28 @@ from common import number, page, publish, say, table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from bitymi_ns.bundle.manifest import POSTER
 from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.view import Site, site_of
 from bitymi_ns.view.page import media_type
 from tests.view.browser import drive
 
-COLUMNS = ("bundle", "version", "network", "first: bytes", "bytes at, s", "picture at, s")
-COLUMNS += ("all: bytes", "bytes at, s", "picture at, s")
+COLUMNS = ["bundle", "version", "network"]
+for shown in ("poster", "first", "all"):
+    COLUMNS += [f"{shown}: bytes", "bytes at, s", "picture at, s"]
 NETWORKS = {"10 Mbit/s, 40 ms": (10e6, 0.04), "1.6 Mbit/s, 150 ms": (1.6e6, 0.15), "not slowed": (1e12, 0.0)}
 PIECE = 4096  # bytes that a connection sends before another has its turn
-TEXELS = "bundle/texels.bin"
+TEXELS, SHOWN_FIRST = "bundle/texels.bin", f"bundle/{POSTER}"
 WATCH = """(() => {
   const seen = (window.pictureTimes = {});
   new MutationObserver(() => {
+    const now = (performance.timeOrigin + performance.now()) / 1000;
+    if (document.querySelector('#poster:not([hidden])')) seen.poster ??= now;
     const text = document.getElementById('status')?.textContent;
     if (!text) return;
-    const now = (performance.timeOrigin + performance.now()) / 1000;
     seen.first ??= now;
     if (!text.includes('on its way')) seen.all ??= now;
-  }).observe(document, { childList: true, subtree: true, characterData: true });
+  }).observe(document, { childList: true, subtree: true, characterData: true, attributes: true });
 })()"""
 
 
@@ -59,13 +64,15 @@ class Network:
     Attributes:
         rate: bits per second.
         round_trip: seconds.
-        sent: path, bytes and the time when the last of them went, of every answer.
+        sent: path, bytes, the time when the last of them went, and all bytes that went until then, of every answer.
+        gone: bytes that went so far.
         begin: time of the first request, None before it.
     """
 
     rate: float
     round_trip: float
-    sent: list[tuple[str, int, float]] = field(default_factory=list)
+    sent: list[tuple[str, int, float, int]] = field(default_factory=list)
+    gone: int = 0
     begin: float | None = None
     _free: float = 0.0
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -74,6 +81,7 @@ class Network:
         """Until so many bytes have gone."""
         with self._lock:
             self._free = max(self._free, time.time()) + 8 * size / self.rate
+            self.gone += size
             until = self._free
         time.sleep(max(0.0, until - time.time()))
 
@@ -107,7 +115,7 @@ def slowly(site: Site, network: Network) -> Iterator[str]:
                 piece = data[at : at + PIECE]
                 network.wait(len(piece))
                 self.wfile.write(piece)
-            network.sent.append((name, len(data), time.time()))
+            network.sent.append((name, len(data), time.time(), network.gone))
 
         def log_message(self, format: str, *args: object) -> None:
             """Says nothing."""
@@ -130,13 +138,17 @@ def measure(bundle: Path, name: str, screen: tuple[int, int]) -> list[str]:
     if found.problems:
         raise SystemExit("\n".join(found.problems))
     times, begin = found.results[-1], network.begin or 0.0
-    whole = [(path, size, at) for path, size, at in network.sent if at <= times["all"]]
-    needed = [(size, at) for path, size, at in whole if path != TEXELS]
+    whole = [(path, size, at) for path, size, at, _ in network.sent if at <= times["all"]]
+    needed = [(path, size, at) for path, size, at in whole if path != TEXELS]
     info = read_manifest(bundle)
     cells = [bundle.name, info.version, name]
-    for part, seen in ((needed, times["first"]), ([(size, at) for _, size, at in whole], times["all"])):
-        last = max(at for _, at in part)
-        cells += [f"{sum(size for size, _ in part):,}", number(last - begin, 2), number(seen - begin, 2)]
+    poster = [(at, gone) for path, _, at, gone in network.sent if path == SHOWN_FIRST]
+    for at, gone in poster[:1]:
+        cells += [f"{gone:,}", number(at - begin, 2), number(times.get("poster", math.nan) - begin, 2)]
+    cells += [] if poster else ["", "", ""]
+    for part, seen in ((needed, times["first"]), (whole, times["all"])):
+        last = max(at for _, _, at in part)
+        cells += [f"{sum(size for _, size, _ in part):,}", number(last - begin, 2), number(seen - begin, 2)]
     return cells
 
 

@@ -31,6 +31,8 @@ FULL_VERSION = (1, 4)
 _DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
+POSTER = "poster.webp"
+"""A picture of what a viewer shows first, which a bundle may have: `bundle.poster`."""
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 UNIT_LENGTH = 1e-3
 """By how much the length of a direction may differ from 1."""

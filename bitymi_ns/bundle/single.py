@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 from bitymi_ns.bundle.archive import opened
-from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, parse
+from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, parse
 from bitymi_ns.bundle.read import MANIFEST_LIMIT, Bundle, assemble, check_bytes, enough_memory, read_manifest
 from bitymi_ns.files import write_file
 
-_ORDER = (MANIFEST, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
+_ORDER = (MANIFEST, POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 SUFFIX = ".bitymi"
 """Of the name of such a file."""
 _DATE = (1980, 1, 1, 0, 0, 0)

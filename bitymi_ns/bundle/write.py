@@ -26,6 +26,7 @@ from bitymi_ns.bundle.manifest import (
     FULL_VERSION,
     LEAN_VERSION,
     MANIFEST,
+    POSTER,
     SURFELS,
     TEXELS,
     VERSION,
@@ -35,6 +36,7 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
+from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.surfel_table import (
     EXTENT_COLUMN,
     TERMS,
@@ -46,6 +48,7 @@ from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.camera import Camera
 
 GENERATOR = f"bitymi-ns {__version__}"
 _CHUNK = 1 << 22
@@ -94,10 +97,12 @@ def export(
     loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
     interchange: bool = False,
+    first: Camera | None = None,
 ) -> Path:
     """Writes a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
 
-    `statistics` is added to those of the bake.
+    `statistics` is added to those of the bake. `first` is the camera with which a viewer opens, the first of
+    cameras.json that was held out, or its first: the poster is drawn from there; None = the bundle gets no poster.
     """
     baked = baked.encoded()
     return write_bundle(
@@ -112,6 +117,7 @@ def export(
         loose_files=loose_files,
         overwrite=overwrite,
         interchange=interchange,
+        poster=None if first is None else draw_poster(baked.stored(), first, background),
     )
 
 
@@ -128,6 +134,7 @@ def write_bundle(
     loose_files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
     interchange: bool = False,
+    poster: Pixels | None = None,
 ) -> Path:
     """Writes a bundle; the folder appears complete or not at all.
 
@@ -144,6 +151,7 @@ def write_bundle(
         loose_files: files that bundle.json does not vouch for, because they may be edited later.
         overwrite: replace an existing bundle.
         interchange: write surfels.ply into a compact bundle, too, for other programs.
+        poster: [H, W, 3] picture of what a viewer shows first.
 
     Returns:
         the folder.
@@ -157,7 +165,7 @@ def write_bundle(
     _check_surfels(scene)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
-        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS):
+        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER):
             raise BundleError(f"extra_files may not replace {name}")
     info = _describe(scene, atlas, background, world or World(), statistics)
     parts = {} if codes is None else _compact_parts(codes, info)
@@ -167,7 +175,10 @@ def write_bundle(
                 write_surfels(new / SURFELS, scene)
             if codes is None and atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
-            for name, data in {**parts, **(extra_files or {})}.items():
+            for name, data in parts.items():
+                (new / name).write_bytes(data)
+            shown = None if poster is None else encode_poster(poster, most_bytes(_scene_bytes(new, parts)))
+            for name, data in {**({POSTER: shown} if shown else {}), **(extra_files or {})}.items():
                 (new / name).write_bytes(data)
             info["files"] = {path.name: _fingerprint(path) for path in sorted(new.iterdir())}
             (new / MANIFEST).write_bytes(dump(describe(info)))
@@ -179,6 +190,11 @@ def write_bundle(
         why = reason(error, folder)
         raise BundleError(f"{folder} cannot be written{needs}: {why}. Nothing was left behind") from error
     return folder
+
+
+def _scene_bytes(folder: Path, parts: Mapping[str, bytes]) -> int:
+    """Of surfels and texels: of the two files of a compact bundle, or of what else there is so far."""
+    return sum(map(len, parts.values())) if parts else sum(path.stat().st_size for path in folder.iterdir())
 
 
 def write_surfels(path: Path, scene: BakedScene) -> None:

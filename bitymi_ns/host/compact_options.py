@@ -7,6 +7,7 @@ from typing import Literal
 
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bundle.poster import most_bytes
 from bitymi_ns.host.errors import fail, say
 
 BundleFormat = Literal["compact", "bc7", "uint8", "fp16"]
@@ -73,10 +74,11 @@ class CompactOptions:
         """
         most = None
         if self.target_mb is not None:
-            most = int(1e6 * self.target_mb) - beside - MANIFEST_BYTES
+            beside += MANIFEST_BYTES + most_bytes(int(1e6 * self.target_mb))
+            most = int(1e6 * self.target_mb) - beside
             if most < 1:
                 fail(
                     f"a bundle of {self.target_mb} MB leaves no bytes for the scene, as other files take "
-                    f"{beside + MANIFEST_BYTES:,}: ask for more (--target-mb)"
+                    f"{beside:,}: ask for more (--target-mb)"
                 )
         return Compact(self.compact_error, most, self.target_psnr)

@@ -177,7 +177,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         model, datamanager = pipeline.model, pipeline.datamanager
         cameras = datamanager.undistorted_train_cameras()
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
-        shown = preview(model, datamanager, views, "JPEG" if self._is_compact else "PNG")
+        first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
+        shown = preview(model, first, "JPEG" if self._is_compact else "PNG")
         cameras_of = camera_files(datamanager, views, self.photographs)
         beside = len(shown) + sum(map(len, cameras_of.values()))
         learning = self._learning(model, len(views), self.compact_of(beside) if self._is_compact else None)
@@ -219,6 +220,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
             interchange=self.interchange,
+            first=first,
         )
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
@@ -295,11 +297,8 @@ def world_of(datamanager: Any) -> World:
 
 
 @torch.no_grad()
-def preview(model: BitymiModel, datamanager: Any, train_views: list[Camera], format: str = "PNG") -> bytes:
-    """A picture of the first held-out view, or of the first training view where none is held out."""
-    camera = train_views[0]
-    if len(datamanager.eval_dataset):
-        camera = datamanager.eval_views[0].camera
+def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
+    """The trained scene as a camera sees it."""
     rgb = model.render(camera, model.background, maps=False).rgb
     pixels = (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()

@@ -23,6 +23,7 @@ TYPES = {
     ".ply": "application/octet-stream",
     ".png": "image/png",
     ".jpg": "image/jpeg",
+    ".webp": "image/webp",
 }
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "

@@ -26,7 +26,7 @@ from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> None:
     assert {p.name for p in bundle.iterdir()} == {
-        "bundle.json", "surfels.ply", "atlas.ktx2", "config.yml", "preview.png", "cameras.json"
+        "bundle.json", "surfels.ply", "atlas.ktx2", "config.yml", "preview.png", "cameras.json", "poster.webp"
     }  # fmt: skip
     cameras = json.loads((bundle / "cameras.json").read_text())["cameras"]
     assert sum(camera["held_out"] for camera in cameras) == 2 and all(

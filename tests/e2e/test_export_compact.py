@@ -22,7 +22,8 @@ def test_it_is_the_default_smaller_and_shows_the_same(
     out = " ".join(capsys.readouterr().out.split())
     assert "MB dct" in out and "per surfel" in out and "surfels within the tolerance" in out
     assert {path.name for path in folder.iterdir()} == {
-        "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg", "cameras.json"
+        "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg", "cameras.json",
+        "poster.webp",
     }  # fmt: skip
     read, checks = check_files(folder)
     assert read is not None and all(check.ok for check in checks), checks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -28,11 +29,22 @@ def view() -> Camera:
 
 
 def write(
-    folder: Path, format: str = "bc7", count: int = 120, compact: bool = False, seen: bool = False, **options: object
+    folder: Path,
+    format: str = "bc7",
+    count: int = 120,
+    compact: bool = False,
+    seen: bool = False,
+    poster: bool = False,
+    kind: str = "sv",
+    larger: float = 0.0,
+    near: float | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **options: object,
 ) -> Path:
     """A bundle of the bake's test scene, with a camera and its photograph; `compact`: of version 3;
-    `seen`: photographed by this camera, so that it is drawn for the size of a view."""
-    made = real_scene(make_surfels, count=count)
+    `seen`: photographed by this camera, so that it is drawn for the size of a view; `poster`: with a poster;
+    `larger`: what the logarithms of the scales are more."""
+    made = real_scene(make_surfels, count=count, kind=kind)
     camera = view()
     picture = io.BytesIO()
     Image.new("RGB", (WIDTH, HEIGHT), (200, 80, 40)).save(picture, "JPEG")
@@ -51,10 +63,13 @@ def write(
         "photograph-0001.jpg": picture.getvalue(),
     }
     with torch.no_grad():
+        made.surfels["log_scales"] += larger
         baked = bake(made, [camera] if seen else [], options=BakeOptions(format=format, **options))
         if compact:
             baked = with_coded_texels(*compacted(baked, [], torch.zeros(3)))
-        export(baked, folder, extra_files=extra)
+        if near is not None:
+            baked = replace(baked, scene=replace(baked.scene, near=near))
+        export(baked, folder, background=background, extra_files=extra, first=camera if poster else None)
     return folder
 
 

@@ -47,6 +47,8 @@ const actions = {
   settle: () => page.waitForFunction(settled, null, { polling: 200 }),
   // until a picture is there without its texture
   first: () => page.waitForFunction(() => document.documentElement.dataset.frame === 'first', null, { polling: 100 }),
+  // until the poster is shown
+  poster: () => page.waitForFunction(() => !document.querySelector('#poster').hidden, null, { polling: 50 }),
   loaded: ([selector]) => page.waitForFunction((s) => document.querySelector(s).naturalWidth > 0, selector),
   click: ([selector]) => page.click(selector),
   press: ([selector]) => page.evaluate(press, selector), // also where the screen is too small to show it

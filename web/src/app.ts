@@ -6,6 +6,7 @@ import type { Show } from './render/programs';
 import type { Screen } from './render/screen';
 import { element, press, pressed } from './ui/dom';
 import { notify, showError } from './ui/pages';
+import { endPoster } from './ui/poster';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import { Pace } from './view/pace';
@@ -134,6 +135,7 @@ export class App {
         return;
       }
       const took = performance.now() - begin;
+      endPoster();
       if (!still && chosen === 'auto') this.pace.took(took);
       this.still = still && !this.dirty;
       this.report(took, scale);

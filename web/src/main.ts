@@ -1,7 +1,8 @@
 // The page: loads the bundle beside it and shows it.
 import './ui/style.css';
 import { App } from './app';
-import { loadBundle } from './bundle/load';
+import { type Bundle, loadBundle, loadManifest } from './bundle/load';
+import { loadPoster } from './bundle/poster';
 import { Folder, SingleFile, type Source } from './bundle/source';
 import { ViewerError } from './errors';
 import { openDevice } from './render/device';
@@ -11,6 +12,8 @@ import { SceneOnDevice } from './render/scene';
 import { screenOf } from './render/screen';
 import { element } from './ui/dom';
 import { notify, showError, showProgress, showScene } from './ui/pages';
+import { showPoster } from './ui/poster';
+import { fromHash } from './view/share';
 
 // The bundle beside the page: the file that the address asks for (?file=), the one that an export names, or a folder.
 async function source(): Promise<Source> {
@@ -36,10 +39,19 @@ async function title(): Promise<string> {
   }
 }
 
+// The poster is asked for first, where the first view is the one that it shows.
+async function load(): Promise<Bundle> {
+  const from = await source();
+  const info = await loadManifest(from);
+  if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
+  return loadBundle(from, info, showProgress);
+}
+
 async function main(): Promise<void> {
+  const loading = load();
+  loading.catch(() => undefined); // until it is waited for
   const graphics = await openDevice();
   const { device } = graphics;
-  const loading = source().then((from) => loadBundle(from, showProgress));
   const programs = new Programs(device);
   const bundle = await loading;
   const scene = new SceneOnDevice(graphics, programs, bundle.info, bundle.surfels, bundle.pages);

@@ -65,6 +65,15 @@ def device() -> Any:
         raise WebGpuUnavailable(f"the graphics device {adapter.info['device']} cannot be used: {error}") from error
 
 
+def in_software() -> bool:
+    """Whether the processor draws, which decodes a block of texels for each that it fetches.
+
+    Raises:
+        WebGpuUnavailable: nothing draws.
+    """
+    return device().adapter.info["adapter_type"] == "CPU"
+
+
 def require() -> None:
     """Sees that something can be drawn here.
 

@@ -16,7 +16,7 @@ from ..baked_cuda import decoded
 from ..baked_scene import BakedScene
 from ..project import Camera
 from .arrays import arrays
-from .device import device, library
+from .device import device, in_software, library
 from .programs import Programs
 
 SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}
@@ -101,14 +101,16 @@ class SceneOnDevice:
     def _texture(self, scene: BakedScene) -> tuple[Any, tuple[int, int]]:
         features = self._device.features
         texels, blocks = scene.atlas, scene.blocks
-        if blocks is not None and "texture-compression-bc" in features:
+        software = in_software()
+        if blocks is not None and "texture-compression-bc" in features and not software:
             return self._pages("bc7-rgba-unorm", blocks.cpu().numpy(), 4)
         if texels is None and blocks is not None:
             texels = decoded(blocks)
-            warnings.warn(
-                "the graphics device draws no BC7 textures: the atlas was decoded, at four times the memory",
-                stacklevel=2,
-            )
+            if not software:
+                warnings.warn(
+                    "the graphics device draws no BC7 textures: the atlas was decoded, at four times the memory",
+                    stacklevel=2,
+                )
         if texels is None:
             return self._pages("rgba8unorm", np.zeros((1, 1, 1, 4), np.uint8), 1)
         if texels.dtype == torch.uint8:

@@ -19,6 +19,7 @@ from bitymi_ns.bake.quantise import bc7_encoder
 from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.bc7 import decode_bc7
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.ops.webgpu import on_device
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import camera_of, front, scene_of, textured
@@ -83,7 +84,33 @@ def test_texels_are_fetched_within_their_tile(prefilter: str) -> None:
         assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
 
 
-def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded() -> None:
+@pytest.fixture
+def as_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks are left to the device even where it is the processor."""
+    monkeypatch.setattr(on_device, "in_software", lambda: False)
+
+
+def test_the_processor_gets_decoded_texels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would decode a block for each texel that it fetches."""
+    scene = replace(textured(20, 0), weight_bound=0.0)
+    blocks = [np.frombuffer(bytes(bc7_encoder("ultrafast")(page.numpy())), np.uint8) for page in scene.atlas]
+    height, width = scene.atlas.shape[1:3]
+    alone = replace(
+        scene, atlas=None, blocks=torch.from_numpy(np.stack(blocks).reshape(len(blocks), height // 4, width // 4, 16))
+    )
+    formats: list[str] = []
+    monkeypatch.setattr(on_device, "in_software", lambda: True)
+    made = on_device.SceneOnDevice._pages
+    monkeypatch.setattr(
+        on_device.SceneOnDevice,
+        "_pages",
+        lambda self, format, *rest: formats.append(format) or made(self, format, *rest),
+    )
+    webgpu.draw(alone, [front()], None, ["rgb"])
+    assert formats == ["rgba8unorm"]
+
+
+def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded(as_a_card: None) -> None:
     scene = replace(textured(60, 0), weight_bound=0.0)
     blocks = [bc7_encoder("ultrafast")(page.numpy()) for page in scene.atlas]
     height, width = scene.atlas.shape[1:3]
@@ -157,7 +184,7 @@ def test_views_of_other_sizes(share: float, prefilter: str) -> None:
         assert off.mean() < 0.1 * STEP and off.max() < 2 * STEP, (off.mean() / STEP, off.max() / STEP)
 
 
-def test_levels_of_blocks_and_of_tiles_without_a_mean() -> None:
+def test_levels_of_blocks_and_of_tiles_without_a_mean(as_a_card: None) -> None:
     camera = front(240, 176)
     scene = photographed(textured(60, 0), camera)
     blocks = [bc7_encoder("ultrafast")(page.numpy()) for page in scene.atlas]

@@ -2,7 +2,7 @@
 import { DamagedBundle } from '../errors';
 import { type Pages, parseKtx2 } from './ktx2';
 import { type Atlas, type Manifest, parseManifest } from './manifest';
-import type { Source } from './source';
+import type { Came, Source } from './source';
 import { type Surfels, readSurfels } from './surfels';
 
 export interface Bundle {
@@ -19,21 +19,27 @@ export type Progress = (done: number, total: number) => void;
 const hex = (bytes: ArrayBuffer): string =>
   [...new Uint8Array(bytes)].map((byte) => byte.toString(16).padStart(2, '0')).join('');
 
-export async function loadBundle(source: Source, progress: Progress): Promise<Bundle> {
-  const info = parseManifest(await source.text('bundle.json'));
+export const loadManifest = async (source: Source): Promise<Manifest> =>
+  parseManifest(await source.text('bundle.json'));
+
+// A file that bundle.json lists, of the size and with the hash that stand there.
+export async function readPart(source: Source, info: Manifest, name: string, came: Came): Promise<ArrayBuffer> {
+  const entry = info.files.get(name);
+  if (!entry) throw new DamagedBundle(`bundle.json does not list ${name}.`);
+  const data = await source.read(name, entry.bytes, came);
+  const subtle = (globalThis.crypto as Partial<Crypto> | undefined)?.subtle;
+  if (subtle && hex(await subtle.digest('SHA-256', data)) !== entry.sha256) {
+    throw new DamagedBundle(`${name} is altered: its SHA-256 is not the one in bundle.json.`);
+  }
+  return data;
+}
+
+export async function loadBundle(source: Source, info: Manifest, progress: Progress): Promise<Bundle> {
   const first = info.compact ? ['surfels.bin'] : ['surfels.ply', ...(info.atlas ? ['atlas.ktx2'] : [])];
   const total = first.reduce((sum, name) => sum + (info.files.get(name)?.bytes ?? 0), 0);
   let done = 0;
-  const load = async (name: string): Promise<ArrayBuffer> => {
-    const entry = info.files.get(name);
-    if (!entry) throw new DamagedBundle(`bundle.json does not list ${name}.`);
-    const data = await source.read(name, entry.bytes, (bytes) => progress((done += bytes), total));
-    const subtle = (globalThis.crypto as Partial<Crypto> | undefined)?.subtle;
-    if (subtle && hex(await subtle.digest('SHA-256', data)) !== entry.sha256) {
-      throw new DamagedBundle(`${name} is altered: its SHA-256 is not the one in bundle.json.`);
-    }
-    return data;
-  };
+  const load = (name: string): Promise<ArrayBuffer> =>
+    readPart(source, info, name, (bytes) => progress((done += bytes), total));
   const views = async (): Promise<string | null> =>
     info.files.has('cameras.json') ? source.text('cameras.json') : null;
   const [cameras, table, atlas] = await Promise.all([views(), ...first.map(load)]);

@@ -1,10 +1,12 @@
 // What stands in the place of the scene: progress, or why there is none.
 import { ViewerError } from '../errors';
 import { element } from './dom';
+import { endPoster } from './poster';
 
 const megabytes = (bytes: number): string => (bytes / 1e6).toFixed(1);
 
 export function showProgress(done: number, total: number): void {
+  if (document.documentElement.dataset.state === 'error') return;
   element<HTMLProgressElement>('page-progress').value = total ? done / total : 0;
   element('page-text').textContent = `${megabytes(done)} of ${megabytes(total)} MB`;
 }
@@ -18,6 +20,7 @@ export function showError(error: unknown): void {
   element('page-progress').hidden = true;
   for (const id of ['top', 'panel', 'menu']) element(id).hidden = true;
   element('page').hidden = false;
+  endPoster();
   document.documentElement.dataset.state = 'error';
 }
 

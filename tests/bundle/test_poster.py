@@ -1,0 +1,96 @@
+"""The poster of a bundle: small, listed and checked as other files are."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bitymi_ns.bundle import BundleError, check_files, read_bundle
+from bitymi_ns.bundle.manifest import POSTER
+from bitymi_ns.bundle.poster import LEAST, SHARE, SIDE, draw_poster, encode_poster, most_bytes
+from bitymi_ns.bundle.single import read_single, write_single
+from tests.bundle.compact_scene import make_codes, write_compact
+from tests.bundle.made import make
+from tests.cuda.baked_scenes import front, textured
+
+SMOOTH = np.zeros((300, 480, 3), np.uint8) + np.linspace(0, 255, 480).astype(np.uint8)[None, :, None]
+NOISE = np.random.default_rng(0).integers(0, 256, (300, 480, 3), dtype=np.uint8)
+
+
+def opened(data: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def test_it_is_what_the_camera_sees_and_small() -> None:
+    scene, background = textured(20, 0), (0.25, 0.5, 1.0)
+    pixels = draw_poster(scene, front(160, 120), background)
+    assert pixels.shape == (120, 160, 3) and pixels.dtype == np.uint8
+    want = scene.render(front(160, 120), torch.tensor(background)).rgb.clamp(0, 1)
+    assert np.abs(pixels / 255.0 - want.numpy()).max() <= 0.5001 / 255
+    assert draw_poster(scene, front(1600, 1200), background).shape == (SIDE * 3 // 4, SIDE, 3)
+
+
+def test_it_fits_its_bytes() -> None:
+    for most in (200_000, 20_000, LEAST):
+        data = encode_poster(NOISE, most)
+        assert data is not None and len(data) <= most
+    whole = encode_poster(SMOOTH, 20_000)
+    assert whole is not None and np.abs(opened(whole).astype(int) - SMOOTH).mean() < 2
+    assert encode_poster(NOISE, 10) is None
+    assert most_bytes(10_000_000) == SHARE * 10_000_000 and most_bytes(0) == LEAST
+
+
+@pytest.mark.parametrize("compact", [True, False], ids=["compact", "bc7"])
+def test_it_is_listed(compact: bool, surfels, tmp_path: Path) -> None:
+    folder = tmp_path / "b"
+    if compact:
+        write_compact(folder, make_codes(), poster=SMOOTH)
+    else:
+        make(surfels, folder, format="bc7", poster=SMOOTH)
+    entry = read_bundle(folder).info.files[POSTER]
+    assert entry.bytes == (folder / POSTER).stat().st_size <= LEAST
+    assert opened((folder / POSTER).read_bytes()).ndim == 3
+
+
+def test_a_bundle_can_do_without(tmp_path: Path) -> None:
+    assert POSTER not in read_bundle(write_compact(tmp_path / "b", make_codes())).info.files
+
+
+def test_it_comes_second_in_one_file_and_is_checked(tmp_path: Path) -> None:
+    folder, single = write_compact(tmp_path / "b", make_codes(), poster=SMOOTH), tmp_path / "b.bitymi"
+    write_single(folder, single)
+    names = [entry.filename for entry in zipfile.ZipFile(single).infolist()]
+    assert names == ["bundle.json", POSTER, "surfels.bin", "texels.bin"]
+    for place in (folder, single):
+        assert POSTER in {check.name for check in check_files(place)[1] if check.ok}
+    good = (folder / POSTER).read_bytes()
+    data = bytearray(good)
+    data[len(data) // 2] ^= 1
+    single.write_bytes(single.read_bytes().replace(good, bytes(data)))
+    (folder / POSTER).write_bytes(data)
+    for place in (folder, single):
+        assert [check.name for check in check_files(place)[1] if not check.ok] == [POSTER]
+        with pytest.raises(BundleError):
+            read_bundle(place)
+    with open(single, "rb") as file:  # reads what it draws, and no poster
+        assert len(read_single(file)) == 12
+
+
+def test_a_file_that_no_reader_knows_is_checked_and_not_looked_at(tmp_path: Path) -> None:
+    """So an optional part, as the poster is one, needs no version of its own."""
+    folder = write_compact(tmp_path / "b", make_codes(), extra_files={"later.bin": b"of a later version"})
+    assert len(read_bundle(folder)) == 12
+    (folder / "later.bin").write_bytes(b"of a later Version")
+    with pytest.raises(BundleError, match=r"later\.bin is altered"):
+        read_bundle(folder)
+
+
+def test_a_file_of_the_callers_does_not_take_its_place(tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match=POSTER):
+        write_compact(tmp_path / "b", make_codes(), extra_files={POSTER: b"x"})

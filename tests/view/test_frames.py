@@ -1,0 +1,93 @@
+"""Frames of every kind of bundle, in a browser and through wgpu, against the CPU renderer (table: docs/viewer.md).
+
+Both draw in software where there is no card. The bundles are random surfels with tiles, with a weight bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bitymi_ns.bundle import read_bundle
+from bitymi_ns.bundle.single import write_single
+from bitymi_ns.ops import webgpu
+from bitymi_ns.view import single_site, write_static
+from tests.required import skip_without
+from tests.view.browser import drive
+from tests.view.conftest import HEIGHT, WIDTH, view, write
+from tests.view.test_browser import MEAN
+from tests.view.test_one_file import plain_server
+
+LARGEST = 12 / 255
+KINDS = ("sv", "sh", "sb", "sg")
+TERMS = {"all": {"format": "uint8", "tolerance": 0.0}, "lean": {"format": "uint8"}, "compact": {"compact": True}}
+CASES = {f"{kind} {terms}": {"kind": kind, **TERMS[terms]} for kind in KINDS for terms in TERMS}
+CASES |= {f"near {near:g}": {"near": near, **TERMS["compact"]} for near in (0.01, 3.0)}
+COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "colour": (0.2, 0.5, 0.9)}
+CASES |= {name: {"background": colour, **TERMS["compact"]} for name, colour in COLOURS.items()}
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Of all cases, by name."""
+    folder = tmp_path_factory.mktemp("frames")
+    given = {name: {"format": "uint8", **options} for name, options in CASES.items()}
+    return {
+        name: write(folder / name.replace(" ", "-"), count=400, larger=0.7, **options)  # type: ignore[arg-type]
+        for name, options in given.items()
+    }
+
+
+def wanted(bundle: Path) -> np.ndarray:
+    """The frame of the CPU renderer, over the bundle's background."""
+    opened = read_bundle(bundle)
+    return opened.scene.render(view(), torch.tensor(opened.info.render.background)).rgb.clamp(0, 1).numpy()
+
+
+def check(name: str, got: np.ndarray, want: np.ndarray) -> None:
+    off = np.abs(got - want)
+    covered = np.abs(want - want[0, 0]).max(-1) > 1 / 255
+    print(f"{name}: mean {255 * off.mean():.3f}, largest {255 * off.max():.1f} of 255; {covered.mean():.0%} covered")
+    assert got.shape == want.shape and covered.mean() > 0.15, name
+    assert off.mean() < MEAN and off.max() < LARGEST, name
+
+
+def test_cases_differ(bundles: dict[str, Path]) -> None:
+    """A near plane takes surfels away, a background shows."""
+    frames = {name: wanted(bundles[name]) for name in ("near 0.01", "near 3", "black", "white")}
+    assert np.abs(frames["near 0.01"] - frames["near 3"]).mean() > 0.02
+    assert np.abs(frames["black"] - frames["white"]).mean() > 0.1
+
+
+def test_in_a_browser(bundles: dict[str, Path], tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    write_static(single_site(bundles["black"]), site)
+    steps: list[list[object]] = []
+    for bundle in bundles.values():
+        write_single(bundle, site / f"{bundle.name}.bitymi")
+        steps += [["goto", bundle.name], ["settle"], ["save", "#screenshot", tmp_path / f"{bundle.name}.png"]]
+    with plain_server(site, True) as (address, _):
+        asked = [["goto", f"{address}?file={step[1]}.bitymi"] if step[0] == "goto" else step for step in steps]
+        found = drive(asked, (WIDTH, HEIGHT), patience=200)
+    assert not found.problems
+    for name, bundle in bundles.items():
+        got = np.asarray(Image.open(tmp_path / f"{bundle.name}.png").convert("RGB"), np.float32) / 255
+        check(name, got, wanted(bundle))
+
+
+def test_through_wgpu(bundles: dict[str, Path]) -> None:
+    try:
+        if not webgpu.adapters():
+            skip_without("webgpu", "no graphics device: apt install mesa-vulkan-drivers")
+    except webgpu.WebGpuUnavailable as error:
+        skip_without("webgpu", str(error))
+    for name, bundle in bundles.items():
+        opened = read_bundle(bundle)
+        scene = replace(opened.scene, through_webgpu=True)
+        got = scene.render(view(), torch.tensor(opened.info.render.background)).rgb.clamp(0, 1).numpy()
+        check(name, got, wanted(bundle))

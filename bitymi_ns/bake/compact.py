@@ -207,12 +207,9 @@ def chosen(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
     """
     if options.most_bytes is not None:
         enough = coder.error + max(LEAST_ERROR, ENOUGH * coder.error) if coder.measured else -math.inf
-        found = _search(
-            coder,
-            lambda priced: priced.bytes > 0.97 * options.most_bytes or priced.error <= enough,
-            progress,
-            upper=True,
-        )
+        most = 0.97 * options.most_bytes
+        more, less = _search(coder, lambda priced: priced.bytes > most or priced.error <= enough, progress)
+        found = more if more.bytes <= most else less
         if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:
             raise ValueError(
                 f"{options.most_bytes:,} bytes are too few for {len(found.baked.rows):,} surfels, which take "
@@ -226,10 +223,10 @@ def chosen(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
                 f"the bake shows the training photographs at {coder.psnr:.2f} dB, so {options.psnr:g} dB cannot be "
                 "had: ask for less, or train for longer"
             )
-        found = _search(coder, lambda priced: priced.psnr >= options.psnr, progress)
+        found, _ = _search(coder, lambda priced: priced.psnr >= options.psnr, progress)
     else:
         allowed = coder.error + max(LEAST_ERROR, options.share * coder.error)
-        found = _search(coder, lambda priced: priced.error <= allowed, progress, most=MOST_PRICE)
+        found, _ = _search(coder, lambda priced: priced.error <= allowed, progress, most=MOST_PRICE)
     baked, coding = kept_at(coder, found)
     if options.most_bytes is not None:
         assert baked.codes is not None
@@ -251,10 +248,10 @@ LEAST_TEXEL_BYTES = 1000
 
 
 def _search(
-    coder: Coder, more: Callable[[Priced], bool], progress: Progress, upper: bool = False, most: float = math.inf
-) -> Priced:
-    """The largest price up to `most` of which `more` holds, or with `upper` the smallest of which it does not, within a
-    tenth."""
+    coder: Coder, more: Callable[[Priced], bool], progress: Progress, most: float = math.inf
+) -> tuple[Priced, Priced]:
+    """The largest price up to `most` of which `more` holds, and the smallest of which it does not, a tenth apart. Where
+    there is none of a kind, the nearest that was looked at stands for it."""
     low, high, found = None, None, {}
     price = START
     for step in range(_SEARCH):
@@ -271,8 +268,7 @@ def _search(
         else:
             price = math.sqrt(low * high)
     progress("choosing the precision", _SEARCH, _SEARCH)
-    best = high if upper else low
-    return found[best if best is not None else (max(found) if upper else min(found))]
+    return found[min(found) if low is None else low], found[max(found) if high is None else high]
 
 
 def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> Baked:

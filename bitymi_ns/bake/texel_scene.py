@@ -106,7 +106,8 @@ class TexelScene:
         return project(*geometry, camera.to("cpu"), scene.near, scene.through_pixel)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
-        """What `coverage` gives, to rounding, of views of which nothing is kept: their colours are not worked out."""
+        """What `coverage` gives, or its squares, to rounding, of views of which nothing is kept: their colours are not
+        worked out."""
         total, bound = torch.zeros_like(self.texels), self._baked.scene.weight_bound
         for index, view in enumerate(views):
             add_coverage(self.projection(view.camera), self.tiles, view.mask, bound, total, squared)
@@ -179,12 +180,20 @@ class TexelViews(Sequence[TexelView]):
 
 
 @torch.no_grad()
-def coverage(scene: TexelScene, views: TexelViews, progress: Progress = no_progress, squared: bool = False) -> Tensor:
+def coverage(
+    scene: TexelScene, views: TexelViews, progress: Progress = no_progress, squares: Tensor | None = None
+) -> Tensor:
     """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
-    weight, or its square, times the bilinear weight, in pixels that count; 0 where no view sees it."""
+    weight times the bilinear weight, in pixels that count; 0 where no view sees it.
+
+    Args:
+        squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.
+    """
     total = torch.zeros_like(scene.texels)
     for index in range(len(views)):
         view = views[index]
-        add_texel_coverage(view.fragments, scene.tiles, view.mask, total, squared)
+        add_texel_coverage(view.fragments, scene.tiles, view.mask, total)
+        if squares is not None:
+            add_texel_coverage(view.fragments, scene.tiles, view.mask, squares, squared=True)
         progress("tracing the training views", index + 1, len(views))
     return total[:, :1]

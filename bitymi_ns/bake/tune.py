@@ -115,10 +115,11 @@ def tune_atlas(
     )
     before = held_in.psnr(scene.texels, progress)  # first: these views are kept first
     looks = Looks(options, before, scene.texels)
-    share = 1.0 / (coverage(scene, tuned, progress) + options.prior)  # [T, 1]
+    squares = None if baked.codes is None else torch.zeros_like(scene.texels)
+    share = 1.0 / (coverage(scene, tuned, progress, squares) + options.prior)  # [T, 1]
     _descend(scene, tuned, held_in, share, looks, options, progress)
     held_out = TexelViews(scene, eval_views, MemoryBudget(0))
-    coder = _coding(baked, scene, tuned, coding or TexelCodeOptions(), progress)
+    coder = _coding(baked, scene, squares, coding or TexelCodeOptions())
     untuned = held_out.psnr(coder.first(scene.texels).texels()) if eval_views else None
     coded = _coded(scene, tuned, held_in, share, looks.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
@@ -136,12 +137,11 @@ def tune_atlas(
 
 
 def _coding(
-    baked: Baked, scene: TexelScene, views: TexelViews, options: TexelCodeOptions, progress: Progress
+    baked: Baked, scene: TexelScene, squares: Tensor | None, options: TexelCodeOptions
 ) -> Coding[CosineTexels] | Coding[PageTexels]:
-    """How the texels are stored."""
-    if baked.codes is not None:
-        weights = coverage(scene, views, progress, squared=True)[:, 0]
-        return Cosines(TexelCoder(scene.sizes, weights, options), options)
+    """How the texels are stored: by their squared coverage [T, 3], or as blocks where there is none."""
+    if squares is not None:
+        return Cosines(TexelCoder(scene.sizes, squares[:, 0], options), options)
     return Pages(baked, scene.tiles)
 
 

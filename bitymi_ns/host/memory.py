@@ -33,7 +33,7 @@ PER_PIXEL = 400
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
-PER_TEXEL = 60
+PER_TEXEL = 52
 """Bytes in training: the texel, how far it moves, and the two states that a run could go back to."""
 VIEWS_OF_TEXELS = 12
 """Beside the smallest tiles, all texels together are as many as those of so many views: 3.5 to 11 were measured."""

@@ -106,7 +106,7 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: li
 def test_bytes_that_buy_nothing_are_not_spent(truth: Baked, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
     kept, coding = chosen(coder, Compact(most_bytes=10**9))
-    assert ENOUGH * coder.error < kept.statistics.rounding.mse < 10 * ENOUGH * coder.error
+    assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error
     size = kept.codes.surfels.nbytes() + with_coded_texels(kept, coding).codes.texels.nbytes()
     assert size < 0.8 * coder.at(START / 1000).bytes
     assert coding.most_bytes == 10**9 - kept.codes.surfels.nbytes()

@@ -16,6 +16,7 @@ from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.texels import SMALLEST
 from bitymi_ns.train.views import REDUCED_BYTES
@@ -35,6 +36,8 @@ PER_SURFEL = 3000
 
 PER_TEXEL = 52
 """Bytes in training: the texel, how far it moves, and the two states that a run could go back to."""
+PER_BAKED_TEXEL = 96
+"""Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
 VIEWS_OF_TEXELS = 12
 """Beside the smallest tiles, all texels together are as many as those of so many views: 3.5 to 11 were measured."""
 
@@ -93,6 +96,8 @@ def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float,
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels + PER_FRAGMENT * most_fragments(scene, cameras)
     needed += PER_SURFEL * learning
+    if isinstance(scene.field, TexelField):
+        needed += PER_BAKED_TEXEL * len(scene.field.texels)
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
 
 

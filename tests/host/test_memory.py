@@ -11,6 +11,7 @@ import torch
 from bitymi_ns.host import memory
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene import Camera, Scene
+from bitymi_ns.scene.field import TexelField
 from tests.scene import bands
 
 CPU = torch.device("cpu")
@@ -79,6 +80,20 @@ def test_surfels_that_learn_in_an_export_take_what_they_take_in_training(
         memory.state_export(scene[0], [scene[1]], 0, learning)
         needed.append(gigabytes(said(capsys)))
     assert needed[1] - needed[0] == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
+
+
+def test_an_export_takes_copies_of_the_texels_that_were_learned(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, camera = scene
+    texels = TexelField.blank(len(one), 5000, one.surfels["means"].detach())
+    monkeypatch.setattr(memory, "PER_BAKED_TEXEL", 1e6)
+    needed = []
+    for field in (None, texels):
+        one.field = field
+        memory.state_export(one, [camera], 0)
+        needed.append(gigabytes(said(capsys)))
+    assert needed[1] - needed[0] == pytest.approx(5.0, abs=0.11)
 
 
 def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:

@@ -91,8 +91,8 @@ class BitymiTrainerConfig(TrainerConfig):
             fail(f"a run is of one machine, not {machine.num_machines} (--machine.num-machines)")
         if machine.num_devices < 1:
             fail(f"--machine.num-devices must be at least 1, not {machine.num_devices}")
-        if machine.device_type == "cuda" and machine.num_devices > torch.cuda.device_count():
-            fail(f"there are {torch.cuda.device_count()} GPUs here, not {machine.num_devices} (--machine.num-devices)")
+        if machine.device_type == "cuda" and machine.num_devices > (cards := torch.cuda.device_count()):
+            fail(f"there are {cards} of {machine.num_devices} GPUs that --machine.num-devices asks for")
 
     def print_to_terminal(self) -> None:
         """Nothing: nerfstudio would print every option here, before anything is checked. All of them are in config.yml,

@@ -20,6 +20,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     monkeypatch.setitem(sys.modules, "bitymi_ns._cuda", kernels)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: kernels)
     device.why_not_cuda.cache_clear()
     device._say_once.cache_clear()
@@ -68,6 +69,12 @@ def test_a_card_trains_any_texture(config, card: ModuleType, texture: str) -> No
     config.machine.device_type, config.pipeline.model.scene.texture = "cuda", texture
     config.set_timestamp()
     assert config.machine.device_type == "cuda" and config.pipeline.model.scene.texture == texture
+
+
+def test_there_are_no_more_processes_than_cards(config, card: ModuleType) -> None:
+    config.machine.device_type, config.machine.num_devices = "cuda", 2
+    with pytest.raises(SystemExit, match=r"1 of 2 GPUs that .*--machine.num-devices"):
+        config.set_timestamp()
 
 
 def test_no_card_and_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:

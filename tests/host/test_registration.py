@@ -92,6 +92,7 @@ def test_a_cpu_gets_a_short_run_and_says_so() -> None:
 
 def test_a_gpu_gets_the_full_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(config, "why_not_cuda", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     run = fresh()
     run.machine.device_type = "cuda"
     run.set_timestamp()

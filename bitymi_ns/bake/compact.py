@@ -135,6 +135,10 @@ class Coder:
         """Whether there are views to measure with."""
         return self._pictures.views > 0
 
+    def allowed(self, share: float) -> float:
+        """The mean square error against the photographs, where so much of that of the bake may be added."""
+        return self.error + max(LEAST_ERROR, share * self.error)
+
     @torch.no_grad()
     def at(self, price: float) -> Priced:
         """What is kept where a bit is worth `price`: squared error, colours from 0 to 1, summed over the pixels and
@@ -206,7 +210,7 @@ def chosen(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
         ValueError: as `compacted` does.
     """
     if options.most_bytes is not None:
-        enough = coder.error + max(LEAST_ERROR, ENOUGH * coder.error) if coder.measured else -math.inf
+        enough = coder.allowed(ENOUGH) if coder.measured else -math.inf
         most = 0.97 * options.most_bytes
         more, less = _search(coder, lambda priced: priced.bytes > most or priced.error <= enough, progress)
         found = more if more.bytes <= most else less
@@ -225,7 +229,7 @@ def chosen(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
             )
         found, _ = _search(coder, lambda priced: priced.psnr >= options.psnr, progress)
     else:
-        allowed = coder.error + max(LEAST_ERROR, options.share * coder.error)
+        allowed = coder.allowed(options.share)
         found, _ = _search(coder, lambda priced: priced.error <= allowed, progress, most=MOST_PRICE)
     baked, coding = kept_at(coder, found)
     if options.most_bytes is not None:

@@ -27,7 +27,6 @@ from bitymi_ns.train.coverage import views_without_surfels
 from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.memory import OnDemand
-from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import TrainingData, View
 
@@ -77,7 +76,7 @@ class TrainingRun:
         )
         optimizers = attributes.optimizers.optimizers
         try:
-            processes = Processes(trainer.local_rank, trainer.world_size)
+            processes = trainer.processes
             self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)

@@ -50,7 +50,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import cc_psnr, psnr
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import View, as_bytes
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
@@ -300,9 +300,8 @@ def world_of(datamanager: Any) -> World:
 def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
     """The trained scene as a camera sees it."""
     rgb = model.render(camera, model.background, maps=False).rgb
-    pixels = (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format=format)
+    Image.fromarray(as_bytes(rgb).numpy()).save(buffer, format=format)
     return buffer.getvalue()
 
 

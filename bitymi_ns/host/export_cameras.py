@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import as_bytes
 
 CAMERAS = "cameras.json"
 MOST_PIXELS = 1600
@@ -52,7 +53,7 @@ def _row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
 
 
 def _jpeg(image: torch.Tensor) -> bytes:
-    picture = Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+    picture = Image.fromarray(as_bytes(image).numpy())
     picture.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
     picture.save(buffer, format="JPEG", quality=88)

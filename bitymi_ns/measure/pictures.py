@@ -22,6 +22,7 @@ from bitymi_ns.ops import composite
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.views import as_bytes
 
 RESIDUAL_GAIN = 4.0
 """Residuals are small; the pictures of them are brightened by this factor."""
@@ -91,9 +92,8 @@ def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> d
 
 def png(image: Tensor) -> bytes:
     """[H, W, 3] in [0, 1] as a PNG file."""
-    pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
+    Image.fromarray(as_bytes(image).numpy()).save(buffer, format="PNG")
     return buffer.getvalue()
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.bake.statistics import Decibels, Part, Share, Statistics, Whole
+from bitymi_ns.bake.streams import MOST_PLANES
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
@@ -118,9 +119,10 @@ class Column(Part):
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
     step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
-    low: Annotated[list[Annotated[int, Field(ge=-(1 << 40), le=1 << 40)]], Field(max_length=16)]
+    low: Annotated[list[Annotated[int, Field(ge=-(1 << 53), le=1 << 53)]], Field(max_length=16)]
     planes: Annotated[
-        list[Annotated[list[Annotated[int, Field(ge=1, le=1 << 40)]], Field(max_length=6)]], Field(max_length=16)
+        list[Annotated[list[Annotated[int, Field(ge=1, le=1 << 40)]], Field(max_length=MOST_PLANES)]],
+        Field(max_length=16),
     ]
 
 

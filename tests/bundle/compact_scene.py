@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -22,13 +23,19 @@ SIDES = ((8, 4), (0, 0), (4, 4), (16, 8))
 RANGE = Range(-0.5, 2.0, "test")
 
 
-def make_codes(kind: str = "sv", count: int = 12, textured: bool = True) -> Codes:
+FINEST = {**REFERENCE, "place": 1e-9}
+"""Steps with which places need every bit of their grid."""
+
+
+def make_codes(
+    kind: str = "sv", count: int = 12, textured: bool = True, steps: Mapping[str, float] = REFERENCE
+) -> Codes:
     """Codes of random surfels, every fourth of which has no tile."""
     params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
     params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
     params |= lean_parameters(kind, count, torch.float32)
     sizes = torch.tensor([SIDES[i % len(SIDES)] if textured else (0, 0) for i in range(count)])
-    surfels, order = code_surfels(params, kind, sizes, torch.linspace(0.5, 3.0, count), REFERENCE)
+    surfels, order = code_surfels(params, kind, sizes, torch.linspace(0.5, 3.0, count), steps)
     sizes = sizes[order]
     generator = torch.Generator().manual_seed(0)
     texels = torch.rand(int(sizes.clamp(min=1).prod(1).sum()), 3, generator=generator) - 0.5

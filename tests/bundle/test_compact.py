@@ -19,7 +19,7 @@ from bitymi_ns.bake.texel_codes import pages
 from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, write_bundle
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from tests.bundle.compact_scene import RANGE, make_codes, scene_of, write_compact
+from tests.bundle.compact_scene import FINEST, RANGE, make_codes, scene_of, write_compact
 from tests.bundle.damage import amend, signed
 
 
@@ -45,6 +45,15 @@ def test_a_compact_bundle_holds_what_its_codes_stand_for(tmp_path: Path, kind: s
         stored = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
         assert got.atlas.numpy().tobytes() == b"".join(stored.payload)
         torch.testing.assert_close(got.mean_residual, codes.texels.constants)
+
+
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_places_may_need_every_bit_of_their_grid(tmp_path: Path, count: int) -> None:
+    codes = make_codes(count=count, steps=FINEST)
+    folder = write_compact(tmp_path / "b", codes)
+    if count == 12:
+        assert codes.surfels.columns["place"].max() >= 1 << 48  # seven bytes
+    torch.testing.assert_close(read_bundle(folder).scene.surfels["means"], codes.surfels.surfels()["means"])
 
 
 def test_it_says_how_large_the_scene_was_photographed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from tests.bundle.compact_scene import make_codes, write_compact
+from tests.bundle.compact_scene import FINEST, make_codes, write_compact
 
 
 def text(data: bytes | Tensor) -> str:
@@ -39,6 +39,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for kind in sorted(VIEW_COLORS):
             bundles[kind] = described(write_compact(Path(folder) / kind, make_codes(kind)))
+        bundles["finest"] = described(write_compact(Path(folder) / "finest", make_codes(steps=FINEST)))
         bundles["plain"] = described(write_compact(Path(folder) / "plain", make_codes(textured=False)))
     path = Path(__file__).with_name("compact.json")
     path.write_text(json.dumps(bundles) + "\n", "utf8")

@@ -128,7 +128,7 @@ class Reader {
 const SIDE = 1 << 20;
 const MOST_COLUMNS = 64;
 const MOST_NUMBERS = 16; // of a column
-const MOST_BYTES = 6; // of a number
+const MOST_BYTES = 7; // of a number: what a double holds exactly
 const MOST_POINTS = 4096;
 const RATES = [1e-12, 1e12]; // pixels per unit of length
 
@@ -136,7 +136,7 @@ function columns(r: Reader): Column[] {
   return r.parts('columns', MOST_COLUMNS).map((column) => ({
     name: column.text('name', /^[a-z0-9_]{1,20}$/),
     step: column.has('step') ? column.number('step', 1e-12, 1e6) : null,
-    low: column.wholes('low', MOST_NUMBERS, -(2 ** 40), 2 ** 40),
+    low: column.wholes('low', MOST_NUMBERS, -(2 ** 53), 2 ** 53),
     planes: column.list('planes', MOST_NUMBERS).map((_, k) => {
       return column.at('planes').wholes(`${k}`, MOST_BYTES, 1, 2 ** 40);
     }),

@@ -65,27 +65,28 @@ struct Hit {
   T u, v;        // 0 without a hit
   T rest;        // 1 - (u^2 + v^2) / 9
 };
-template <class S, class T>
+// Without kMisses all but `ok` is anything where there is no hit, NaN too.
+template <bool kMisses = true, class S, class T>
 BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const Planes<T> p = planes(g, dx, dy);
   Hit<T> h;
   h.ok = (p.W > zero) & behind_near(g, near, p.W);
-  h.inv = inverse_(select(h.ok, p.W, one));
-  h.u = select(h.ok, p.U * h.inv, zero);
-  h.v = select(h.ok, p.V * h.inv, zero);
+  h.inv = inverse_(kMisses ? select(h.ok, p.W, one) : p.W);
+  h.u = kMisses ? select(h.ok, p.U * h.inv, zero) : p.U * h.inv;
+  h.v = kMisses ? select(h.ok, p.V * h.inv, zero) : p.V * h.inv;
   h.rest = one - (h.u * h.u + h.v * h.v) * T(S(1.0 / kSupport2));
   return h;
 }
 
-// Without kBlur the low pass is left out, for pixels that are not near the centre.
+// Without kBlur the low pass is left out, for pixels that are not near the centre; where sigma is 0 the rest is then
+// anything.
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));
   if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_hit<S, T>(g, dx, dy));
-  const Hit<T> h = hit(g, near, dx, dy);
-  const auto inside = h.ok & (h.rest > zero);
-  const T kernel = select(inside, power_(select(inside, h.rest, one), T(g[kBeta])), zero);
+  const Hit<T> h = hit<kBlur>(g, near, dx, dy);
+  const T kernel = select(h.ok & (h.rest > zero), power_(max_(h.rest, T(S(1e-30))), T(g[kBeta])), zero);
   Fragment<T> f;
   f.u = h.u, f.v = h.v, f.depth = T(g[kW0] * g[kZ]) * h.inv, f.low_pass = zero;
   T most = kernel;

@@ -11,49 +11,79 @@
 namespace bt {
 
 namespace {
-// Two texels that lie next to each other, as eight reals.
+// Red, green and blue of a texel for each lane.
 template <class S>
-inline Oct<S> texel_pair(const uint8_t* at) {
-  typedef uint8_t B __attribute__((vector_size(8)));
-  B b;
-  std::memcpy(&b, at, sizeof b);
-  return __builtin_convertvector(b, Oct<S>);
+struct Texels {
+  Pack<S> rgb[3];
+};
+// The texels at the lanes' places in a tile's texels, and their right neighbours.
+template <class S>
+struct TexelPairs {
+  Texels<S> left, right;
+};
+
+template <class S>
+inline Texels<S> texels_of(const Wide<uint32_t>& rgba) {
+  Texels<S> t;
+  for (int c = 0; c < 3; ++c) t.rgb[c] = from_integers<S>(rgba >> 8 * c & 255u);
+  return t;
 }
 #if defined(__AVX2__)
-template <>
-inline Oct<float> texel_pair<float>(const uint8_t* at) {  // the compiler takes the bytes one by one
-  return (Oct<float>)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i*)at)));
+// Of eight lanes, those at `at`: from 8 bytes for each, which hold both.
+inline void eight_pairs(const uint8_t* patch, const int32_t* at, __m256i* left, __m256i* right) {
+  const auto two = [&](int i) {
+    const __m128i first = _mm_loadl_epi64((const __m128i*)(patch + 4 * int64_t(at[i])));
+    int64_t second;
+    std::memcpy(&second, patch + 4 * int64_t(at[i + 1]), sizeof second);
+    return _mm_insert_epi64(first, second, 1);
+  };
+  const __m256 a = (__m256)_mm256_set_m128i(two(4), two(0)), b = (__m256)_mm256_set_m128i(two(6), two(2));
+  *left = (__m256i)_mm256_shuffle_ps(a, b, 0x88), *right = (__m256i)_mm256_shuffle_ps(a, b, 0xdd);
 }
 #endif
 template <class S>
-inline Oct<S> texel_pair(const float* at) {
-  Oct<float> b;
-  std::memcpy(&b, at, sizeof b);
-  return __builtin_convertvector(b, Oct<S>);
+inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
+  Wide<uint32_t> left, right;
+#if defined(__AVX2__)
+  __m256i l[2], r[2];
+  eight_pairs(patch, at, l, r), eight_pairs(patch, at + 8, l + 1, r + 1);
+  std::memcpy(&left, l, sizeof l), std::memcpy(&right, r, sizeof r);
+#else
+  uint32_t pair[2];
+  for (int i = 0; i < kLanes; ++i) {
+    std::memcpy(pair, patch + 4 * int64_t(at[i]), sizeof pair);
+    set_lane(left, i, pair[0]), set_lane(right, i, pair[1]);
+  }
+#endif
+  return {texels_of<S>(left), texels_of<S>(right)};
+}
+template <class S>
+inline TexelPairs<S> texel_pairs(const float* patch, const int32_t* at) {
+  TexelPairs<S> t;
+  for (int i = 0; i < kLanes; ++i)
+    for (int c = 0; c < 3; ++c) {
+      const float* p = patch + 4 * int64_t(at[i]) + c;
+      t.left.rgb[c].set(i, S(p[0])), t.right.rgb[c].set(i, S(p[4]));
+    }
+  return t;
 }
 
-// The textured fragments of a pack: to[lane] += weight * relu(colour + scale * texel), bilinear. The position is
-// clamped to the outer texel centres, so at a tile's last column and row the neighbour has weight 0 and may be any
-// texel.
+// Residuals at the lanes' positions in a tile, bilinear. A position is clamped to the outer texel centres, so at a
+// tile's last column and row the neighbour has weight 0 and may be any texel.
 template <class S, class T>
-inline void add_textured(const T* patch, int columns, uint32_t lanes, Pack<S> x, Pack<S> y, Pack<S> weight,
-                         Quad<S> colour, S scale, Quad<S>* to) {
+inline Texels<S> bilinear(const T* patch, int columns, Pack<S> x, Pack<S> y) {
   using P = Pack<S>;
-  const P x0 = floor_(x), y0 = floor_(y);
-  S fx[kLanes], fy[kLanes], at[kLanes], w[kLanes];
-  store(fx, x - x0), store(fy, y - y0), store(w, weight);
-  store(at, y0 * P(S(columns)) + x0);  // exact: a tile has fewer than 2^24 texels
-  const int stride = 4 * columns;
-  for (uint32_t r = lanes; r; r &= r - 1) __builtin_prefetch(patch + 4 * int(at[__builtin_ctz(r)]));
-  for (uint32_t r = lanes; r; r &= r - 1) {
-    const int i = __builtin_ctz(r);
-    const T* p = patch + 4 * int(at[i]);
-    const Oct<S> top = texel_pair<S>(p), bottom = texel_pair<S>(p + stride);
-    const Oct<S> column = top + fy[i] * (bottom - top);
-    const Quad<S> left = half<0, Quad<S>>(column), right = half<1, Quad<S>>(column);
-    const Quad<S> c = colour + scale * (left + fx[i] * (right - left));
-    to[i] += w[i] * relu_quad<S>(c);
+  const P x0 = floor_(x), y0 = floor_(y), fx = x - x0, fy = y - y0;
+  int32_t at[kLanes];
+  store_integers(at, y0 * P(S(columns)) + x0);  // exact: a tile has fewer than 2^24 texels
+  const TexelPairs<S> top = texel_pairs<S>(patch, at), bottom = texel_pairs<S>(patch + 4 * columns, at);
+  Texels<S> t;
+  for (int c = 0; c < 3; ++c) {
+    const P left = top.left.rgb[c] + fy * (bottom.left.rgb[c] - top.left.rgb[c]);
+    const P right = top.right.rgb[c] + fy * (bottom.right.rgb[c] - top.right.rgb[c]);
+    t.rgb[c] = left + fx * (right - left);
   }
+  return t;
 }
 }  // namespace
 
@@ -100,6 +130,18 @@ const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
   return level ? a.coarser[level - 1] : a.patches;
 }
 
+// Residuals of a surfel's level at surfel coordinates.
+template <class S>
+inline Texels<S> fetch(const Patches& level, int64_t id, S extent, Pack<S> u, Pack<S> v, const BakedResidual& atlas) {
+  const int32_t* sides = level.sides.data() + 2 * id;
+  const Pack<S> x = texel_position(u, sides[0], extent), y = texel_position(v, sides[1], extent);
+  const int64_t first = 4 * level.first[id];
+  Texels<S> t = level.floats.empty() ? bilinear<S>(level.bytes.data() + first, sides[0], x, y)
+                                     : bilinear<S>(level.floats.data() + first, sides[0], x, y);
+  for (auto& channel : t.rgb) channel = Pack<S>(S(atlas.offset)) + Pack<S>(S(atlas.scale)) * channel;
+  return t;
+}
+
 // Asks for what a surfel that comes soon is drawn from: a tile's list names surfels from all over the memory.
 constexpr int kAhead = 3;
 template <class S>
@@ -108,6 +150,14 @@ void prefetch(const BakedForward<S>& a, int64_t id) {
   __builtin_prefetch(a.view.radii + 2 * id);
   __builtin_prefetch(a.base + 3 * id);
   __builtin_prefetch(a.patches->sides.data() + 2 * id);
+  __builtin_prefetch(a.patches->first.data() + id);
+}
+// And later for its first texels.
+template <class S>
+void prefetch_texels(const BakedForward<S>& a, int64_t id) {
+  if (a.patches->bytes.empty()) return;
+  const uint8_t* p = a.patches->bytes.data() + 4 * a.patches->first[id];
+  for (int line = 0; line < 4; ++line) __builtin_prefetch(p + 64 * line);
 }
 
 template <class Kernel, class S>
@@ -128,13 +178,12 @@ void baked_forward(const BakedForward<S>& a) {
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height, S(atlas.transmittance_min));
-    // fragments with a residual sum into rgb, one by one; all the rest in packs
-    Quad<S> rgb[kTile * kTile] = {};
-    P sums[kMapChannels + 1][kPacks];  // rgb of the fragments without residual, alpha, beta, depth, normal, overdraw
+    P sums[kMapChannels + 1][kPacks];  // rgb, alpha, beta, depth, normal, overdraw
     for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
       if (k + kAhead < bins.start[tile + 1]) prefetch(a, bins.surfels[k + kAhead]);
+      if (k + 1 < bins.start[tile + 1]) prefetch_texels(a, bins.surfels[k + 1]);
       const S* g = geom + id * kGeom;
       const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
       bool tiled = a.patches->sides[2 * id] != 0;
@@ -147,35 +196,24 @@ void baked_forward(const BakedForward<S>& a) {
       store3(view, view_base(load3(base + 3 * id)));
       state.template blend<Kernel>(
           g, radii + 2 * id, near,
-          [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
-            const typename P::M taken = mask_of<S>(lanes), textures = taken & (weight >= P(bound));
-            const P w = select(taken, weight, P(S(0))), plain = select(textures, P(S(0)), w);
-            for (int c = 0; c < 3; ++c) sums[c][pack] += plain * P(view[c]);
+          [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
+            const typename P::M textures = taken & (weight >= P(bound));
+            const P w = select(taken, weight, P(S(0)));
+            P colour[3] = {P(view[0]), P(view[1]), P(view[2])};
+            if (bits(textures)) {
+              if (tiled && !level) level = level_of(a, id, extent), tiled = level != nullptr;
+              const Texels<S> residual = tiled ? fetch<S>(*level, id, extent, f.u, f.v, atlas)
+                                               : Texels<S>{P(S(flat[0])), P(S(flat[1])), P(S(flat[2]))};
+              for (int c = 0; c < 3; ++c) colour[c] = select(textures, shaded(colour[c], residual.rgb[c]), colour[c]);
+            }
+            for (int c = 0; c < 3; ++c) sums[c][pack] += w * colour[c];
             sums[3][pack] += w;
             if (maps) {
               sums[4][pack] += w * P(g[kBeta]);
-              sums[5][pack] += w * f.depth;
+              sums[5][pack] += select(taken, w * f.depth, P(S(0)));
               for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
             }
             if (overdraw) sums[kMapChannels][pack] += select(taken, P(S(1)), P(S(0)));
-            const uint32_t rest = bits(textures);
-            if (!rest) return;
-            if (tiled && !level) level = level_of(a, id, extent), tiled = level != nullptr;
-            if (!tiled) {
-              for (int c = 0; c < 3; ++c) sums[c][pack] += (w - plain) * P(shaded(view[c], S(flat[c])));
-              return;
-            }
-            const Patches& patches = *level;
-            const int32_t* sides = patches.sides.data() + 2 * id;
-            const P x = texel_position(f.u, sides[0], extent), y = texel_position(f.v, sides[1], extent);
-            const Quad<S> colour = {view[0] + S(atlas.offset), view[1] + S(atlas.offset), view[2] + S(atlas.offset),
-                                    S(0)};
-            const int64_t first = 4 * patches.first[id];
-            Quad<S>* to = rgb + pack * kLanes;
-            if (patches.floats.empty())
-              add_textured(patches.bytes.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
-            else
-              add_textured(patches.floats.data() + first, sides[0], rest, x, y, weight, colour, S(atlas.scale), to);
           },
           sharp);
     }
@@ -187,7 +225,6 @@ void baked_forward(const BakedForward<S>& a) {
         const int64_t pixel = int64_t(y) * width + x;
         S* to = image + pixel * channels;
         for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
-        for (int c = 0; c < 3; ++c) to[c] += rgb[pack * kLanes + lane][c];
         if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][pack][lane]);
       }
   }

@@ -31,15 +31,9 @@ struct LaneTypes<double> {
   typedef double Q __attribute__((vector_size(32)));
 };
 template <class S>
-using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry, or rgba
+using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry
 template <class S>
-using Oct = typename LaneTypes<S>::O;  // eight: two texels that lie next to each other
-
-// relu of core/common.h; a Quad is no class and finds no function by its name
-template <class S>
-BT_HD Quad<S> relu_quad(Quad<S> a) {
-  return a < S(0) ? Quad<S>{} : a;
-}
+using Oct = typename LaneTypes<S>::O;  // eight
 
 template <class S>
 struct IndexOf<Pack<S>> {
@@ -109,28 +103,30 @@ BT_HD Pack<S> select(typename Pack<S>::M m, Pack<S> yes, Pack<S> no) {
 }
 template <class S>
 BT_HD Pack<S> max_(Pack<S> a, Pack<S> b) {
-  return choose(a.v > b.v, a.v, b.v);
+  return larger(a.v, b.v);
 }
 template <class S>
 BT_HD Pack<S> min_(Pack<S> a, Pack<S> b) {
-  return choose(a.v < b.v, a.v, b.v);
+  return smaller(a.v, b.v);
 }
 
-// exp and log of floats: Cody-Waite reduction and a polynomial, below 2 ulp over the normal range.
+template <class S>
+BT_HD Pack<S> relu(Pack<S> a) {
+  return larger(Pack<S>(S(0)).v, a.v);  // NaN stays NaN
+}
+
+// exp and log of floats, below 2 ulp over the normal range: Cody-Waite reduction and a minimax polynomial in pairs, so
+// that few operations wait for one another.
 BT_HD Pack<float> exp_(Pack<float> x) {
   using V = Pack<float>::V;
   using M = Pack<float>::M;
   V a = min_(max_(x, Pack<float>(-87.0f)), Pack<float>(88.0f)).v;
   const V magic = Pack<float>(12582912.0f).v;  // 1.5 * 2^23: adding it rounds to an integer
   const V n = (a * 1.44269504f + magic) - magic;
-  const V f = (a - n * 0.693145752f) - n * 1.42860677e-6f;
-  V p = 1.98412698e-4f * f + 1.38888889e-3f;
-  p = p * f + 8.33333333e-3f;
-  p = p * f + 4.16666667e-2f;
-  p = p * f + 1.66666667e-1f;
-  p = p * f + 0.5f;
-  p = p * f + 1.0f;
-  p = p * f + 1.0f;
+  const V f = (a - n * 0.693145752f) - n * 1.42860677e-6f, f2 = f * f;
+  // exp(f) = 1 + f + f^2 q
+  const V q = (0.166665211f * f + 0.49999994f) + f2 * ((8.36871658e-3f * f + 4.16683890e-2f) + f2 * 1.38145988e-3f);
+  const V p = (1.0f + f) + f2 * q;
   const V two_n = same_bits<V>((convert<M>(n) + 127) << 23);
   return choose(x.v < -87.0f, V{}, p * two_n);
 }
@@ -142,13 +138,11 @@ BT_HD Pack<float> log_(Pack<float> x) {
   const M shifted = bits - 0x3f3504f3;
   const M e = shifted >> 23;
   const V m = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3);
-  const V f = m - 1.0f;
-  const V s = f / (2.0f + f), s2 = s * s;
-  // log(1+f) = 2 atanh(s)
-  V p = 0.222221985f * s2 + 0.285714287f;
-  p = p * s2 + 0.4f;
-  p = p * s2 + 0.666666667f;
-  const V r = s * s2 * p + 2.0f * s;
+  const V f = m - 1.0f, f2 = f * f, f4 = f2 * f2;
+  // log(1 + f) = f - f^2 / 2 + f^3 q
+  const V low = (-0.250013381f * f + 0.333339095f) + f2 * (-0.16577585f * f + 0.199630633f);
+  const V q = low + f4 * ((-0.142674878f * f + 0.149147674f) + f2 * 8.70043784e-2f);
+  const V r = f + f2 * (f * q - 0.5f);
   const V n = convert<V>(e);
   return (r + n * 1.42860677e-6f) + n * 0.693145752f;
 }
@@ -161,15 +155,6 @@ BT_HD Pack<double> log_(Pack<double> x) {
   Pack<double> r;
   for (int i = 0; i < kLanes; ++i) r.set(i, std::log(x[i]));
   return r;
-}
-
-// The lane mask of such bits.
-template <class S>
-BT_HD typename Pack<S>::M mask_of(uint32_t b) {
-  using M = typename Pack<S>::M;
-  M number;
-  for (int i = 0; i < kLanes; ++i) set_lane(number, i, std::decay_t<decltype(number[0])>(1 << i));
-  return (number & int(b)) != 0;
 }
 
 // The lanes named by `keep`, next to each other; `to` has room for a whole pack.
@@ -202,6 +187,23 @@ BT_HD Pack<S> floor_(Pack<S> a) {
 template <class S>
 BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
   return same_bits<typename IndexOf<Pack<S>>::type>(convert<typename Pack<S>::M>(a.v));
+}
+// Integers below 2^24, and lanes of integers.
+template <class S>
+BT_HD Pack<S> from_integers(const Wide<uint32_t>& a) {
+  if constexpr (std::is_same_v<S, float>) return convert<Wide<float>>(same_bits<Wide<int32_t>>(a));
+  Pack<S> r;
+  for (int i = 0; i < kLanes; ++i) r.set(i, S(a[i]));
+  return r;
+}
+template <class S>
+BT_HD void store_integers(int32_t* to, Pack<S> a) {
+  if constexpr (std::is_same_v<S, float>) {
+    const auto whole = convert<Wide<int32_t>>(a.v);
+    std::memcpy(to, &whole, sizeof whole);
+  } else {
+    for (int i = 0; i < kLanes; ++i) to[i] = int32_t(a[i]);
+  }
 }
 // Half of a vector: the lower one (0) or the upper one (1). GCC has the shuffle from version 12 on.
 template <int which, class Half, class V>

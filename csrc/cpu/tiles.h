@@ -8,6 +8,8 @@
 namespace bt {
 
 constexpr int kPackSide = 4, kPacksAcross = kTile / kPackSide, kPacks = kPacksAcross * kPacksAcross;
+constexpr uint32_t kColumns = 0x1111;  // a bit for the first pack of each row
+static_assert(kPacks == kLanes && kPacksAcross == 4, "a bit and a lane for each pack of a tile");
 
 // A pack's first pixel in its tile.
 inline int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
@@ -19,11 +21,12 @@ struct TileState {
   using P = Pack<S>;
   using M = typename P::M;
   P transmittance[kPacks];
-  M open[kPacks];  // pixels inside the image that still take light
-  int open_packs = 0;
-  S x0, y0;  // the tile's first pixel
-  S stop;    // transmittance at which a pixel takes no more light
-  P lane_x, lane_y;
+  M open[kPacks];           // pixels inside the image that still take light
+  uint32_t open_packs = 0;  // a bit for each pack that has such pixels
+  S x0, y0;                 // the tile's first pixel
+  S stop;                   // transmittance at which a pixel takes no more light
+  P lane_x, lane_y;         // pixel centres of a pack
+  P middle_x, middle_y;     // middles of the packs, from the tile's corner
 
   TileState(int tile_x, int tile_y, int width, int height, S stop = S(kTransmittanceMin)) : stop(stop) {
     x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
@@ -35,35 +38,39 @@ struct TileState {
       transmittance[p] = P(S(1));
       const P px = P(x0 + S(pack_column(p))) + lane_x, py = P(y0 + S(pack_row(p))) + lane_y;
       open[p] = (px < P(S(width))) & (py < P(S(height)));
-      open_packs += bits(open[p]) != 0;
+      open_packs |= uint32_t(bits(open[p]) != 0) << p;
+      middle_x.set(p, S(pack_column(p)) + S(0.5 * kPackSide)), middle_y.set(p, S(pack_row(p)) + S(0.5 * kPackSide));
     }
   }
 
-  // Blends a surfel: fn(pack, lanes, fragment, weight) for every pack in which some pixel takes it.
+  // Blends a surfel: fn(pack, mask of its pixels, fragment, weight) for every pack in which some pixel takes it.
   template <class Kernel, class F>
   void blend(const S* g, const S* radius, S near, F&& fn, S sharp = S(1)) {
     const S cx = g[kCx] - x0, cy = g[kCy] - y0;
-    const int left = first(cx - radius[0]), right = last(cx + radius[0]);
-    const int top = first(cy - radius[1]), bottom = last(cy + radius[1]);
-    for (int py = top; py <= bottom; ++py) {
-      for (int px = left; px <= right; ++px) {
-        const int pack = py * kPacksAcross + px;
-        if (!bits(open[pack])) continue;
-        const P dx = lane_x + P(S(px * kPackSide) - cx), dy = lane_y + P(S(py * kPackSide) - cy);
-        if (filtered<Kernel>(g)) {
-          const FilteredHit<P> at = filtered_hit<S, P>(g, dx, dy);
-          if (bits(open[pack] & in_support(at))) take_fragment(pack, filtered_fragment<S, P>(g, near, at), fn);
-          continue;
-        }
-        // a cheap look first: does any lane lie in the support or near the centre?
-        const M inside = in_support(planes(g, dx, dy)), close = near_centre<Kernel>(dx, dy, sharp);
-        if (!bits(open[pack] & (inside | close))) continue;
-        take_fragment(pack, fragment<Kernel>(g, near, dx, dy, bits(close) != 0, sharp), fn);
+    uint32_t packs = open_packs & boxed(cx, cy, radius);
+    Reached r = {packs, packs};
+    if (!filtered<Kernel>(g)) r = reached<Kernel>(g, cx, cy, sharp), packs &= r.support | r.centre;
+    // all fragments first: what a branch on one of them waits for is then known
+    Fragment<P> found[kPacks];
+    int at[kPacks], n = 0;
+    for (; packs; packs &= packs - 1) {
+      const int pack = __builtin_ctz(packs);
+      const P dx = lane_x + P(S(pack_column(pack)) - cx), dy = lane_y + P(S(pack_row(pack)) - cy);
+      if (filtered<Kernel>(g)) {
+        const FilteredHit<P> hit = filtered_hit<S, P>(g, dx, dy);
+        if (bits(open[pack] & in_support(hit))) found[n] = filtered_fragment<S, P>(g, near, hit), at[n++] = pack;
+        continue;
       }
+      found[n] = fragment<Kernel>(g, near, dx, dy, r.centre >> pack & 1, sharp), at[n++] = pack;
     }
+    for (int i = 0; i < n; ++i) take_fragment(at[i], found[i], fn);
   }
 
  private:
+  // Packs with a pixel in a surfel's support, and with one near its centre.
+  struct Reached {
+    uint32_t support, centre;
+  };
   template <class F>
   void take_fragment(int pack, const Fragment<P>& f, F& fn) {
     const Blend<P> b = bt::blend(f.sigma, transmittance[pack]);
@@ -71,9 +78,31 @@ struct TileState {
     if (!bits(v.takes | v.ends)) return;
     open[pack] = open[pack] & ~v.ends;
     transmittance[pack] = select(v.takes, b.behind, transmittance[pack]);
-    const uint32_t lanes = bits(v.takes);
-    if (lanes) fn(pack, lanes, f, b.weight);
-    if (!bits(open[pack])) --open_packs;
+    if (bits(v.takes)) fn(pack, v.takes, f, b.weight);
+    if (!bits(open[pack])) open_packs &= ~(1u << pack);
+  }
+  // Packs that the box around a surfel's level set meets.
+  static uint32_t boxed(S cx, S cy, const S* radius) {
+    const int left = first(cx - radius[0]), right = last(cx + radius[0]);
+    const int top = first(cy - radius[1]), bottom = last(cy + radius[1]);
+    if (left > right || top > bottom) return 0;
+    const uint32_t columns = (2u << right) - (1u << left);
+    const uint32_t rows = (2u << (kPacksAcross * bottom + kPacksAcross - 1)) - (1u << kPacksAcross * top);
+    return rows & columns * kColumns;
+  }
+  // Packs in which a pixel may lie in a surfel's support or near its centre: never one too few, few too many. Within a
+  // pack a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
+  template <class Kernel>
+  Reached reached(const S* g, S cx, S cy, S sharp) const {
+    constexpr S kHalf = S(0.5 * (kPackSide - 1)), kRounding = S(1e-6), kPixelSlack = S(1e-3);
+    const P zero = P(S(0)), x = middle_x - P(cx), y = middle_y - P(cy);
+    const S half_x = kHalf + kRounding * (S(kTile) + abs_(cx)), half_y = kHalf + kRounding * (S(kTile) + abs_(cy));
+    const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
+    const Planes<P> p = planes(g, x, y);
+    const Planes<P> nearest = {max_(abs_(p.U) - P(spread(kU1)), zero), max_(abs_(p.V) - P(spread(kV1)), zero),
+                               abs_(p.W) + P(spread(kW1) + kRounding * abs_(g[kW0]))};
+    const P dx = max_(abs_(x) - P(half_x + kPixelSlack), zero), dy = max_(abs_(y) - P(half_y + kPixelSlack), zero);
+    return {bits(within(nearest, P(S(kSupport2 * (1 + 1e-5))))), bits(near_centre<Kernel>(dx, dy, sharp))};
   }
   static int first(S offset) {  // pack that holds the pixel at this offset, at least 0
     return offset <= S(0) ? 0 : int(offset) / kPackSide;

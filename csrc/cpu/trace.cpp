@@ -56,7 +56,8 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
       state.template blend<Kernel>(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
-                                   [&](int pack, uint32_t lanes, const Fragment<P>& f, P weight) {
+                                   [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
+                                     const uint32_t lanes = bits(taken);
                                      if (!keep) {
                                        count += __builtin_popcount(lanes);
                                        return;

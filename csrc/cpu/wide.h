@@ -116,6 +116,40 @@ BT_HD V choose(const M& m, const V& yes, const V& no) {
   else
     return m ? yes : no;
 }
+// a > b ? a : b and a < b ? a : b, for which processors have one instruction that the compiler does not find.
+template <class V>
+BT_HD V larger(const V& a, const V& b) {
+  if constexpr (is_two<V>)
+    return {larger(a.low, b.low), larger(a.high, b.high)};
+  else
+    return choose(a > b, a, b);
+}
+template <class V>
+BT_HD V smaller(const V& a, const V& b) {
+  if constexpr (is_two<V>)
+    return {smaller(a.low, b.low), smaller(a.high, b.high)};
+  else
+    return choose(a < b, a, b);
+}
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+template <>
+BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
+  return (Vector<float>)_mm512_max_ps((__m512)a, (__m512)b);
+}
+template <>
+BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
+  return (Vector<float>)_mm512_min_ps((__m512)a, (__m512)b);
+}
+#elif defined(__AVX2__)
+template <>
+BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
+  return (Vector<float>)_mm256_max_ps((__m256)a, (__m256)b);
+}
+template <>
+BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
+  return (Vector<float>)_mm256_min_ps((__m256)a, (__m256)b);
+}
+#endif
 // Numbers to numbers of another type, as wide.
 template <class To, class V>
 BT_HD To convert(const V& v) {

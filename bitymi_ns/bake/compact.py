@@ -27,9 +27,9 @@ from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2
 """Price that is looked at first: squared error that a bit is worth, colours from 0 to 1."""
-MOST_PRICE = 8.0 / 255**2
+MOST_PRICE = 4.0 / 255**2
 """The price is no larger where a share of the error decides: much of a large error is what no texel mends, such as of
-exposure, and does not hide that of rounding; and texels learn little behind steps above the 5.9 of 255 that this is."""
+exposure, and does not hide that of rounding; and texels learn little behind steps above the 4.2 of 255 that this is."""
 TEXEL_SHARE = 0.5
 """Of the error that a bit is worth elsewhere, what it is worth in texels, which are tuned after it."""
 ENOUGH = 0.002
@@ -257,7 +257,7 @@ def _search(
     """The largest price up to `most` of which `more` holds, and the smallest of which it does not, a tenth apart. Where
     there is none of a kind, the nearest that was looked at stands for it."""
     low, high, found = None, None, {}
-    price = START
+    price = min(START, most)
     for step in range(_SEARCH):
         found[price] = coder.at(price)
         progress("choosing the precision", step + 1, _SEARCH)

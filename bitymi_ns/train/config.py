@@ -74,11 +74,12 @@ class DensifyConfig:
     reset_opacity: float = 0.01
     """Opacity after a reset, at most. Very short runs reset to a higher one."""
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
-    """Steps of the final multi-view prunes."""
+    """Steps of the final prunes."""
     final_prune_opacity: float = 0.1
     """Final prunes remove surfels below this opacity."""
-    final_prune_score: float = 0.9
-    """Final prunes remove surfels whose multi-view error score (0 to 1) is above this."""
+    final_prune_score: float = 1.0
+    """Final prunes remove surfels whose multi-view error score (0 to 1) is above this; 1 = none. FastGS's 0.9 removes
+    those that cover most bad pixels, the largest of a background among them, when nothing can close the hole."""
     min_interval: int = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
     pixels_per_surfel: float = 300.0

@@ -103,7 +103,7 @@ class Schedule:
         return any(reset < step <= reset + max(1, self.reset_every // 2) for reset in self.reset_steps)
 
     def is_final_prune_step(self, step: int) -> bool:
-        """Whether the multi-view prune of the finished geometry takes place after this step."""
+        """Whether the prune of the finished geometry takes place after this step."""
         return step in self.final_prune_steps
 
     def overdraw_counts(self, step: int) -> bool:

@@ -251,9 +251,10 @@ class Strategy:
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
         config = self.config.densify
         report = self._drop_dead(scene, optimizers)
-        scores = self._scores(scene, views)
         logits = scene.surfels["opacity_logits"]
-        pruned = (logits.sigmoid() < config.final_prune_opacity) | (scores.prune > config.final_prune_score)
+        pruned = logits.sigmoid() < config.final_prune_opacity
+        if config.final_prune_score < 1.0:
+            pruned |= self._scores(scene, views).prune > config.final_prune_score
         pruned = self._keep_minimum(pruned, logits, len(scene))
         self._remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}

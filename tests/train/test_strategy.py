@@ -314,16 +314,26 @@ def test_a_scene_without_a_finite_row_is_an_error(bench):
         b.step(DENSIFY)
 
 
-def test_final_prune_removes_the_transparent_and_the_bad(bench):
+def test_final_prune_removes_the_transparent(bench):
     b = bench(10)
+    b.set("opacity_logits", 0, -2.3)
+    b.prune[7] = 1.0
+    report = b.step(FINAL)
+    assert b.x == list(range(1, 10))
+    assert (report["pruned"], report["surfels"]) == (1, 9)
+    assert b.asked == []  # no view is drawn for scores that nobody asks for
+    check_optimizers = b.optimizers["means"].state[b.scene.surfels["means"]]
+    assert len(check_optimizers["exp_avg"]) == 9
+
+
+def test_final_prune_removes_the_bad_where_that_is_asked_for(bench):
+    b = bench(10, final_prune_score=0.9)
     b.set("opacity_logits", 0, -2.3)
     b.prune[7] = 0.91
     b.prune[8] = 0.9
     report = b.step(FINAL)
     assert b.x == [1, 2, 3, 4, 5, 6, 8, 9]
     assert (report["pruned"], report["surfels"]) == (2, 8)
-    check_optimizers = b.optimizers["means"].state[b.scene.surfels["means"]]
-    assert len(check_optimizers["exp_avg"]) == 8
 
 
 @pytest.mark.parametrize(("n", "least", "left"), [(10, 4, 4), (10, 100, 10), (10, 0, 1)])

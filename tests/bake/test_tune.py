@@ -328,4 +328,4 @@ def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: Bake
     scene = replace(truth, options=replace(truth.options, format="fp16"))
     views = photographs(scene)
     tuned = tune_atlas(scene, views, BACKGROUND, TuneOptions.of_learned(20))
-    assert error(tuned, views) < 2e-6
+    assert error(tuned, views) < 3e-6

@@ -188,7 +188,7 @@ template <class S>
 BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
   return same_bits<typename IndexOf<Pack<S>>::type>(convert<typename Pack<S>::M>(a.v));
 }
-// Integers below 2^24, and lanes of integers.
+// Lanes of integers below 2^24, and such lanes as integers.
 template <class S>
 BT_HD Pack<S> from_integers(const Wide<uint32_t>& a) {
   if constexpr (std::is_same_v<S, float>) return convert<Wide<float>>(same_bits<Wide<int32_t>>(a));
@@ -198,12 +198,11 @@ BT_HD Pack<S> from_integers(const Wide<uint32_t>& a) {
 }
 template <class S>
 BT_HD void store_integers(int32_t* to, Pack<S> a) {
-  if constexpr (std::is_same_v<S, float>) {
-    const auto whole = convert<Wide<int32_t>>(a.v);
+  const auto whole = to_index(a);
+  if constexpr (std::is_same_v<S, float>)
     std::memcpy(to, &whole, sizeof whole);
-  } else {
-    for (int i = 0; i < kLanes; ++i) to[i] = int32_t(a[i]);
-  }
+  else
+    for (int i = 0; i < kLanes; ++i) to[i] = int32_t(whole[i]);
 }
 // Half of a vector: the lower one (0) or the upper one (1). GCC has the shuffle from version 12 on.
 template <int which, class Half, class V>

@@ -48,8 +48,8 @@ struct TileState {
   void blend(const S* g, const S* radius, S near, F&& fn, S sharp = S(1)) {
     const S cx = g[kCx] - x0, cy = g[kCy] - y0;
     uint32_t packs = open_packs & boxed(cx, cy, radius);
-    Reached r = {packs, packs};
-    if (!filtered<Kernel>(g)) r = reached<Kernel>(g, cx, cy, sharp), packs &= r.support | r.centre;
+    const Reached r = filtered<Kernel>(g) ? Reached{packs, 0} : reached<Kernel>(g, cx, cy, sharp);
+    packs &= r.support | r.centre;
     // all fragments first: what a branch on one of them waits for is then known
     Fragment<P> found[kPacks];
     int at[kPacks], n = 0;

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bitymi_ns.bake import Baked, TuneOptions, tune_atlas
+from bitymi_ns.bake import Baked, TuneOptions, compact, tune_atlas
 from bitymi_ns.bake.compact import (
     ENOUGH,
     MOST_PRICE,
@@ -59,7 +59,10 @@ def from_photographs(baked: Baked, views: list[View]) -> float:
     return sum(float((x - y).square().mean()) for x, y in pictures) / len(pictures)
 
 
-def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(truth: Baked, views: list[View]) -> None:
+def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
+    truth: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compact, "MOST_PRICE", math.inf)  # the share alone decides
     sizes = []
     for share in (0.02, 0.4):
         rounded, coding = compacted(truth, views, BACKGROUND, Compact(share=share, views=len(views)))
@@ -68,7 +71,7 @@ def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(truth: Baked,
         assert error(truth, rounded, views) < 4 * allowed
         assert sorted(rounded.rows.tolist()) == sorted(truth.rows.tolist())
         sizes.append(rounded.codes.surfels.nbytes() + with_coded_texels(rounded, coding).codes.texels.nbytes())
-    assert sizes[1] < sizes[0]
+    assert sizes[1] < 0.9 * sizes[0]
 
 
 def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Baked, views: list[View]) -> None:

@@ -52,6 +52,17 @@ def test_files_of_other_programs_are_read(surfels, tmp_path: Path, degree: int) 
             read_gaussians(tmp_path / "b.ply")
 
 
+def test_opacities_of_0_and_1_are_read(surfels, tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", gaussians_of(baked(surfels(3), "sv"), torch.randn(3, 16, 3)))
+    columns = ply.parse_ply((tmp_path / "a.ply").read_bytes())["vertex"]
+    ply.write_ply(tmp_path / "b.ply", columns | {"opacity": np.array([-np.inf, 0.5, np.inf], np.float32)})
+    found = read_gaussians(tmp_path / "b.ply").opacity_logits
+    assert found.isfinite().all() and torch.sigmoid(found).tolist() == pytest.approx([0, 1 / (1 + np.exp(-0.5)), 1])
+    ply.write_ply(tmp_path / "b.ply", columns | {"opacity": np.array([np.nan, 0, 0], np.float32)})
+    with pytest.raises(ply.PlyError, match="opacity is not finite in row 0"):
+        read_gaussians(tmp_path / "b.ply")
+
+
 def test_a_missing_column_is_named(tmp_path: Path) -> None:
     ply.write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
     with pytest.raises(ply.PlyError, match="the column y"):

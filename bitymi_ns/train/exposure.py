@@ -164,12 +164,16 @@ class Exposure:
             "optimizer": None if self._optimizer is None else copy.deepcopy(self._optimizer.state_dict()),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any] | None, count: int) -> None:
+    def load_state_dict(
+        self, state: Mapping[str, Any] | None, count: int, device: torch.device | str | None = None
+    ) -> None:
         """Goes on where `state_dict` was taken; what belongs to another option or other photographs is left.
 
         Args:
             state: None = of a run from before there were corrections: `auto` then leaves all as it is.
             count: number of training photographs.
+            device: where the corrections are wanted, because a checkpoint may have been loaded elsewhere; None = where
+                those of `state` are.
         """
         if state is None:
             self.decided = self.kind in ("off", "auto")
@@ -181,8 +185,7 @@ class Exposure:
         if table is None:
             self.table = self._optimizer = None
             return
-        device = table.device if self.table is None else self.table.device
-        self._begin(table[:, _diagonal(table)].to(device), table.shape[1] > 3)
+        self._begin(table[:, _diagonal(table)].to(device or table.device), table.shape[1] > 3)
         assert self.table is not None and self._optimizer is not None
         self.table.data.copy_(table)
         self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))

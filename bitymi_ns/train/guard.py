@@ -304,4 +304,4 @@ class Guard:
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.strategy.load_state_dict(state["strategy"])
         if self.exposure is not None and self._views is not None:
-            self.exposure.load_state_dict(state["exposure"], len(self._views))
+            self.exposure.load_state_dict(state["exposure"], len(self._views), surfels["means"].device)

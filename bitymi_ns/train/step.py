@@ -149,8 +149,9 @@ class Training:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
         if not self._alike:
             self._alike = True
-            found = self.processes.from_first(self.exposure.state_dict(), self.scene.surfels["means"].device)
-            self.exposure.load_state_dict(found, len(self._full_size))
+            device = self.scene.surfels["means"].device
+            found = self.processes.from_first(self.exposure.state_dict(), device)
+            self.exposure.load_state_dict(found, len(self._full_size), device)
         if self.texels.begin(step, self.views):
             self.guard.start_from_here()
         self.guard.before(step, self.views)
@@ -251,5 +252,6 @@ class Training:
         self.strategy.load_state_dict(state["strategy"])
         if "guard" in state:  # checkpoints of earlier versions have none
             self.guard.load_state_dict(state["guard"])
-        self.exposure.load_state_dict(state.get("exposure"), len(self._full_size))
+        device = self.scene.surfels["means"].device  # a checkpoint is read on the CPU
+        self.exposure.load_state_dict(state.get("exposure"), len(self._full_size), device)
         self.clock = Stopwatch(state["seconds"], state["cpu_seconds"])

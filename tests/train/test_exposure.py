@@ -225,6 +225,15 @@ def test_a_resumed_run_is_the_same_run(make_scene, uneven, kind: str) -> None:
     assert torch.equal(moments[0]["exp_avg"].to_dense(), moments[1]["exp_avg"].to_dense())
 
 
+def test_a_run_that_is_resumed_on_a_device_has_its_corrections_there(make_scene, uneven) -> None:
+    trainer = Trainer(make_scene(), uneven, config("gain"), 20)
+    trainer.advance()
+    resumed = Exposure("gain")
+    resumed.load_state_dict(trainer.training.exposure.state_dict(), len(uneven), "meta")
+    assert resumed.table is not None and resumed.table.device.type == "meta"
+    assert resumed.of(0).device.type == "meta"  # type: ignore[union-attr]
+
+
 def test_states_of_earlier_versions_other_options_and_other_photographs(make_scene, uneven) -> None:
     trainer = Trainer(make_scene(), uneven, config("gain"), 20)
     trainer.advance()

@@ -52,7 +52,7 @@ class RenderOutput:
         soft_overdraw: [H, W, 1] fragments per pixel, those of small weight in part; None without `overdraw_half`.
         fragments: the view's fragments; where they were too many, what is known of them without the list.
         projection: the view's surfels.
-        image: [H, W, 5] rgb, alpha and beta in one tensor; None where there are maps, a background or the overdraw.
+        image: [H, W, 5] rgb, alpha and beta in one tensor; None where there are maps or the overdraw.
     """
 
     rgb: Tensor
@@ -176,19 +176,19 @@ class Scene(nn.Module):
         except TooManyFragments as error:
             image, fragments = self._draw_in_bands(projection, draw, error)
         image = image.view(camera.height, camera.width, -1)
-        rgb, alpha = image[..., :3], image[..., 3:4]
         if background is not None:
-            rgb = rgb + (1 - alpha) * background
+            behind = torch.nn.functional.pad(background, (0, image.shape[-1] - 3))
+            image = torch.addcmul(image, 1.0 - image[..., 3:4], behind)
         return RenderOutput(
-            rgb=rgb,
-            alpha=alpha,
+            rgb=image[..., :3],
+            alpha=image[..., 3:4],
             beta=image[..., 4:5],
             depth=image[..., 5:6] if maps else None,
             normal=image[..., 6:9] if maps else None,
             soft_overdraw=image[..., -1:] if overdraw_half is not None else None,
             fragments=fragments,
             projection=projection,
-            image=image if background is None and image.shape[-1] == IMAGE_CHANNELS else None,
+            image=image if image.shape[-1] == IMAGE_CHANNELS else None,
         )
 
     def _draw_in_bands(

@@ -60,7 +60,9 @@ def view_losses(
     )
     shown = output
     if view.correction is not None:
-        shown = replace(output, rgb=view.shown(output.rgb, output.alpha, background), image=None)
+        rgb = view.shown(output.rgb, output.alpha, background)
+        image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
+        shown = replace(output, rgb=rgb, image=image)
     terms = objective(shown, view.target(background, device), config.loss, view.mask)
     own = watch or LossWatch()
     own.note(scene, step, terms)

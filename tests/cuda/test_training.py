@@ -31,10 +31,12 @@ def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[Vie
     return scene, [View(camera, torch.rand(16, 20, channels, generator=g)) for channels in (3, 4)]
 
 
-def train(device: torch.device, background: str) -> tuple[list[float], float, dict[str, torch.Tensor]]:
+def train(device: torch.device, background: str, exposure: str) -> tuple[list[float], float, dict[str, torch.Tensor]]:
     """Losses of the steps, PSNR after them, and the parameters on the CPU."""
     scene, views = scene_and_views()
-    config = TrainConfig(background=background, resolution_schedule=0, freeze_after=1, freeze_every=2)
+    config = TrainConfig(
+        background=background, exposure=exposure, resolution_schedule=0, freeze_after=1, freeze_every=2
+    )
     trainer = Trainer(scene.to(device), views, config, STEPS)
     losses = []
     for _ in range(STEPS):
@@ -45,11 +47,11 @@ def train(device: torch.device, background: str) -> tuple[list[float], float, di
     return losses, psnr, {name: p.detach().cpu() for name, p in scene.named_parameters()}
 
 
-@pytest.mark.parametrize("background", ["random", "black"])  # over black the losses have kernels of their own
-def test_training_steps_equal_those_of_the_cpu(background: str, device: torch.device, cpu) -> None:
-    losses, psnr, parameters = train(device, background)
+@pytest.mark.parametrize(("background", "exposure"), [("random", "off"), ("black", "off"), ("random", "affine")])
+def test_training_steps_equal_those_of_the_cpu(background: str, exposure: str, device: torch.device, cpu) -> None:
+    losses, psnr, parameters = train(device, background, exposure)
     with cpu():
-        want_losses, want_psnr, want = train(torch.device("cpu"), background)
+        want_losses, want_psnr, want = train(torch.device("cpu"), background, exposure)
     assert losses == pytest.approx(want_losses, rel=1e-4)
     assert psnr == pytest.approx(want_psnr, abs=0.01)
     for name, value in want.items():

@@ -283,14 +283,15 @@ def add_list_coverage(
     if mask is not None:
         counts = counts * mask.reshape(-1)[fragments.pixel.long()]
     share, base = total.new_ones(len(total)), total.new_zeros(fragments.surfels, 3)
+    grey = counts[:, None].expand(-1, 3).contiguous()  # as colours, too: where they are 0 there is nothing to count
     # the gradient of colours of which no channel is cut off, as a step of length -1
     kernel("texel_colors_backward", total)(
         **by_name(fragments.arrays),
         **tiles.arrays,
         **_backward_memory(total, len(base), True),
         **{"bound": bound, "base": base, "texels": total, "moved": total, "share": share, "rate": -1.0},
-        colors=total.new_ones(len(fragments), 3),
-        dcolors=counts[:, None].expand(-1, 3).contiguous(),
+        colors=grey,
+        dcolors=grey,
         dbase=None,
         dtexels=None,
         duv=None,

@@ -12,6 +12,9 @@ from bitymi_ns.ops import Projection, TexelTiles, add_list_coverage, fitting_lis
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
+PART = 1 << 20
+"""Fragments that are looked at together: what is computed of them then takes no memory from the system."""
+
 
 @dataclass(frozen=True)
 class Visibility:
@@ -67,13 +70,13 @@ def visibility(
         here = torch.zeros_like(pixels)
         projection = project(means, *geometry, camera.to(means.device), near, through_pixel)
         for fragments in fitting_lists(projection):
-            in_front = fragments.weight / fragments.sigma.abs()  # its sign tells the low-pass branch
-            rows = fragments.surfel.long()
-            largest.scatter_reduce_(0, rows, in_front, "amax")
-            textured = torch.where(fragments.weight >= weight_bound, fragments.weight, 0.0)
-            here.index_add_(0, rows, textured.to(here.dtype))
-            seen[done - 1, rows] = True
-            del fragments, in_front, rows, textured  # before the next list is made
+            lists = (fragments.surfel, fragments.weight, fragments.sigma)
+            for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):
+                rows = surfel.long()
+                largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # its sign tells the low-pass branch
+                here.index_add_(0, rows, torch.where(weight >= weight_bound, weight, 0.0).to(here.dtype))
+                seen[done - 1, rows] = True
+            del fragments, lists, surfel, weight, sigma  # before the next list is made
         pixels = torch.maximum(pixels, here)
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, seen)

@@ -162,6 +162,7 @@ class Guard:
             else:
                 output = self.scene.render(view.camera.to(device), background=background, field_mode="frozen")
                 drawn = view.shown(output.rgb, output.alpha, background)
+                del output  # with its fragments, before the next view makes its own
             losses.append(photometric(drawn, target, self.config.loss.ssim_weight, view.mask))
         return self.processes.mean(float(torch.stack(losses).mean()))
 

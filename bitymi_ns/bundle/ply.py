@@ -84,7 +84,8 @@ def parse_ply(data: bytes | bytearray, unbounded: Collection[str] = ()) -> dict[
         element to name to [N] float32 or int32 array, in the file's order; the first element is `vertex`.
 
     Raises:
-        PlyError: another kind of PLY, a length that does not match the header, or a value that is not finite.
+        PlyError: another kind of PLY, a length that does not match the header, or a value that is not finite where it
+            has to be.
     """
     header = read_header(data, len(data))
     elements, at = {}, header.start

@@ -34,8 +34,8 @@ _REST = tuple(3 * (n * n - 1) for n in range(1, 5))
 _UNIT_LENGTH = 1e-6
 """Rotations that differ by no more from it are left as they are."""
 
-_LARGEST_LOGIT = 30.0
-"""Of an opacity that is read; its sigmoid is 1 in single precision."""
+_OPAQUE = 30.0
+"""In place of an infinite logit; its sigmoid is 1 in single precision."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
 def read_gaussians(path: str | Path) -> Gaussians:
     """Reads a PLY file of 3DGS, of `write_gaussians` or of other programs: its harmonics may end at any degree, normals
     may be left out, and rotations may have any length but 0. Opacities of 0 and 1 have infinite logits, which programs
-    that store opacities in bytes do write; they become the nearest ones that are finite.
+    that store opacities in bytes do write; they become 30, an opacity within 1e-13 of it.
 
     Raises:
         ply.PlyError: it is another kind of PLY, a column is missing, or another value is not finite.
@@ -135,5 +135,5 @@ def read_gaussians(path: str | Path) -> Gaussians:
     coefficients[:, 1 : 1 + rest.shape[1]] = rest
     length = found["quats"].norm(dim=1, keepdim=True)
     quats = torch.where((length - 1).abs() > _UNIT_LENGTH, found["quats"] / length, found["quats"])
-    logits = found["opacity_logits"][:, 0].clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+    logits = found["opacity_logits"][:, 0].nan_to_num(posinf=_OPAQUE, neginf=-_OPAQUE)
     return Gaussians(found["means"], quats, found["log_scales"], logits, coefficients)

@@ -111,7 +111,7 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
 def read_gaussians(path: str | Path) -> Gaussians:
     """Reads a PLY file of 3DGS, of `write_gaussians` or of other programs: its harmonics may end at any degree, normals
     may be left out, and rotations may have any length but 0. Opacities of 0 and 1 have infinite logits, which programs
-    that store opacities in bytes do write; they become 30, an opacity within 1e-13 of it.
+    that store opacities in bytes do write; they become -30 and 30.
 
     Raises:
         ply.PlyError: it is another kind of PLY, a column is missing, or another value is not finite.

@@ -57,6 +57,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "freeze_min_updates": (0, MOST),
     "field_warmup": (0, MOST),
     "resolution_schedule": (0, MOST),
+    "small_photograph": (1, MOST),
     "num_downscales": (0, 16),
     "init_opacity": (TINY, 1 - TINY),
     "random_points": (1, MOST),

@@ -23,13 +23,16 @@ class Schedule:
     `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
     """
 
-    def __init__(self, config: TrainConfig, max_steps: int, extent: float = 1.0, texels: bool = False) -> None:
+    def __init__(
+        self, config: TrainConfig, max_steps: int, extent: float = 1.0, texels: bool = False, pixels: float = 0.0
+    ) -> None:
         """
         Args:
             config: training options.
             max_steps: length of the run in steps.
             extent: scene extent in world units; the learning rate of the means is in multiples of it.
             texels: whether texels learn in the last part of the run.
+            pixels: of a photograph, on average.
         """
         if max_steps < 1:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
@@ -49,6 +52,11 @@ class Schedule:
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
+        apart, times = config.resolution_schedule, config.num_downscales if config.resolution_schedule > 0 else 0
+        if times and self.texels_start < max_steps:
+            wait = min(self.short_run_gain, math.sqrt(pixels / config.small_photograph))
+            apart = max(apart, min(apart * wait, config.texels.start / times))
+        self._doublings = [self.scaled(apart * (i + 1)) for i in range(times)]
         self._last_part: Schedule | None = None
         if self.texels_start < max_steps:
             slower = replace(config, lr=config.lr.times(config.texels.surfel_rates))
@@ -152,11 +160,14 @@ class Schedule:
         return min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
 
     def resolution_factor(self, step: int) -> float:
-        """Factor of the image size, 2^-k; 1 from `num_downscales` times `resolution_schedule` steps on."""
-        if self.config.resolution_schedule <= 0:
-            return 1.0
-        doublings = [self.scaled(self.config.resolution_schedule * (i + 1)) for i in range(self.config.num_downscales)]
-        return 2.0 ** -sum(step < at for at in doublings)
+        """Factor of the image size, 2^-k; 1 from the last doubling on.
+
+        Doublings are `resolution_schedule` steps apart. Short runs whose texels learn in a last part of their own wait
+        longer, by `short_run_gain`, though full size comes with the texels at the latest: what the surfels need to know
+        before, smaller pictures show for less. Photographs that are small themselves show too little then, and their
+        runs wait less: by the square root of their pixels over `small_photograph`.
+        """
+        return 2.0 ** -sum(step < at for at in self._doublings)
 
     def lr(self, name: str, step: int) -> float:
         """Learning rate of a parameter in this step.

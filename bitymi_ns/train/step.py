@@ -113,7 +113,7 @@ class Training:
         """
         self.scene, self.optimizers, self.config, self.processes = scene, optimizers, config, processes
         textured = scene.config.texture == "texels"
-        self.schedule = Schedule(config, max_steps, data.extent, textured)
+        self.schedule = Schedule(config, max_steps, data.extent, textured, data.image_pixels / max(1, len(data.views)))
         self.schedule.reset_opacity()
         for name in optimizers:
             self.schedule.lr(name, 0)

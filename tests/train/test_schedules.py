@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
-from bitymi_ns.train.config import DensifyConfig, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.schedules import Schedule
 
 
@@ -70,6 +72,27 @@ def test_resolution_doubles_up_to_full_size():
     assert [schedule.resolution_factor(s) for s in (0, 299, 300, 599, 600, 2999)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
     assert Schedule(TrainConfig(resolution_schedule=0), 3000).resolution_factor(0) == 1.0
     assert Schedule(TrainConfig(num_downscales=0), 3000).resolution_factor(0) == 1.0
+
+
+def doublings(config: TrainConfig, steps: int, pixels: float = 1e6) -> list[int]:
+    """Steps at which the pictures of a run whose texels learn in its last part become larger."""
+    schedule = Schedule(config, steps, texels=True, pixels=pixels)
+    factors = [schedule.resolution_factor(step) for step in range(steps)]
+    assert all(now in (before, 2 * before) for before, now in itertools.pairwise(factors)) and factors[-1] == 1.0
+    return [step for step in range(1, steps) if factors[step] > factors[step - 1]]
+
+
+def test_short_runs_see_small_pictures_for_longer_but_their_texels_full_size():
+    assert doublings(TrainConfig(), 30_000) == [3000, 6000]
+    assert doublings(TrainConfig(), 60_000) == [6000, 12_000]
+    gain = Schedule(TrainConfig(), 3000).short_run_gain
+    assert gain > 2 and doublings(TrainConfig(), 3000) == [round(300 * gain), round(600 * gain)]
+    assert doublings(TrainConfig(), 1200) == [360, 720] and doublings(TrainConfig(), 10) == [3, 6]
+    assert doublings(TrainConfig(), 1200, 22_500) == [180, 360]
+    assert doublings(TrainConfig(), 1200, 9_000) == doublings(TrainConfig(), 1200, 0.0) == [120, 240]
+    assert doublings(TrainConfig(texels=TexelConfig(start=3000)), 1200) == [120, 240]  # as in a run without
+    assert doublings(TrainConfig(texels=TexelConfig(start=30_000)), 1200) == [120, 240]
+    assert doublings(TrainConfig(num_downscales=0), 1200) == doublings(TrainConfig(resolution_schedule=0), 1200) == []
 
 
 def test_learning_rates():

@@ -10,11 +10,20 @@ import torch
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.visibility import visibility
+from bitymi_ns.train import texels
 from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.texels import LEAST_SHARE, blank_texels, coverage, in_one_view, tiles_as_seen
+from bitymi_ns.train.texels import (
+    LEAST_SHARE,
+    blank_texels,
+    coverage,
+    in_one_view,
+    looked_size,
+    of_size,
+    tiles_as_seen,
+)
 
 OPTIONS = TexelConfig(start=18_000, pixels_per_texel=0.5)
 
@@ -91,6 +100,24 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
     total.backward()
     torch.testing.assert_close(found, field.texels.grad[:, 0], rtol=1e-4, atol=1e-4)
     assert (found > 0).any()
+
+
+def test_large_photographs_are_looked_through_at_half_their_size(textured, views, monkeypatch) -> None:
+    scene, cameras = textured(), [view.camera for view in views]
+    whole = blank_texels(scene, views, len(views), OPTIONS)
+    pixels = sum(camera.width * camera.height for camera in cameras) // len(cameras)
+    for least, size in ((pixels, 1.0), (pixels // 4, 0.5), (0, 0.5)):
+        monkeypatch.setattr(texels, "LOOKED_PIXELS", least)
+        assert looked_size(cameras) == size
+    assert looked_size([]) == 1.0
+    field = blank_texels(scene, views, len(views), OPTIONS)
+    halves = [of_size(view, 0.5) for view in views]
+    assert all(half.camera.width == round(0.5 * camera.width) for half, camera in zip(halves, cameras, strict=True))
+    found, at_full_size = 4 * coverage(scene, field, halves), coverage(scene, field, views)
+    assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
+    assert 0.95 < float(found.sum() / at_full_size.sum()) < 1.05
+    assert float((found - at_full_size).norm()) < 0.5 * float(at_full_size.norm())
+    assert 0.9 < len(field.texels) / len(whole.texels) < 1.1
 
 
 def test_views_that_were_not_looked_through_move_no_texel_far(textured, views) -> None:

@@ -11,13 +11,15 @@ without, with n surfels of which v are visible, b pairs of surfel and tile, f fr
 
 On a card 3840 x 2160 is drawn in any case. "frame" is the three stages launched by the host, "graph" the same as a CUDA
 graph, "packed" that with 8 bits per channel instead of floats, "waited for" the time of a program that waits for
-each frame.
+each frame. "ends at 0.002" is the packed graph where a pixel takes no more light at that transmittance instead of 1e-4,
+which may change it by half an 8-bit step of the brightest colour; "differs" is by how much it does.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -43,6 +45,8 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
+EARLY = 2e-3
+"""Transmittance at which a pixel that is drawn for speed takes no more light."""
 HEADER = (
     "scene",
     "size",
@@ -55,6 +59,8 @@ HEADER = (
     "graph ms",
     "packed, graph ms",
     "packed, waited for ms",
+    "ends at 0.002, graph ms",
+    "differs, 8-bit steps",
     "frames/s",
     "G fragments/s",
     "draw: of fp32",
@@ -123,16 +129,20 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
 
 def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
     """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of each column of the
-    table from `prepare` to `packed, waited for` ("alone")."""
+    table from `prepare` to `packed, waited for` ("alone") and of the frame whose pixels end early ("early"); and by how
+    many 8-bit steps this differs at most."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
-    sums = dict.fromkeys(("pairs", "fragments", "prepare", "bin", "draw", "frame", "graph", "packed", "alone"), 0.0)
+    stages = ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")
+    sums = dict.fromkeys(("pairs", "fragments", *stages), 0.0)
+    ending = replace(scene, transmittance_min=EARLY)
     for camera in cameras:
         sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
         frame = BakedRenderer(scene, width, height)
         recorded = BakedRenderer(scene, width, height, graph=card)
         packed = BakedRenderer(scene, width, height, images=("packed",), graph=card)
-        for renderer in (frame, recorded, packed):
+        early = BakedRenderer(ending, width, height, images=("packed",), graph=card)
+        for renderer in (frame, recorded, packed, early):
             renderer.draw([camera])
         sums["pairs"] += frame.workspace.pairs
         cases: list[tuple[str, Callable[[], object]]] = [
@@ -142,11 +152,14 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
             ("frame", frame.run),
             ("graph", recorded.run),
             ("packed", packed.run),
+            ("early", early.run),
         ]
         for stage, run in cases:
             sums[stage] += milliseconds(run, options)
         sums["alone"] += with_launches(packed.run, options)
-    return {key: value / len(cameras) for key, value in sums.items()}
+    images = [drawn.render_views(cameras, None, ("rgb",))["rgb"] for drawn in (scene, ending)]
+    steps = 255.0 * float((images[0] - images[1]).abs().max())
+    return {key: value / len(cameras) for key, value in sums.items()} | {"steps": steps}
 
 
 def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:
@@ -159,7 +172,8 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         f"{width} x {height}",
         number(mean["pairs"] / 1e6, 2),
         number(mean["fragments"] / pixels, 1),
-        *(number(mean[key], 3) for key in ("prepare", "bin", "draw", "frame", "graph", "packed", "alone")),
+        *(number(mean[key], 3) for key in ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")),
+        number(mean["steps"], 2),
         number(1e3 / mean["graph"], 0),
         number(mean["fragments"] / draw / 1e9, 1),
         f"{100 * 60 * mean['fragments'] / draw / rate:.0f} %",

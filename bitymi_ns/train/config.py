@@ -202,7 +202,7 @@ class TrainConfig:
     """Steps over which the learning rate of the texture field rises to its full value."""
     resolution_schedule: int = 3000
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Where
-    texels learn in the last part, runs of fewer than 30,000 steps wait longer, at most until then."""
+    texels learn in the last part, runs of fewer than 3,000 steps wait longer, at most until then."""
     small_photograph: int = 10_000
     """Pixels of a photograph with which they do not wait longer; with n times as many, by at most sqrt(n)."""
     num_downscales: int = 2

@@ -9,6 +9,8 @@ from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.options import check_ranges
 
+PATIENT_STEPS = 3000
+"""Steps of a run from which it has time for full size as early as the options say."""
 FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
 
 
@@ -54,7 +56,9 @@ class Schedule:
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
         apart, times = config.resolution_schedule, config.num_downscales if config.resolution_schedule > 0 else 0
         if times and self.texels_start < max_steps:
-            wait = min(self.short_run_gain, math.sqrt(pixels / config.small_photograph))
+            wait = min(
+                self.short_run_gain, math.sqrt(pixels / config.small_photograph), (PATIENT_STEPS / max_steps) ** 2
+            )
             apart = max(apart, min(apart * wait, config.texels.start / times))
         self._doublings = [self.scaled(apart * (i + 1)) for i in range(times)]
         self._last_part: Schedule | None = None
@@ -165,7 +169,8 @@ class Schedule:
         Doublings are `resolution_schedule` steps apart. Short runs whose texels learn in a last part of their own wait
         longer, by `short_run_gain`, though full size comes with the texels at the latest: what the surfels need to know
         before, smaller pictures show for less. Photographs that are small themselves show too little then, and their
-        runs wait less: by the square root of their pixels over `small_photograph`.
+        runs wait less: by the square root of their pixels over `small_photograph`. Longer runs learn more than smaller
+        pictures show: from 1,500 steps on they wait less, from `PATIENT_STEPS` on not at all.
         """
         return 2.0 ** -sum(step < at for at in self._doublings)
 

@@ -85,8 +85,9 @@ def doublings(config: TrainConfig, steps: int, pixels: float = 1e6) -> list[int]
 def test_short_runs_see_small_pictures_for_longer_but_their_texels_full_size():
     assert doublings(TrainConfig(), 30_000) == [3000, 6000]
     assert doublings(TrainConfig(), 60_000) == [6000, 12_000]
-    gain = Schedule(TrainConfig(), 3000).short_run_gain
-    assert gain > 2 and doublings(TrainConfig(), 3000) == [round(300 * gain), round(600 * gain)]
+    gain = Schedule(TrainConfig(), 1500).short_run_gain
+    assert gain > 2 and doublings(TrainConfig(), 1500) == [round(150 * gain), round(300 * gain)]
+    assert doublings(TrainConfig(), 3000) == [300, 600] and doublings(TrainConfig(), 2400) == [375, 750]
     assert doublings(TrainConfig(), 1200) == [360, 720] and doublings(TrainConfig(), 10) == [3, 6]
     assert doublings(TrainConfig(), 1200, 22_500) == [180, 360]
     assert doublings(TrainConfig(), 1200, 9_000) == doublings(TrainConfig(), 1200, 0.0) == [120, 240]

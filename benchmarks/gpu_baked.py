@@ -47,6 +47,8 @@ from bitymi_ns.scene.camera import Camera
 LARGE = (3840, 2160)
 EARLY = 2e-3
 """Transmittance at which a pixel that is drawn for speed takes no more light."""
+TIMED = ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")
+"""What `measured` times, in the order of the columns from "prepare ms" on."""
 HEADER = (
     "scene",
     "size",
@@ -133,8 +135,7 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
     many 8-bit steps this differs at most."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
-    stages = ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")
-    sums = dict.fromkeys(("pairs", "fragments", *stages), 0.0)
+    sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
     ending = replace(scene, transmittance_min=EARLY)
     for camera in cameras:
         sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
@@ -172,7 +173,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         f"{width} x {height}",
         number(mean["pairs"] / 1e6, 2),
         number(mean["fragments"] / pixels, 1),
-        *(number(mean[key], 3) for key in ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")),
+        *(number(mean[key], 3) for key in TIMED),
         number(mean["steps"], 2),
         number(1e3 / mean["graph"], 0),
         number(mean["fragments"] / draw / 1e9, 1),

@@ -54,13 +54,7 @@ class Schedule:
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
-        apart, times = config.resolution_schedule, config.num_downscales if config.resolution_schedule > 0 else 0
-        if times and self.texels_start < max_steps:
-            wait = min(
-                self.short_run_gain, math.sqrt(pixels / config.small_photograph), (PATIENT_STEPS / max_steps) ** 2
-            )
-            apart = max(apart, min(apart * wait, config.texels.start / times))
-        self._doublings = [self.scaled(apart * (i + 1)) for i in range(times)]
+        self._doublings = self._image_doublings(pixels)
         self._last_part: Schedule | None = None
         if self.texels_start < max_steps:
             slower = replace(config, lr=config.lr.times(config.texels.surfel_rates))
@@ -164,15 +158,26 @@ class Schedule:
         return min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
 
     def resolution_factor(self, step: int) -> float:
-        """Factor of the image size, 2^-k; 1 from the last doubling on.
-
-        Doublings are `resolution_schedule` steps apart. Short runs whose texels learn in a last part of their own wait
-        longer, by `short_run_gain`, though full size comes with the texels at the latest: what the surfels need to know
-        before, smaller pictures show for less. Photographs that are small themselves show too little then, and their
-        runs wait less: by the square root of their pixels over `small_photograph`. Longer runs learn more than smaller
-        pictures show: from 1,500 steps on they wait less, from `PATIENT_STEPS` on not at all.
-        """
+        """Factor of the image size, 2^-k; 1 from the last doubling on."""
         return 2.0 ** -sum(step < at for at in self._doublings)
+
+    def _image_doublings(self, pixels: float) -> list[int]:
+        """Steps from which the image size is doubled, `resolution_schedule` apart.
+
+        Short runs whose texels learn in a last part of their own wait longer, by `short_run_gain`, though full size
+        comes with the texels at the latest: what the surfels need to know before, smaller pictures show for less.
+        Photographs that are small themselves show too little then, and their runs wait less: by the square root of
+        their pixels over `small_photograph`. Longer runs learn more than smaller pictures show: from about 1,850 steps
+        on they wait less, from `PATIENT_STEPS` on not at all.
+        """
+        apart, count = self.config.resolution_schedule, self.config.num_downscales
+        if apart <= 0 or count <= 0:
+            return []
+        if self.texels_start < self.max_steps:
+            by_pixels = math.sqrt(pixels / self.config.small_photograph)
+            wait = min(self.short_run_gain, by_pixels, (PATIENT_STEPS / self.max_steps) ** 2)
+            apart = max(apart, min(apart * wait, self.config.texels.start / count))
+        return [self.scaled(apart * (i + 1)) for i in range(count)]
 
     def lr(self, name: str, step: int) -> float:
         """Learning rate of a parameter in this step.

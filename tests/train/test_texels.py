@@ -21,9 +21,9 @@ from bitymi_ns.train.texels import (
     coverage,
     in_one_view,
     looked_size,
-    of_size,
     tiles_as_seen,
 )
+from bitymi_ns.train.views import at_size
 
 OPTIONS = TexelConfig(start=18_000, pixels_per_texel=0.5)
 
@@ -111,7 +111,7 @@ def test_large_photographs_are_looked_through_at_half_their_size(textured, views
         assert looked_size(cameras) == size
     assert looked_size([]) == 1.0
     field = blank_texels(scene, views, len(views), OPTIONS)
-    halves = [of_size(view, 0.5) for view in views]
+    halves = [at_size(view, view.camera.scaled(0.5), "cpu") for view in views]
     assert all(half.camera.width == round(0.5 * camera.width) for half, camera in zip(halves, cameras, strict=True))
     found, at_full_size = 4 * coverage(scene, field, halves), coverage(scene, field, views)
     assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))

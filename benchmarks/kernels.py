@@ -20,7 +20,6 @@ bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels
   view colour backw.  (25 + 75 K) v; (56 K + 40) v
   trace               65 f + 80 v + v log2 v + 30 b; 84 f (written, then put in order) + 64 b + 16 v + 8 b
   trace backward      140 f; 20 f + 176 r (row of geom, 14 sums read and written) + 176 n
-  shade, no field     6 f; 32 f
   shade               6 f + (32 + 88 L + 512 + 32 L 4 + 128) t; 32 f + (44 + 128 L) t; 8 L t loads
                       88 L: cell, weights and interpolation; the rest: MLP of 4 L x 16 x 16 x 3
   shade backward,     6 f; 68 f + 36 n
@@ -30,6 +29,11 @@ bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels
                       write; 128 L are indices and weights written and read again)
   composite           9 f; 28 f + 40 p
   composite backward  14 f; 52 f + 20 p + 96 n
+  blend               15 f; 16 f + 40 p
+  blend backward      20 f; 20 f + 20 p + 108 n
+  blend, texels       15 f + 45 t; 16 f + 56 t + 40 p
+  blend backward,     20 f + 110 t; 28 f + 104 t + 20 p + 108 n
+    texels            (neighbouring texels are gathered from the cache, so loads are not counted)
   ssim                411 values (3 p) forward and backward; 88 bytes a value
   baked render        project + view colour + trace, of which 65 f without the fragment list (no 84 f), and
                       10 f + 70 t; 16 t bytes of texels, 20 p, 12 b; 4 t loads
@@ -44,8 +48,9 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads OpenMP
 
@@ -54,6 +59,7 @@ from common import number, page, publish, say, table
 
 from bitymi_ns import ops
 from bitymi_ns.bake.packing import pack
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.trace_cpu import tracers
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -65,6 +71,7 @@ WARM_UP = 2
 SITES = 7
 LEVELS = 4
 LOG2_TABLE = 17
+TILE_SIDE = 8
 
 
 @dataclass(frozen=True)
@@ -111,9 +118,6 @@ class Sizes:
     def trace_backward(self) -> Work:
         return Work(140 * self.f, 20 * self.f + 176 * self.r + 176 * self.n)
 
-    def shade_plain(self) -> Work:
-        return Work(6 * self.f, 32 * self.f)
-
     def shade(self) -> Work:
         textured = 32 + 88 * LEVELS + 2 * 16 * (4 * LEVELS + 16 + 3) + 32
         return Work(6 * self.f + textured * self.t, 32 * self.f + (44 + 128 * LEVELS) * self.t, 8.0 * LEVELS * self.t)
@@ -136,6 +140,18 @@ class Sizes:
 
     def composite_backward(self) -> Work:
         return Work(14 * self.f, 52 * self.f + 20 * self.p + 96 * self.n)
+
+    def blend(self) -> Work:
+        return Work(15 * self.f, 16 * self.f + 40 * self.p)
+
+    def blend_backward(self) -> Work:
+        return Work(20 * self.f, 20 * self.f + 20 * self.p + 108 * self.n)
+
+    def blend_texels(self) -> Work:
+        return self.blend() + Work(45 * self.t, 56 * self.t)
+
+    def blend_texels_backward(self) -> Work:
+        return self.blend_backward() + Work(110 * self.t, 8 * self.f + 104 * self.t)
 
     def ssim(self) -> Work:
         return Work(411 * 3 * self.p, 88 * 3 * self.p)
@@ -233,7 +249,11 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
 
     learning, frozen = shade(leaf, weights), shade(leaf, fixed)
     colors = frozen.detach().requires_grad_()
-    image = ops.composite_image(fragments, projection, colors)
+    geom = projection.geom.detach().requires_grad_()
+    at = replace(projection, geom=geom)
+    weight, uv = (values.detach().requires_grad_() for values in (fragments.weight, fragments.uv))
+    alone = replace(fragments, weight=weight, uv=uv, depth=fragments.depth.detach())
+    image = ops.composite_image(alone, at, colors)
     sizes = Sizes(
         n=len(scene),
         v=int(projection.visible.sum()),
@@ -261,6 +281,13 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
 
         return call
 
+    side = torch.full((len(scene), 2), TILE_SIDE, dtype=torch.int32)
+    tiles = ops.TexelTiles.of_sizes(side, projection.geom.new_full((len(scene),), SUPPORT))
+    texels = (torch.rand(tiles.count, 3, generator=gradient) - 0.5).requires_grad_()
+
+    def blend(*given: Any) -> torch.Tensor:
+        return ops.blended_image(alone, at, leaf, *given, bound=bound)
+
     def ssim() -> object:
         return torch.autograd.grad(ops.ssim(other, photo), other)
 
@@ -272,7 +299,6 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
         ("view colour backward", sizes.view_color_backward(), backward(base, (q["means"], *view))),
         ("trace", sizes.trace(), without_graph(lambda: ops.trace(projection, scene.config.rim))),
         ("trace backward", sizes.trace_backward(), backward(fragments.weight, (projection.geom,))),
-        ("shade, no field", sizes.shade_plain(), without_graph(lambda: ops.shade(fragments, leaf, frames))),
         ("shade", sizes.shade(), without_graph(lambda: shade(leaf, fixed))),
         ("shade backward, field frozen", sizes.shade_backward_frozen(), backward(frozen, (leaf,))),
         ("shade backward, field training", sizes.shade_backward(), backward(learning, (leaf, *weights))),
@@ -284,7 +310,15 @@ def cases(scene: Scene, camera: Camera) -> tuple[Sizes, list[tuple[str, Work, Ca
         (
             "composite backward",
             sizes.composite_backward(),
-            backward(image, (fragments.weight, projection.geom, colors)),
+            backward(image, (weight, geom, colors)),
+        ),
+        ("blend", sizes.blend(), without_graph(lambda: blend())),
+        ("blend backward", sizes.blend_backward(), backward(blend(), (alone.weight, geom, leaf))),
+        ("blend, texels", sizes.blend_texels(), without_graph(lambda: blend(texels, tiles))),
+        (
+            "blend backward, texels",
+            sizes.blend_texels_backward(),
+            backward(blend(texels, tiles), (alone.weight, alone.uv, geom, leaf, texels)),
         ),
         ("ssim forward + backward", sizes.ssim(), ssim),
         ("baked render, uint8 atlas", sizes.baked(), lambda: baked.render(camera)),

@@ -19,10 +19,9 @@ from bitymi_ns.ops import (
     TexelTiles,
     add_texel_coverage,
     add_texel_gradient,
-    composite_image,
+    blended_image,
     fitting_lists,
     project,
-    shade,
     texel_image,
     view_color,
 )
@@ -124,7 +123,7 @@ class TexelScene:
 
         def chosen_lists() -> Iterator[tuple[Fragments, Tensor]]:
             for fragments in fitting_lists(projection):
-                drawn.append(composite_image(fragments, projection, shade(fragments, base, projection.frames)))
+                drawn.append(blended_image(fragments, projection, base))
                 yield fragments, fragments.weight >= scene.weight_bound
                 del fragments  # before the next list is made
 

@@ -6,6 +6,7 @@ RuntimeError that says so. `baked.draw` draws a baked scene on both, by `baked_c
 """
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
+from .blend import blended_image
 from .composite import beta_map, composite, composite_image, soft_overdraw
 from .errors import TooManyFragments
 from .field import FieldGeometry, field
@@ -41,6 +42,7 @@ __all__ = [
     "add_texel_gradient",
     "band",
     "beta_map",
+    "blended_image",
     "by_bands",
     "composite",
     "composite_image",

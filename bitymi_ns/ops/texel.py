@@ -149,6 +149,23 @@ def _check(base: Tensor, texels: Tensor, tiles: TexelTiles) -> None:
         raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
 
 
+def check_texels(
+    fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles, descent: TexelDescent | None
+) -> None:
+    """Refuses what does not belong together; see `texel_colors`.
+
+    Raises:
+        ValueError: says what it is.
+    """
+    named = {"share": descent.share} if descent is not None else {}
+    on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
+    _check(base, texels, tiles)
+    if fragments.surfels != len(base):
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
+    if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
+        raise ValueError("texels that the backward pass moves are dense and ask for no gradient")
+
+
 class _TexelImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, base, texels, fragments, tiles, bound):
@@ -358,12 +375,6 @@ def texel_colors(
         ValueError: the tiles are not those of these texels or surfels, or the fragments those of others; or texels
             that ask for a gradient are to be moved; or tensors lie on several devices.
     """
-    named = {"share": descent.share} if descent is not None else {}
-    on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
-    _check(base, texels, tiles)
-    if fragments.surfels != len(base):
-        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
+    check_texels(fragments, base, texels, tiles, descent)
     uv = fragments.uv if move_surfels else fragments.uv.detach()
-    if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
-        raise ValueError("texels that the backward pass moves are dense and ask for no gradient")
     return _TexelColors.apply(base, texels, uv, fragments, tiles, bound, descent)

@@ -7,7 +7,16 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops import Fragments, TexelDescent, TexelTiles, shade, texel_colors
+from bitymi_ns.ops import (
+    Fragments,
+    Projection,
+    TexelDescent,
+    TexelTiles,
+    blended_image,
+    composite_image,
+    shade,
+    texel_colors,
+)
 from bitymi_ns.ops.constants import COLOR_BIAS, FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
@@ -17,18 +26,26 @@ from .config import SceneConfig
 class ResidualField(Protocol):
     """What colours the fragments of a scene beside the surfels' view colours."""
 
-    def shade(
-        self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
+    def image(
+        self,
+        fragments: Fragments,
+        projection: Projection,
+        base: Tensor,
+        bound: float,
+        learns: bool,
+        moves_surfels: bool,
+        maps: bool,
     ) -> Tensor:
-        """[F, 3] colours of the fragments, ReLU(ReLU(f_view + 0.5) + residual).
+        """[H * W, C] what `composite_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
 
         Args:
-            fragments: F fragments, of N surfels.
+            fragments: of an H x W view.
+            projection: the view's.
             base: [N, 3] f_view of every surfel.
-            frames: [N, 9] of the projection.
             bound: fragments of weight below this have no residual.
             learns: whether the residual gets gradients.
             moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
+            maps: also depth and normals.
         """
 
 
@@ -116,12 +133,20 @@ class HashField(nn.Module):
         """Table and MLP weights, in the order the operations take them."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
-    def shade(
-        self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
+    def image(
+        self,
+        fragments: Fragments,
+        projection: Projection,
+        base: Tensor,
+        bound: float,
+        learns: bool,
+        moves_surfels: bool,
+        maps: bool,
     ) -> Tensor:
         """See `ResidualField`."""
         weights = self.weights if learns else tuple(w.detach() for w in self.weights)
-        return shade(fragments, base, frames, self.geometry, weights, bound, moves_surfels)
+        colors = shade(fragments, base, projection.frames, self.geometry, weights, bound, moves_surfels)
+        return composite_image(fragments, projection, colors, maps)
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
@@ -191,13 +216,20 @@ class TexelField(nn.Module):
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
-    def shade(
-        self, fragments: Fragments, base: Tensor, frames: Tensor, bound: float, learns: bool, moves_surfels: bool
+    def image(
+        self,
+        fragments: Fragments,
+        projection: Projection,
+        base: Tensor,
+        bound: float,
+        learns: bool,
+        moves_surfels: bool,
+        maps: bool,
     ) -> Tensor:
         """See `ResidualField`."""
         descent = self.descent if learns else None
         texels = self.texels if learns and descent is None else self.texels.detach()
-        return texel_colors(fragments, base, texels, self.tiles, bound, moves_surfels, descent)
+        return blended_image(fragments, projection, base, texels, self.tiles, bound, maps, moves_surfels, descent)
 
     @torch.no_grad()
     def residual(self, fragments: Fragments, bound: float) -> Tensor:

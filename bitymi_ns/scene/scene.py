@@ -18,11 +18,10 @@ from bitymi_ns.ops import (
     TooManyFragments,
     band,
     beta_map,
+    blended_image,
     by_bands,
-    composite_image,
     project,
     refused,
-    shade,
     soft_overdraw,
     trace,
     view_color,
@@ -160,11 +159,10 @@ class Scene(nn.Module):
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
             fragments = trace(part, self.config.rim, most)
             if field is None:
-                colors = shade(fragments, base, part.frames)
+                image = blended_image(fragments, part, base, maps=maps)
             else:
                 moves = learns and self.config.residual_moves_surfels
-                colors = field.shade(fragments, base, part.frames, bound, learns, moves)
-            image = composite_image(fragments, part, colors, maps)
+                image = field.image(fragments, part, base, bound, learns, moves, maps)
             if beta_alone:
                 image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)
             if overdraw_half is not None:

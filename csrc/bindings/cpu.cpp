@@ -38,6 +38,13 @@ void set_up_process() {
   wait_without_spinning();
 }
 
+// Gives memory that was freed, but kept for the next views, back to the system.
+void give_back_memory() {
+#if defined(__GLIBC__)
+  malloc_trim(0);
+#endif
+}
+
 template <class Arguments>
 void bind_operation(nb::module_& m, const std::string& name, void (*run)(const Arguments&)) {
   m.def(name.c_str(), [name, run](const nb::kwargs& given) {
@@ -101,6 +108,8 @@ void bind_operations(nb::module_& m) {
   bind_tracer<S>(m);
   bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
   bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
+  bind_operation(m, name("blend_forward"), &blend_forward<S>);
+  bind_operation(m, name("blend_backward"), &blend_backward<S>);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }
 }  // namespace
@@ -133,6 +142,7 @@ NB_MODULE(BITYMI_MODULE, m) {
   m.attr("MAX_TERMS") = kMaxTerms, m.attr("LOG_TAU_MAX") = kLogTauMax, m.attr("SH_C0") = kShC0;
   m.attr("COLOR_BIAS") = kColorBias;
   m.def("set_up_process", &set_up_process, "Before the first kernel: threads that wait asleep, memory that is kept.");
+  m.def("give_back_memory", &give_back_memory, "What was freed and kept goes back to the system.");
   m.def("set_num_threads", &set_num_threads, "n"_a, "Threads of the kernels; 0 = as many as there are cores.");
   m.def("num_threads", &num_threads);
 }

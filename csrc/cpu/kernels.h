@@ -11,6 +11,7 @@
 #include "cpu/memory.h"
 #include "ops/appearance.h"
 #include "ops/baked.h"
+#include "ops/blend.h"
 #include "ops/field.h"
 #include "ops/texel.h"
 #include "ops/visibility.h"
@@ -95,7 +96,7 @@ struct TraceCopy {
     out.fields(r);
   }
 };
-// Large lists give their memory back.
+// Large lists give their memory back, block by block.
 template <class S>
 void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
 
@@ -132,6 +133,10 @@ template <class S>
 void texel_colors_forward(const TexelColorsForward<S>& a);
 template <class S>
 void texel_colors_backward(const TexelColorsBackward<S>& a);
+template <class S>
+void blend_forward(const BlendForward<S>& a);
+template <class S>
+void blend_backward(const BlendBackward<S>& a);
 template <class S>
 void ssim(const Ssim<S>& a);
 

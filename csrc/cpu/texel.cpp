@@ -2,58 +2,12 @@
 // differentiable.
 #include "core/texel.h"
 
-#include <numeric>
-
 #include "core/shading.h"
 #include "cpu/kernels.h"
+#include "cpu/runs.h"
 #include "cpu/threads.h"
 
 namespace bt {
-
-namespace {
-// Fragments of one surfel that follow each other, from `start[r]` to `start[r + 1]`; `order` sorts the runs by surfel.
-struct Runs {
-  const int32_t* surfel;  // of every fragment
-  const int64_t *start, *order;
-  int64_t count;
-
-  int64_t id(int64_t k) const { return surfel[start[order[k]]]; }
-};
-
-// fn(k, last) for the runs order[k] to order[last - 1] of every surfel. A thread takes whole surfels: what is added to
-// their tiles is added by it alone, and in the order of the list.
-template <class F>
-void for_surfels(const Runs& runs, F&& fn) {
-  std::vector<int64_t> cost(runs.count + 1, 0);
-  for (int64_t r = 0; r < runs.count; ++r)
-    cost[r + 1] = cost[r] + runs.start[runs.order[r] + 1] - runs.start[runs.order[r]];
-  parallel_tiles(cost.data(), runs.count, 1 << 20, [&](int, int64_t begin, int64_t end) {
-    while (begin > 0 && begin < runs.count && runs.id(begin) == runs.id(begin - 1)) ++begin;
-    while (end < runs.count && runs.id(end) == runs.id(end - 1)) ++end;
-    for (int64_t k = begin, last; k < end; k = last) {
-      for (last = k + 1; last < end && runs.id(last) == runs.id(k);) ++last;
-      fn(k, last);
-    }
-  });
-}
-
-// The runs of a fragment list of n surfels.
-struct FoundRuns {
-  std::vector<int64_t> start, order;
-
-  FoundRuns(const int32_t* surfel, int64_t fragments, int64_t n) : start{0} {
-    std::vector<int64_t> next(n + 1, 0);  // first the number of runs, then the place of a surfel's next one
-    for (int64_t i = 0; i < fragments; ++i) {
-      if (i + 1 < fragments && surfel[i + 1] == surfel[i]) continue;
-      start.push_back(i + 1);
-      ++next[surfel[i] + 1];
-    }
-    std::partial_sum(next.begin(), next.end(), next.begin());
-    order.resize(start.size() - 1);
-    for (size_t r = 0; r < order.size(); ++r) order[next[surfel[start[r]]]++] = int64_t(r);
-  }
-};
-}  // namespace
 
 template <class S>
 void texel_image_forward(const TexelForward<S>& a) {
@@ -149,11 +103,7 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
         if (duv) patch.uv_vjp(corners, g, duv[i], duv[f.total + i]);
       }
     if (dbase) store3(dbase + 3 * id, base_gradient(load3(table.base + 3 * id), sum));
-    if (!moved) return;
-    for (int64_t t = 0; t < area; ++t) {
-      S* at = moved + 3 * (patch.first + t);
-      store3(at, texel_step(load3(at), load3(dtile + 3 * t), a.rate, a.share[patch.first + t]));
-    }
+    if (moved) move_texels(moved + 3 * patch.first, dtile, a.rate, a.share + patch.first, area);
   });
 }
 

@@ -27,6 +27,12 @@ struct TexelTiles {
     r.rows("texels", values, texels, 3);
   }
 };
+// A backward pass that moves texels moves these, by a share of each, and keeps no gradient of them.
+template <class R, class S>
+void check_moved(R& r, const TexelTiles<S>& table, const S* moved, const S* share, const S* dtexels) {
+  if (moved && (moved != table.values || !share || dtexels))
+    r.refuse("what moves are the texels, by a share of each, and their gradient is not kept");
+}
 // What the fragments of one surfel share.
 template <class S>
 struct TexelPatch {
@@ -176,8 +182,7 @@ struct TexelColorsBackward {
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
     work.fields(r, sums_texels() ? of.table.texels : 0, of.table.n);
-    if (moved && (moved != of.table.values || !share || dtexels))
-      r.refuse("what moves are the texels, by a share of each, and their gradient is not kept");
+    check_moved(r, of.table, moved, share, dtexels);
   }
 };
 

@@ -144,11 +144,8 @@ def _by_kernels(
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.through_pixel)
     fragments = ops.trace(projection, rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
-    if way.texels:
-        colors = ops.texel_colors(fragments, base, leaves[TEXELS], tiles_of(leaves[TEXELS]))
-    else:
-        colors = ops.shade(fragments, base, projection.frames)
-    image = ops.composite_image(fragments, projection, colors, maps=True)
+    textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
+    image = ops.blended_image(fragments, projection, base, **textured, maps=True)
     shape = (case.width * case.height, len(leaves["means"]))
     blended, low_pass = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
     pixel, surfel = fragments.pixel.cpu().long(), fragments.surfel.cpu().long()

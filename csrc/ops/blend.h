@@ -1,0 +1,72 @@
+// Arguments of shading and blending in one pass over a fragment list.
+#pragma once
+
+#include "ops/texel.h"
+#include "ops/visibility.h"
+
+namespace bt {
+
+// Surfels with texels, or without any (sizes 0, 0), as a view shows them.
+template <class S>
+struct BlendedSurfels {
+  bool maps;
+  const S* geom;  // [n, kGeom]
+  int width, height;
+  Fragments<S, TileStarts> fragments;
+  S bound;
+  TexelTiles<S> table;
+
+  int64_t numbers() const { return int64_t(width) * height * (maps ? kMapChannels : kImageChannels); }
+  template <class R>
+  void fields(R& r) {
+    r.number("maps", maps);
+    r.number("width", width);
+    r.number("height", height);
+    r.number("bound", bound);
+    table.fields(r);
+    r.array("geom", geom, table.n * kGeom);
+    fragments.fields(r, table.n, width, height);
+  }
+};
+
+// image [height, width, channels]: the sums of core/blend.h, with the colours of TexelColorsForward. Written.
+template <class S>
+struct BlendForward {
+  BlendedSurfels<S> of;
+  S* image;
+
+  template <class R>
+  void fields(R& r) {
+    of.fields(r);
+    r.array("image", image, of.numbers());
+  }
+};
+
+// dweight [F], ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and
+// what is given of duv [2, F] and dtexels [texels, 3]. `moved`, `share` and `rate` are those of TexelColorsBackward.
+template <class S>
+struct BlendBackward {
+  BlendedSurfels<S> of;
+  const S *dimage, *share;
+  S rate;
+  S *dweight, *duv, *ddepth, *dgeom, *dbase, *dtexels, *moved;
+
+  template <class R>
+  void fields(R& r) {
+    of.fields(r);
+    const int64_t total = of.fragments.f.total, n = of.table.n;
+    r.array("dimage", dimage, of.numbers());
+    r.array("dweight", dweight, total);
+    r.maybe("duv", duv, 2 * total);
+    of.maps ? r.array("ddepth", ddepth, total) : r.maybe("ddepth", ddepth, total);
+    r.array("dgeom", dgeom, n * kGeom);
+    r.array("dbase", dbase, 3 * n);
+    r.maybe("dtexels", dtexels, 3 * of.table.texels);
+    r.maybe("moved", moved, 3 * of.table.texels);
+    r.maybe("share", share, of.table.texels);
+    r.number("rate", rate);
+    check_moved(r, of.table, moved, share, dtexels);
+  }
+};
+
+}  // namespace bt

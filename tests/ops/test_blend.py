@@ -1,0 +1,172 @@
+"""Shading and blending in one pass: against the operations it stands for, finite differences and the golden render."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops import backend
+from tests.ops.golden import SURFEL_KEYS, SceneCase, camera_of, load_golden, random_scene
+
+SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
+BOUND = 0.03
+
+
+class View:
+    """A view of a random scene, with everything that learns as leaves."""
+
+    def __init__(self, case: SceneCase, dtype: torch.dtype, textured: bool, learns: bool = True) -> None:
+        n = len(case.params["means"])
+        g = torch.Generator().manual_seed(n)
+
+        def uniform(low: float, high: float, *shape: int) -> Tensor:
+            return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(dtype)
+
+        self.camera = camera_of(case, dtype)
+        self.leaves = [case.params[key].to(dtype).clone().requires_grad_() for key in SURFEL_KEYS]
+        self.base = uniform(-0.9, 0.5, n, 3).requires_grad_()
+        self.leaves.append(self.base)
+        self.given: dict[str, Tensor | ops.TexelTiles] = {}
+        if textured:
+            size = torch.tensor(SIZES, dtype=torch.int32).repeat(n // len(SIZES) + 1, 1)[:n]
+            tiles = ops.TexelTiles.of_sizes(size, uniform(1.0, 3.0, n))
+            texels = uniform(-0.6, 0.6, tiles.count, 3).requires_grad_(learns)
+            self.given = {"texels": texels, "tiles": tiles}
+            if learns:
+                self.leaves.append(texels)
+
+    def fragments(self) -> tuple[ops.Fragments, ops.Projection]:
+        projection = ops.project(*self.leaves[: len(SURFEL_KEYS)], self.camera)
+        return ops.trace(projection), projection
+
+    def image(self, maps: bool = False, moves: bool = True, descent: ops.TexelDescent | None = None) -> Tensor:
+        fragments, projection = self.fragments()
+        options = {"bound": BOUND, "move_surfels": moves, "descent": descent} if self.given else {}
+        return ops.blended_image(fragments, projection, self.base, **self.given, **options, maps=maps)
+
+    def one_by_one(self, maps: bool = False, moves: bool = True) -> Tensor:
+        fragments, projection = self.fragments()
+        if self.given:
+            colors = ops.texel_colors(fragments, self.base, **self.given, bound=BOUND, move_surfels=moves)
+        else:
+            colors = ops.shade(fragments, self.base, projection.frames)
+        return ops.composite_image(fragments, projection, colors, maps)
+
+    def gradients(self, image: Tensor) -> list[Tensor]:
+        towards = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image).to(image)
+        return list(torch.autograd.grad(image, self.leaves, towards))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize("maps", [False, True], ids=["image", "maps"])
+@pytest.mark.parametrize("textured, moves", [(False, True), (True, True), (True, False)])
+def test_it_is_shading_and_compositing(textured: bool, moves: bool, maps: bool, dtype: torch.dtype) -> None:
+    view = View(random_scene(60, 3, width=70, height=40), dtype, textured)
+    got, want = view.image(maps, moves), view.one_by_one(maps, moves)
+    assert got.shape == (70 * 40, 9 if maps else 5)
+    tolerance = 1e-11 if dtype == torch.float64 else 2e-4
+    torch.testing.assert_close(got, want, rtol=0.01 * tolerance, atol=0.01 * tolerance)
+    for mine, theirs in zip(view.gradients(got), view.gradients(want), strict=True):
+        assert theirs.abs().max() > 1e-3
+        torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance * float(theirs.abs().max()))
+
+
+def test_texels_that_do_not_learn_have_no_gradient_and_move_surfels() -> None:
+    case = random_scene(60, 3, width=70, height=40)
+    fixed, learning = View(case, torch.float64, True, learns=False), View(case, torch.float64, True)
+    mine, theirs = fixed.gradients(fixed.image()), learning.gradients(learning.image())
+    assert len(mine) == len(theirs) - 1
+    for a, b in zip(mine, theirs, strict=False):
+        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+
+
+def test_a_descent_moves_the_texels_by_their_gradient() -> None:
+    case = random_scene(60, 3, width=70, height=40)
+    learning, moving = View(case, torch.float64, True), View(case, torch.float64, True, learns=False)
+    *surfels, dtexels = learning.gradients(learning.image())
+    texels = moving.given["texels"]
+    before, share = texels.clone(), torch.linspace(0.1, 2.0, len(texels), dtype=torch.float64)
+    moved = moving.gradients(moving.image(descent=ops.TexelDescent(share, 0.3)))
+    assert all(torch.equal(a, b) for a, b in zip(moved, surfels, strict=True))  # by the texels before they moved
+    torch.testing.assert_close(texels, before - 0.3 * share[:, None] * dtexels, rtol=1e-12, atol=1e-12)
+    with pytest.raises(ValueError, match="ask for no gradient"):
+        learning.image(descent=ops.TexelDescent(share, 0.3))
+
+
+@pytest.mark.parametrize("textured", [False, True], ids=["surfels", "texels"])
+def test_gradients_by_finite_differences(textured: bool) -> None:
+    view = View(random_scene(6, 5, width=12, height=9, scale=0.4), torch.float64, textured)
+    with torch.no_grad():
+        fragments, projection = view.fragments()
+    leaves = [fragments.weight, fragments.depth, view.base]
+    leaves += [view.given["texels"]] if textured else []
+    leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
+
+    def image(weight: Tensor, depth: Tensor, base: Tensor, *texels: Tensor) -> Tensor:
+        given = {"texels": texels[0], "tiles": view.given["tiles"]} if texels else {}
+        listed = replace(fragments, weight=weight, depth=depth)
+        return ops.blended_image(listed, projection, base, **given, maps=True)
+
+    assert torch.autograd.gradcheck(image, leaves)
+
+
+def test_the_golden_image_and_the_gradients_of_its_texels() -> None:
+    golden = load_golden("textured")
+    sizes = torch.tensor([[tile.shape[1], tile.shape[0]] for tile in golden.tiles])
+    tiles = ops.TexelTiles.of_sizes(sizes, torch.full((len(sizes),), 3.0, dtype=torch.float64))
+    texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).requires_grad_()
+    camera = camera_of(golden)
+    projection = ops.project(*(golden.params[key] for key in SURFEL_KEYS), camera)
+    base = ops.view_color("sv", golden.params, golden.params["means"], camera.center)
+    image = ops.blended_image(ops.trace(projection), projection, base, texels, tiles)
+    rgb = image[:, :3].view_as(golden.outputs["rgb"])
+    alpha = image[:, 3:4].view(*rgb.shape[:2], 1)
+    torch.testing.assert_close(rgb + (1 - alpha) * golden.background, golden.outputs["rgb"], rtol=1e-11, atol=1e-12)
+    (rgb * golden.loss_weights["rgb"]).sum().backward()
+    want = torch.cat([grad.reshape(-1, 3) for grad in golden.tile_grads])
+    torch.testing.assert_close(texels.grad, want, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("textured", [False, True], ids=["surfels", "texels"])
+def test_threads_change_no_more_than_the_order_of_sums(textured: bool) -> None:
+    """Not even that where texels learn."""
+    view = View(random_scene(300, 3, width=150, height=90), torch.float32, textured)
+    with torch.no_grad():
+        fragments, projection = view.fragments()
+    results = []
+    for threads in (1, 2, 3, 7):
+        backend.module(torch.device("cpu")).set_num_threads(threads)
+        leaves = [view.base, projection.geom.requires_grad_(), fragments.weight.requires_grad_()]
+        leaves += [fragments.uv.requires_grad_(), view.given["texels"]] if textured else []
+        image = ops.blended_image(fragments, projection, view.base, **view.given, maps=True)
+        results.append([image, *torch.autograd.grad(image.square().sum(), leaves)])
+    backend.module(torch.device("cpu")).set_num_threads(0)
+    for other in results[1:]:
+        assert torch.equal(other[0], results[0][0])
+        for a, b in zip(other, results[0], strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+            assert not textured or torch.equal(a, b)
+
+
+@pytest.mark.parametrize("textured", [False, True], ids=["surfels", "texels"])
+def test_a_view_that_shows_nothing(textured: bool) -> None:
+    case = random_scene(60, 3, width=70, height=40)
+    case.params["opacity_logits"].fill_(-20)
+    view = View(case, torch.float32, textured)
+    image = view.image(maps=True)
+    assert not image.any() and not any(gradient.any() for gradient in view.gradients(image))
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    view = View(random_scene(60, 3, width=70, height=40), torch.float32, True)
+    fragments, projection = view.fragments()
+    with pytest.raises(ValueError, match="the tiles hold"):
+        ops.blended_image(fragments, projection, view.base, view.given["texels"][1:], view.given["tiles"])
+    with pytest.raises(ValueError, match="base must have shape"):
+        ops.blended_image(fragments, projection, view.base[1:])
+    with pytest.raises(ValueError, match="fragments are those of 61 surfels, not of 60"):
+        ops.blended_image(replace(fragments, surfels=61), projection, view.base, **view.given)

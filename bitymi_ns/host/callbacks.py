@@ -117,8 +117,8 @@ class TrainingRun:
             train = self.datamanager.train_dataset.cameras
             cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1]))
             learns = scene.config.texture == "texels"
-            pixels = config.texels.pixels_per_texel if learns else 0.0
-            state_training(scene, cameras, self.training.strategy.most, pixels, processes.count)
+            texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
+            state_training(scene, cameras, self.training.strategy.most, texels, to_come, processes.count)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

@@ -18,7 +18,8 @@ from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
-from bitymi_ns.train.texels import SMALLEST
+from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import REDUCED_BYTES
 
 COUNTED_VIEWS = 3
@@ -27,15 +28,17 @@ MARGIN = 1.1
 """Factor by which another view may have more fragments than the counted ones."""
 PROGRAM = 800e6
 """Bytes of Python, the libraries, and a capture's cameras and points."""
-PER_FRAGMENT = 56
-"""Bytes: a list and the kernel's copy of it; or the list, its colours, and their gradients in the backward pass."""
+PER_FRAGMENT = 44
+"""Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
+PER_SHADED_FRAGMENT = 24
+"""Bytes more where a field in space shades: colours, and their gradients."""
 PER_PIXEL = 400
 """Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
-PER_TEXEL = 52
-"""Bytes in training: the texel, how far it moves, and the two states that a run could go back to."""
+PER_TEXEL = 28
+"""Bytes in training: the texel, how far it moves, and the two states in half precision that a run could go back to."""
 PER_BAKED_TEXEL = 96
 """Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
 VIEWS_OF_TEXELS = 12
@@ -60,7 +63,12 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
 
 
 def state_training(
-    scene: Scene, cameras: Sequence[Camera], most_surfels: int, pixels_per_texel: float = 0.0, processes: int = 1
+    scene: Scene,
+    cameras: Sequence[Camera],
+    most_surfels: int,
+    texels: TexelConfig | None = None,
+    to_come: int = 0,
+    processes: int = 1,
 ) -> None:
     """Say what a training run will take.
 
@@ -68,17 +76,19 @@ def state_training(
         scene: as the run finds it.
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
-        pixels_per_texel: of texels that will learn; 0 = none will.
+        texels: of those that will learn; None = none will.
+        to_come: views that they learn from, each counted as often as it is looked at.
         processes: of the run, each of which takes as much.
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
-    needed = PROGRAM + kept + PER_PIXEL * pixels + PER_FRAGMENT * fragments
+    needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
     surfels = max(len(scene), most_surfels)
     needed += PER_SURFEL * surfels
-    if pixels_per_texel > 0:
-        needed += PER_TEXEL * (SMALLEST**2 * surfels + VIEWS_OF_TEXELS * pixels / pixels_per_texel)
+    if texels is not None:
+        most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
+        needed += PER_TEXEL * (SMALLEST**2 * surfels + most)
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
     _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
 
@@ -94,11 +104,15 @@ def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float,
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
-    needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels + PER_FRAGMENT * most_fragments(scene, cameras)
-    needed += PER_SURFEL * learning
+    needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels
+    needed += _per_fragment(scene) * most_fragments(scene, cameras) + PER_SURFEL * learning
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
+
+
+def _per_fragment(scene: Scene) -> float:
+    return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 
 def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:

@@ -98,6 +98,13 @@ def _set_up_process() -> None:
     load("_cpu").set_up_process()
 
 
+def give_back_memory() -> None:
+    """What the process has freed, but keeps for the next views, goes back to the system. For where another part of a
+    run begins, whose views are of other sizes."""
+    if _set_up_process.cache_info().currsize:  # the CPU kernels have been asked for
+        load("_cpu").give_back_memory()
+
+
 def cuda_backend(device: torch.device) -> bool:
     """Whether tensors on that device go to the CUDA kernels (or to their emulation)."""
     return device.type == "cuda" or _emulated

@@ -46,7 +46,7 @@ class SceneConfig:
     as what they cover of each pixel, with the right moments (docs/numerics.md)."""
     max_fragments: int = 0
     """Fragments that are kept at once. Views with more are drawn in bands, which the backward pass draws once more. 0:
-    on a GPU as many as its memory holds, on the CPU 2^25, which take 1.9 GB."""
+    on a GPU as many as its memory holds, on the CPU 2^25, which take 1.5 GB."""
     rim: float = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
 

@@ -163,6 +163,9 @@ class TexelConfig(TexelSteps):
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: float = 0.25
     """A tile has at most a texel for so many pixels that its surfel makes up of the view that shows most of it."""
+    looked_pixels_per_texel: float = 32.0
+    """Where there would be more than 8 million texels, tiles together have at most one for so many pixels that the
+    steps of that part look at: more take memory that they are not worth."""
     largest: int = 64
     """Largest side of a tile, texels, a power of two."""
     views: float = 0.25

@@ -247,7 +247,8 @@ class Guard:
             self._best = min(self._best, mean)
         self._convert(step)
         if not last and not (enough and mean > self._limit):  # a state that will be good enough later as well
-            self._states = [*self._states[-1:], (step + 1, self._capture())]
+            self._states = self._states[-1:]  # before the next one is made: they are large
+            self._states.append((step + 1, self._capture()))
         return {}
 
     def _field_is_finite(self) -> bool:
@@ -279,12 +280,16 @@ class Guard:
         return {"rolled_back": float(step - origin), "rates": self.factor, "surfels": float(len(self.scene))}
 
     def _capture(self) -> dict[str, Any]:
-        # what never changes in place is kept once for all states: a long run has more texels than anything else
-        steady = [f"field.{name}" for name in TexelField.STEADY] if isinstance(self.scene.field, TexelField) else []
+        scene = {name: value.detach() for name, value in self.scene.state_dict().items()}
+        # A long run has more texels than anything else. What never changes in place is kept once for all states, and
+        # the texels in half precision: going back is no resuming, and 2^-11 of a residual is nothing to see.
+        textured = isinstance(self.scene.field, TexelField)
+        steady = {f"field.{name}" for name in TexelField.STEADY} if textured else set()
+        texels = {"field.texels"} if textured else set()
         return {
             "scene": {
-                name: value.detach() if name in steady else value.detach().clone()
-                for name, value in self.scene.state_dict().items()
+                name: value if name in steady else value.half() if name in texels else value.clone()
+                for name, value in scene.items()
             },
             "optimizers": {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),

@@ -50,6 +50,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "texels.prior": (TINY, MOST),
     "texels.surfel_rates": (0, MOST),
     "texels.pixels_per_texel": (TINY, MOST),
+    "texels.looked_pixels_per_texel": (TINY, MOST),
     "texels.largest": (4, 4096),
     "texels.views": (0, MOST),
     "freeze_after": (0, MOST),

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from bitymi_ns.ops.backend import give_back_memory
 from bitymi_ns.train.clock import Stopwatch
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.errors import TrainingDiverged
@@ -154,8 +155,12 @@ class Training:
             device = self.scene.surfels["means"].device
             found = self.processes.from_first(self.exposure.state_dict(), device)
             self.exposure.load_state_dict(found, len(self._full_size), device)
-        if self.texels.begin(step, self.views):
+        grows = step > 0 and self.schedule.resolution_factor(step) != self.schedule.resolution_factor(step - 1)
+        began = self.texels.begin(step, self.views)
+        if began:
             self.guard.start_from_here()
+        if began or grows:
+            give_back_memory()
         self.guard.before(step, self.views)
         self._set_rates()
 

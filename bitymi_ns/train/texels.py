@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -34,6 +35,10 @@ FEWEST_VIEWS = 32
 """That are looked through for the tiles, however short the run."""
 SMALLEST = 4
 """Side of the smallest tile, texels: a block of BC7."""
+FEW = 1 << 23
+"""Texels that no run is too short for: 235 MB."""
+FEWER = 0.8
+"""Factor by which tiles get fewer texels, as often as it takes until all are few enough."""
 LEAST_SHARE = 0.25
 """What a texel counts as seen by, at least, where not all views are looked through: this share of what one view can
 show of it. So no step is much longer than four times the rate. With all of it, texels that others hide learn too
@@ -64,13 +69,20 @@ class LearningTexels:
         most = max(FEWEST_VIEWS, round(self.options.views * (self.schedule.max_steps - self.schedule.texels_start)))
         count = min(most, len(views))
         some = OnDemand(count, lambda i: views.at(i * len(views) // count, 1.0))
-        field = blank_texels(self.scene, some, len(views), self.options) if self.processes.first else None
+        field = None
+        if self.processes.first:
+            field = blank_texels(self.scene, some, len(views), self.options, self.views_to_come)
         if self.processes.count > 1:
             device = self.scene.surfels["means"].device
             found = self.processes.from_first(None if field is None else field.state_dict(), device)
             field = TexelField(found["size"], found["extent"], found["texels"], found["share"])
         self.scene.field = field
         return True
+
+    @property
+    def views_to_come(self) -> int:
+        """Views that all steps of this part look at, each counted as often as it is looked at."""
+        return self.processes.views * (self.schedule.max_steps - self.schedule.texels_start)
 
     def prepare(self, step: int, view: View, factor: float) -> None:
         """Says how the backward pass of a step on this view moves the texels.
@@ -106,7 +118,9 @@ class LearningTexels:
 
 
 @torch.no_grad()
-def blank_texels(scene: Scene, views: Sequence[View], count: int, options: TexelConfig) -> TexelField:
+def blank_texels(
+    scene: Scene, views: Sequence[View], count: int, options: TexelConfig, to_come: float = math.inf
+) -> TexelField:
     """A tile for every surfel, with residuals of 0.
 
     A surfel of which no view shows a residual has one texel.
@@ -116,6 +130,7 @@ def blank_texels(scene: Scene, views: Sequence[View], count: int, options: Texel
         views: those that are looked through, at full size; their pictures do not matter.
         count: of all training views, which these stand for.
         options: see `TexelConfig`.
+        to_come: views that the texels learn from, each counted as often as it is looked at.
     """
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
@@ -124,7 +139,7 @@ def blank_texels(scene: Scene, views: Sequence[View], count: int, options: Texel
     smaller = [camera.scaled(size_looked) for camera in cameras]
     seen = visibility(surfels, smaller, scene.near, bound, scene.config.through_pixel)
     seen = replace(seen, pixels=seen.pixels / size_looked**2)
-    size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options)
+    size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options, to_come)
     field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
     looked = OnDemand(len(views), lambda i: at_size(views[i], smaller[i], extent.device))
     seen_in_all = coverage(scene, field, looked) * (count / max(1, len(views)) / size_looked**2)
@@ -133,6 +148,11 @@ def blank_texels(scene: Scene, views: Sequence[View], count: int, options: Texel
         seen_in_all = torch.maximum(seen_in_all, least)
     field.share.copy_(1.0 / (seen_in_all + options.prior))
     return field
+
+
+def most_texels(options: TexelConfig, looked_at: float) -> float:
+    """Texels of all tiles, for a part whose steps look at so many pixels."""
+    return max(FEW, looked_at / options.looked_pixels_per_texel)
 
 
 def looked_size(cameras: Sequence[Camera]) -> float:
@@ -174,6 +194,7 @@ def tiles_as_seen(
     near: float,
     weight_bound: float,
     options: TexelConfig,
+    to_come: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
     """Tiles that reach as far as fragments reach the weight bound, with at most a texel for so many pixels of the view
     that shows most of the surfel.
@@ -185,13 +206,19 @@ def tiles_as_seen(
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
         options: see `TexelConfig`.
+        to_come: views that the texels learn from, each counted as often as it is looked at.
 
     Returns:
         sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 where no fragment reaches the bound.
     """
     extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
     size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
-    size = coarsened(size, seen.pixels / options.pixels_per_texel, SMALLEST)
+    pixels = sum(camera.width * camera.height for camera in cameras) / max(1, len(cameras))
+    texels, most = seen.pixels / options.pixels_per_texel, most_texels(options, to_come * pixels)
+    size = coarsened(size, texels, SMALLEST)
+    while int(size.long().prod(1).sum()) > most and int(size.max()) > SMALLEST:
+        texels = FEWER * texels
+        size = coarsened(size, texels, SMALLEST)
     size[extent <= 0] = 1
     return size, torch.where(extent > 0, extent, torch.full_like(extent, SUPPORT))
 

@@ -12,6 +12,8 @@ from bitymi_ns.host import memory
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene import Camera, Scene
 from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train import texels
+from bitymi_ns.train.config import TexelConfig
 from tests.scene import bands
 
 CPU = torch.device("cpu")
@@ -56,12 +58,16 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     monkeypatch.setattr(memory, "PER_FRAGMENT", 1e6)
     memory.state_training(one, [camera], 0)
     assert gigabytes(said(capsys)) == pytest.approx(0.8 + 1e-3 * memory.MARGIN * count, abs=0.1)
-    memory.state_training(one, [camera], 0, pixels_per_texel=2.0)
-    monkeypatch.setattr(memory, "PER_TEXEL", 1e6)
-    memory.state_training(one, [camera], 0, pixels_per_texel=2.0)
-    few, many = said(capsys).split("Training will take")[1:]
-    texels = memory.SMALLEST**2 * len(one) + memory.VIEWS_OF_TEXELS * camera.width * camera.height / 2.0
-    assert gigabytes(many) - gigabytes(few) == pytest.approx(1e-3 * texels, rel=0.1)
+    monkeypatch.setattr(texels, "FEW", 0)
+    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    for to_come, views in ((1000, memory.VIEWS_OF_TEXELS / 2.0), (20, 2.0)):
+        monkeypatch.setattr(memory, "PER_TEXEL", 0)
+        memory.state_training(one, [camera], 0, options, to_come)
+        monkeypatch.setattr(memory, "PER_TEXEL", 1e6)
+        memory.state_training(one, [camera], 0, options, to_come)
+        few, many = said(capsys).split("Training will take")[1:]
+        most = memory.SMALLEST**2 * len(one) + views * camera.width * camera.height
+        assert gigabytes(many) - gigabytes(few) == pytest.approx(1e-3 * most, rel=0.1)
     large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs alone: more than are kept
     monkeypatch.setattr(memory, "most_fragments", lambda *_: 0)
     needed = []

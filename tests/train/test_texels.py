@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.texels import (
     LEAST_SHARE,
+    SMALLEST,
     blank_texels,
     coverage,
     in_one_view,
@@ -80,6 +82,25 @@ def test_every_surfel_gets_a_tile_as_fine_as_it_is_seen(textured, views) -> None
         sizes.append(area)
     assert (sizes[0] >= sizes[1]).all() and (sizes[1] >= sizes[2]).all() and sizes[0].sum() > 2 * sizes[2].sum()
     assert sizes[0][0] <= 16
+
+
+def test_there_are_no_more_texels_than_a_run_can_use(textured, views, monkeypatch) -> None:
+    scene, cameras = textured(), [view.camera for view in views]
+    pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
+    options = replace(OPTIONS, pixels_per_texel=0.01, looked_pixels_per_texel=8.0)
+    free = blank_texels(scene, views, len(views), options, to_come=1)  # few enough for any run
+    smallest = SMALLEST**2 * len(scene)
+    assert len(free.texels) > 2 * smallest
+    monkeypatch.setattr(texels, "FEW", smallest)
+    for share in (0.5, 0.8, 2.0):
+        to_come = share * len(free.texels) * options.looked_pixels_per_texel / pixels
+        bound = blank_texels(scene, views, len(views), options, to_come)
+        if share < 1:
+            assert 0.5 * share * len(free.texels) < len(bound.texels) <= share * len(free.texels)
+            assert (bound.size <= free.size).all()
+        else:
+            assert torch.equal(bound.size, free.size)
+    assert len(blank_texels(scene, views, len(views), options, to_come=0).texels) <= smallest
 
 
 def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None:
@@ -191,6 +212,8 @@ def test_a_run_that_diverges_goes_back_to_its_texels(textured, views) -> None:
         scene.surfels["means"][:] = float("nan")
     with pytest.warns(UserWarning, match="back to the state"):
         trainer.advance()
+    kept = trainer.training.guard._states[0][1]["scene"]["field.texels"]
+    assert kept.dtype == torch.float16 and torch.equal(scene.field.texels, kept.float())
     assert all(torch.isfinite(p).all() for p in scene.parameters())
     assert len(scene.field.size) == len(scene) and len(scene.field.texels) == scene.field.tiles.count
     trainer.advance()

@@ -28,7 +28,7 @@ from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import TrainingData, View
+from bitymi_ns.train.views import TrainingData, View, covered_share
 
 
 class TrainingRun:
@@ -72,6 +72,7 @@ class TrainingRun:
             scene_extent(metadata["camera_centers"], scene.surfels["means"]),
             metadata["train_pixels"],
             metadata["first_surfels"],
+            covered_share(self.datamanager.train_views),
             stops_of(self.datamanager.train_dataset.image_filenames),
         )
         optimizers = attributes.optimizers.optimizers

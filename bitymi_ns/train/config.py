@@ -207,7 +207,8 @@ class TrainConfig:
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Where
     texels learn in the last part, runs of fewer than 3,000 steps wait longer, at most until then."""
     small_photograph: int = 10_000
-    """Pixels of a photograph with which they do not wait longer; with n times as many, by at most sqrt(n)."""
+    """Pixels of a photograph, of those that show something, with which they do not wait longer; with n times as many,
+    by at most sqrt(n)."""
     num_downscales: int = 2
     """How many times the image size is halved at the start."""
     init_opacity: float = 0.1

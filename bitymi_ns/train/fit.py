@@ -18,7 +18,7 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import TrainingData, View, training_order
+from bitymi_ns.train.views import TrainingData, View, covered_share, training_order
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
@@ -88,7 +88,7 @@ class Trainer:
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
         pixels = sum(view.camera.width * view.camera.height for view in views)
-        data = TrainingData(views, extent, pixels, len(scene))
+        data = TrainingData(views, extent, pixels, len(scene), covered_share(views))
         self.training = Training(scene, data, self.optimizers, config, max_steps, processes=processes)
         self.step = 0
         self._views = len(views)

@@ -34,7 +34,7 @@ class Schedule:
             max_steps: length of the run in steps.
             extent: scene extent in world units; the learning rate of the means is in multiples of it.
             texels: whether texels learn in the last part of the run.
-            pixels: of a photograph, on average.
+            pixels: of a photograph that show something, on average.
         """
         if max_steps < 1:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
@@ -166,9 +166,9 @@ class Schedule:
 
         Short runs whose texels learn in a last part of their own wait longer, by `short_run_gain`, though full size
         comes with the texels at the latest: what the surfels need to know before, smaller pictures show for less.
-        Photographs that are small themselves show too little then, and their runs wait less: by the square root of
-        their pixels over `small_photograph`. Longer runs learn more than smaller pictures show: from about 1,850 steps
-        on they wait less, from `PATIENT_STEPS` on not at all.
+        Photographs that are small themselves, or show something in few of their pixels, show too little then, and
+        their runs wait less: by the square root of these pixels over `small_photograph`. Longer runs learn more than
+        smaller pictures show: from about 1,850 steps on they wait less, from `PATIENT_STEPS` on not at all.
         """
         apart, count = self.config.resolution_schedule, self.config.num_downscales
         if apart <= 0 or count <= 0:

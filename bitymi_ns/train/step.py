@@ -114,7 +114,8 @@ class Training:
         """
         self.scene, self.optimizers, self.config, self.processes = scene, optimizers, config, processes
         textured = scene.config.texture == "texels"
-        self.schedule = Schedule(config, max_steps, data.extent, textured, data.image_pixels / max(1, len(data.views)))
+        pixels = data.covered * data.image_pixels / max(1, len(data.views))
+        self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
         self.schedule.reset_opacity()
         for name in optimizers:
             self.schedule.lr(name, 0)

@@ -19,6 +19,10 @@ REDUCED_BYTES = 1 << 28
 """Memory for reduced pictures on the CPU; the others are reduced anew at every use."""
 
 
+COVERED_VIEWS = 8
+"""In which it is counted what the photographs show."""
+
+
 class View(NamedTuple):
     """One photograph.
 
@@ -63,6 +67,7 @@ class TrainingData:
         extent: scene extent in world units (`init.scene_extent`).
         image_pixels: of all training views together.
         first_surfels: that training starts, or started, with.
+        covered: share of their pixels that show something (`covered_share`).
         exif_stops: log2 of the exposure of each photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
     """
 
@@ -70,7 +75,22 @@ class TrainingData:
     extent: float
     image_pixels: int
     first_surfels: int
+    covered: float = 1.0
     exif_stops: Sequence[float] | None = None
+
+
+def covered_share(views: Sequence[View]) -> float:
+    """Share of the pixels that count and are not transparent, in a few of the views."""
+    count = min(len(views), COVERED_VIEWS)
+    return sum(_covered(views[i * len(views) // count]) for i in range(count)) / max(1, count)
+
+
+def _covered(view: View) -> float:
+    shows = None if view.image.shape[-1] < 4 else view.image[..., 3] > 0
+    if view.mask is not None:
+        counts = view.mask.reshape(view.mask.shape[:2])
+        shows = counts if shows is None else shows & counts
+    return 1.0 if shows is None else float(shows.float().mean())
 
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:

@@ -19,6 +19,20 @@ from bitymi_ns.train.step import view_losses
 from bitymi_ns.train.views import View, at_size
 
 
+def test_a_run_on_photographs_that_show_little_sees_full_size_early(make_scene, views):
+    scene = make_scene(texture=False)
+    scene.config.texture = "texels"
+    pixels = views[0].camera.width * views[0].camera.height
+    config = TrainConfig(small_photograph=pixels // 3)
+    masks = [torch.rand(view.camera.height, view.camera.width, 1) < share for view in views for share in (2.0, 0.4)]
+    full, little = (
+        Trainer(scene, [view._replace(mask=mask) for view, mask in zip(views, masks[i::2], strict=True)], config, 1200)
+        for i in range(2)
+    )
+    sizes = [[run.training.schedule.resolution_factor(step) for step in (250, 300, 500)] for run in (full, little)]
+    assert sizes == [[0.5, 0.5, 1.0], [0.5, 1.0, 1.0]]
+
+
 def test_a_short_run_is_a_proper_run(make_scene, views):
     scene, config = (
         make_scene(),

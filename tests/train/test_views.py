@@ -10,6 +10,7 @@ from bitymi_ns.train.views import (
     as_float,
     at_size,
     background_color,
+    covered_share,
     over_background,
     reduce_image,
     reduce_mask,
@@ -79,6 +80,24 @@ def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.Monke
         assert all(torch.equal(a.image, b.image) for a, b in pairs)
         again = [few.at(i, factor) is pairs[i][0] for i in range(len(views))]
         assert sum(again) == min(len(views), 2 if factor == 0.5 else 8)
+
+
+def test_pixels_that_show_something(cameras) -> None:
+    camera, opaque = cameras[0], torch.rand(4, 10, 3)
+    half = torch.cat([opaque, torch.zeros(4, 10, 1)], -1)
+    half[:, :5, 3] = 0.2
+    mask = torch.ones(4, 10, 1, dtype=torch.bool)
+    mask[:2] = False
+    shares = {
+        1.0: View(camera, opaque),
+        0.5: View(camera, (255 * half).to(torch.uint8)),
+        0.25: View(camera, half, mask[..., 0]),
+    }
+    for share, view in shares.items():
+        assert covered_share([view]) == pytest.approx(share)
+    assert covered_share([View(camera, opaque, mask)]) == pytest.approx(0.5)
+    assert covered_share([shares[1.0], shares[0.5]]) == pytest.approx(0.75) and covered_share([]) == 0
+    assert covered_share([shares[1.0]] * 300) == 1
 
 
 def test_views_are_drawn_without_replacement(views):

@@ -58,8 +58,8 @@ def blended_image(
     """What `composite_image` gives for the colours of `texel_colors`, or of `shade` where there are no texels.
 
     On the CPU it is one pass over the fragments, and one backward, which list neither colours nor their gradients: of
-    64 bytes per fragment 40 are left. Where texels learn, the backward pass gives whole surfels to each thread, so that
-    sums do not depend on the number of threads.
+    64 bytes per fragment 40 are left. Where there are texels, the backward pass gives whole surfels to each thread, so
+    that sums do not depend on the number of threads, nor on what learns.
 
     Args:
         fragments: F fragments of an H x W view.

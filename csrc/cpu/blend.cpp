@@ -76,7 +76,8 @@ void surfel_backward(const BlendBackward<S>& a, int64_t id, const Sums<S>& sums)
   for (int k = 0; k < 4; ++k) a.dgeom[id * kGeom + kBeta + k] = sums.geom[k];
 }
 
-// Surfel after surfel: a thread adds to the tiles of its own.
+// Surfel after surfel: a thread adds to the tiles of its own. Also where they do not learn, so that the gradients of
+// the surfels are the same.
 template <bool kMaps, class S>
 void backward_by_surfel(const BlendBackward<S>& a) {
   const FragmentArrays<S>& f = a.of.fragments.f;
@@ -98,7 +99,7 @@ void backward_by_surfel(const BlendBackward<S>& a) {
   });
 }
 
-// In the order of the list, which is faster where nothing is added to tiles.
+// In the order of the list, which is faster where there are no tiles.
 template <bool kMaps, class S>
 void backward_by_list(const BlendBackward<S>& a) {
   const FragmentArrays<S>& f = a.of.fragments.f;
@@ -134,7 +135,7 @@ void backward(const BlendBackward<S>& a) {
   std::fill(a.dgeom, a.dgeom + table.n * kGeom, S(0));
   std::fill(a.dbase, a.dbase + 3 * table.n, S(0));
   if (a.dtexels) std::fill(a.dtexels, a.dtexels + 3 * table.texels, S(0));
-  a.moved || a.dtexels ? backward_by_surfel<kMaps>(a) : backward_by_list<kMaps>(a);
+  table.texels ? backward_by_surfel<kMaps>(a) : backward_by_list<kMaps>(a);
 }
 }  // namespace
 

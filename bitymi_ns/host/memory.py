@@ -20,7 +20,7 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
-from bitymi_ns.train.views import REDUCED_BYTES
+from bitymi_ns.train.views import REDUCED_BYTES, spread
 
 COUNTED_VIEWS = 3
 """Views whose fragments are counted."""
@@ -55,8 +55,8 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
         bound: views with more are drawn in bands; 0 = that of the CPU kernels.
     """
     p, most = scene.surfels, 0
-    for i in range(min(COUNTED_VIEWS, len(cameras))):
-        camera = cameras[i * len(cameras) // min(COUNTED_VIEWS, len(cameras))]
+    for i in spread(len(cameras), COUNTED_VIEWS):
+        camera = cameras[i]
         geometry = (p[name] for name in GEOMETRY)
         most = max(most, count(project(*geometry, camera, scene.near, scene.config.through_pixel)))
     return min(int(MARGIN * most), bound or MOST)

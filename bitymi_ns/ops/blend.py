@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, on_same_device
-from .composite import composite_image
+from .backend import cuda_backend, dense, kernel
+from .composite import check_projection, composite_image
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
 from .shade import shade
@@ -80,13 +80,11 @@ def blended_image(
         else:
             colors = texel_colors(fragments, base, texels, tiles, bound, move_surfels, descent)
         return composite_image(fragments, projection, colors, maps)
-    n = fragments.surfels
+    check_projection(fragments, projection)
     if texels is None or tiles is None:
+        n = fragments.surfels
         nothing = torch.zeros(n, dtype=torch.int64), torch.zeros(n, 2, dtype=torch.int32), base.new_zeros(n)
         texels, tiles, move_surfels, descent = base.new_zeros(0, 3), TexelTiles(*nothing), False, None
-    on_same_device(fragments.weight, geom=projection.geom)
-    if len(projection.geom) != n:
-        raise ValueError(f"the fragments are those of {n} surfels, not of {len(projection.geom)}")
     check_texels(fragments, base, texels, tiles, descent)
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     given = (projection.geom, base, texels, fragments, tiles, bound, maps, descent)

@@ -39,6 +39,17 @@ class _CompositeImage(torch.autograd.Function):
         return out["dweight"], ddepth, out["dgeom"], out["dcolors"], None, None
 
 
+def check_projection(fragments: Fragments, projection: Projection) -> None:
+    """Refuses a projection of other surfels than the fragments', or on another device.
+
+    Raises:
+        ValueError: says what it is.
+    """
+    on_same_device(fragments.weight, geom=projection.geom)
+    if len(projection.geom) != fragments.surfels:
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(projection.geom)}")
+
+
 def composite_image(fragments: Fragments, projection: Projection, colors: Tensor, maps: bool = False) -> Tensor:
     """Sums of w times colour, 1 and beta, and with maps also depth and normal, per pixel.
 
@@ -55,9 +66,8 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
     Raises:
         ValueError: tensors on different devices, or colours of a wrong shape.
     """
-    on_same_device(fragments.weight, colors=colors, geom=projection.geom)
-    if len(projection.geom) != fragments.surfels:
-        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(projection.geom)}")
+    on_same_device(fragments.weight, colors=colors)
+    check_projection(fragments, projection)
     if tuple(colors.shape) != (len(fragments), 3):
         raise ValueError(f"colors must have shape {[len(fragments), 3]}, not {list(colors.shape)}")
     return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)

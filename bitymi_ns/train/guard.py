@@ -37,7 +37,7 @@ from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import ReducedViews, judging_background
+from bitymi_ns.train.views import ReducedViews, judging_background, spread
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -152,10 +152,10 @@ class Guard:
     @torch.no_grad()
     def _loss_of(self, views: ReducedViews, factor: float, blank: bool = False) -> float:
         """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
-        losses, count = [], min(len(views), COMPARED_VIEWS)
+        losses = []
         device = self.scene.surfels["means"].device
         background = judging_background(self.config.background, device)
-        for view in (views.at(i * len(views) // count, factor) for i in range(count)):
+        for view in (views.at(i, factor) for i in spread(len(views), COMPARED_VIEWS)):
             target = view.target(background, device)
             if blank:
                 drawn = target.mean((0, 1)).expand_as(target).contiguous()

@@ -58,7 +58,12 @@ class Schedule:
         self._last_part: Schedule | None = None
         if self.texels_start < max_steps:
             slower = replace(config, lr=config.lr.times(config.texels.surfel_rates))
-            self._last_part = Schedule(slower, max_steps - self.texels_start, extent)
+            self._last_part = Schedule(slower, self.texel_steps, extent)
+
+    @property
+    def texel_steps(self) -> int:
+        """Steps in which texels learn."""
+        return self.max_steps - self.texels_start
 
     @property
     def short_run_gain(self) -> float:
@@ -151,7 +156,7 @@ class Schedule:
         return self.config.texels.rate * self._falling(step)
 
     def _falling(self, step: int) -> float:
-        return falling(1.0, step - self.texels_start, self.max_steps - self.texels_start)
+        return falling(1.0, step - self.texels_start, self.texel_steps)
 
     def field_warmup(self, step: int) -> float:
         """Factor of the field's learning rate: rises linearly to 1 over the first `field_warmup` steps."""

@@ -23,7 +23,7 @@ from bitymi_ns.train.losses import numbers
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.rotations import tangents
-from bitymi_ns.train.views import at_size
+from bitymi_ns.train.views import at_size, spread
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -66,9 +66,8 @@ class LearningTexels:
         """Gives the surfels their tiles where this step is the first that needs them; whether it was."""
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
-        most = max(FEWEST_VIEWS, round(self.options.views * (self.schedule.max_steps - self.schedule.texels_start)))
-        count = min(most, len(views))
-        some = OnDemand(count, lambda i: views.at(i * len(views) // count, 1.0))
+        looked = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
+        some = OnDemand(len(looked), lambda i: views.at(looked[i], 1.0))
         field = None
         if self.processes.first:
             field = blank_texels(self.scene, some, len(views), self.options, self.views_to_come)
@@ -82,7 +81,7 @@ class LearningTexels:
     @property
     def views_to_come(self) -> int:
         """Views that all steps of this part look at, each counted as often as it is looked at."""
-        return self.processes.views * (self.schedule.max_steps - self.schedule.texels_start)
+        return self.processes.views * self.schedule.texel_steps
 
     def prepare(self, step: int, view: View, factor: float) -> None:
         """Says how the backward pass of a step on this view moves the texels.
@@ -157,8 +156,12 @@ def most_texels(options: TexelConfig, looked_at: float) -> float:
 
 def looked_size(cameras: Sequence[Camera]) -> float:
     """Size of the pictures that are looked through, as a share of that of the photographs."""
-    pixels = sum(camera.width * camera.height for camera in cameras)
-    return 0.5 if cameras and pixels >= 4 * LOOKED_PIXELS * len(cameras) else 1.0
+    return 0.5 if cameras and mean_pixels(cameras) >= 4 * LOOKED_PIXELS else 1.0
+
+
+def mean_pixels(cameras: Sequence[Camera]) -> float:
+    """Of a view; 0 where there is none."""
+    return sum(camera.width * camera.height for camera in cameras) / max(1, len(cameras))
 
 
 def in_one_view(
@@ -213,8 +216,8 @@ def tiles_as_seen(
     """
     extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
     size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
-    pixels = sum(camera.width * camera.height for camera in cameras) / max(1, len(cameras))
-    texels, most = seen.pixels / options.pixels_per_texel, most_texels(options, to_come * pixels)
+    texels = seen.pixels / options.pixels_per_texel
+    most = most_texels(options, to_come * mean_pixels(cameras))
     size = coarsened(size, texels, SMALLEST)
     while int(size.long().prod(1).sum()) > most and int(size.max()) > SMALLEST:
         texels = FEWER * texels

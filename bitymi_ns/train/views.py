@@ -79,10 +79,16 @@ class TrainingData:
     exif_stops: Sequence[float] | None = None
 
 
+def spread(count: int, most: int) -> list[int]:
+    """Numbers of at most `most` of `count` views, evenly spread; the first is one of them."""
+    used = min(count, most)
+    return [i * count // used for i in range(used)]
+
+
 def covered_share(views: Sequence[View]) -> float:
     """Share of the pixels that count and are not transparent, in a few of the views."""
-    count = min(len(views), COVERED_VIEWS)
-    return sum(_covered(views[i * len(views) // count]) for i in range(count)) / max(1, count)
+    chosen = spread(len(views), COVERED_VIEWS)
+    return sum(_covered(views[i]) for i in chosen) / max(1, len(chosen))
 
 
 def _covered(view: View) -> float:

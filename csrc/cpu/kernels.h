@@ -96,7 +96,7 @@ struct TraceCopy {
     out.fields(r);
   }
 };
-// Large lists give their memory back, block by block.
+// Large lists give their memory back, a block of every thread at a time.
 template <class S>
 void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
 

@@ -105,33 +105,33 @@ void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
     throw std::invalid_argument("the list has " + std::to_string(list.total) + " fragments in " +
                                 std::to_string(list.tile_start.size() - 1) + " tiles");
   std::copy(list.tile_start.begin(), list.tile_start.end(), a.tile_start);
-  std::vector<std::vector<std::vector<int64_t>>> tiles(list.blocks.size());  // of every block
+  std::vector<std::vector<int64_t>> tiles;  // of the k-th blocks of all threads
   for (size_t t = 0; t < list.pieces.size(); ++t) {
     const auto& p = list.pieces[t];
     if (!p.count) continue;
-    auto& own = tiles[p.thread];
-    own.resize(std::max(own.size(), size_t(p.block) + 1));
-    own[p.block].push_back(int64_t(t));
+    tiles.resize(std::max(tiles.size(), size_t(p.block) + 1));
+    tiles[p.block].push_back(int64_t(t));
   }
-  for (size_t thread = 0; thread < tiles.size(); ++thread)
-    for (size_t k = 0; k < tiles[thread].size(); ++k) {
-      auto& block = list.blocks[thread][k];
-      const std::vector<int64_t>& own = tiles[thread][k];
+  const bool large = list.total > kKept;
+  for (size_t k = 0; k < tiles.size(); ++k) {
 #pragma omp parallel for num_threads(num_threads()) schedule(static)
-      for (int64_t i = 0; i < int64_t(own.size()); ++i) {
-        const auto& p = list.pieces[own[i]];
-        const int64_t to = list.tile_start[own[i]];
-        std::copy_n(block.surfel + p.from, p.count, out.surfel + to);
-        std::copy_n(block.pixel + p.from, p.count, out.pixel + to);
-        std::copy_n(block.weight + p.from, p.count, out.weight + to);
-        std::copy_n(block.u + p.from, p.count, out.uv + to);
-        std::copy_n(block.v + p.from, p.count, out.uv + list.total + to);
-        std::copy_n(block.depth + p.from, p.count, out.depth + to);
-        std::copy_n(block.sigma + p.from, p.count, out.sigma + to);
-      }
-      if (list.total > kKept) block.memory.reset();  // at once: the list is never there twice
+    for (int64_t i = 0; i < int64_t(tiles[k].size()); ++i) {
+      const auto& p = list.pieces[tiles[k][i]];
+      const auto& block = list.blocks[p.thread][k];
+      const int64_t to = list.tile_start[tiles[k][i]];
+      std::copy_n(block.surfel + p.from, p.count, out.surfel + to);
+      std::copy_n(block.pixel + p.from, p.count, out.pixel + to);
+      std::copy_n(block.weight + p.from, p.count, out.weight + to);
+      std::copy_n(block.u + p.from, p.count, out.uv + to);
+      std::copy_n(block.v + p.from, p.count, out.uv + list.total + to);
+      std::copy_n(block.depth + p.from, p.count, out.depth + to);
+      std::copy_n(block.sigma + p.from, p.count, out.sigma + to);
     }
-  if (list.total > kKept) list.blocks.clear();
+    if (!large) continue;
+    for (auto& own : list.blocks)
+      if (k < own.size()) own[k].memory.reset();  // at once, so that the list is not there twice
+  }
+  if (large) list.blocks.clear();
 }
 
 namespace {

@@ -1,18 +1,12 @@
 // Front-to-back blending of a pixel's fragments, its end, and its vector-Jacobian product.
 #pragma once
 
-#include <utility>
-
 #include "core/surfel.h"
 
 namespace bt {
 
 // Sums over a pixel's fragments, each times its weight: rgb, 1 and beta; with maps also depth and normal.
 constexpr int kImageChannels = 5, kMapChannels = 9;
-
-// What comparing two reals gives: a bool, or one for each lane of a pack.
-template <class T>
-using MaskOf = decltype(std::declval<T>() < std::declval<T>());
 
 // The weight of a fragment in front of which `transmittance` is left, and what is left behind it.
 template <class T>
@@ -65,6 +59,20 @@ template <bool kMaps, class S>
 BT_HD S weight_gradient(const S* d, const S* color, const S& beta, const S& depth, const S* normal) {
   S gradient = d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] + d[4] * beta;
   if constexpr (kMaps) gradient += d[5] * depth + d[6] * normal[0] + d[7] * normal[1] + d[8] * normal[2];
+  return gradient;
+}
+
+// Both with vectors of four: colour and 1, and with maps depth and normal.
+template <bool kMaps, class S, class F>
+BT_HD void add_blended(S weight, F color, S beta, F depth_normal, S* sums) {
+  (F::load(sums) + weight * color).store(sums);
+  sums[4] += weight * beta;
+  if constexpr (kMaps) (F::load(sums + 5) + weight * depth_normal).store(sums + 5);
+}
+template <bool kMaps, class S, class F>
+BT_HD S weight_gradient(const S* d, F color, S beta, F depth_normal) {
+  S gradient = dot(F::load(d), color) + d[4] * beta;
+  if constexpr (kMaps) gradient += dot(F::load(d + 5), depth_normal);
   return gradient;
 }
 

@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <utility>
 
 #if defined(__CUDACC__)
 #define BT_HD __host__ __device__ __forceinline__
@@ -27,6 +28,10 @@ BT_HD float floor_(float x) { return floorf(x); }
 BT_HD double floor_(double x) { return floor(x); }
 BT_HD bool finite_(float x) { return fabsf(x) <= 3.402823466e38f; }  // false for NaN as well
 BT_HD bool finite_(double x) { return fabs(x) <= 1.7976931348623157e308; }
+
+// What comparing two reals gives: a bool, or one for each lane of a pack.
+template <class T>
+using MaskOf = decltype(std::declval<T>() < std::declval<T>());
 
 template <class T>
 BT_HD T select(bool condition, T yes, T no) {

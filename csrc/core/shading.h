@@ -26,9 +26,9 @@ BT_HD Vec3<S> shaded(Vec3<S> base, Vec3<S> residual) {
 }
 
 // The residual passes gradient where the outer ReLU is open, the view colour where both are.
-template <class S>
-BT_HD S residual_gradient(S color, S dcolor) {
-  return color > S(0) ? dcolor : S(0);
+template <class T>
+BT_HD T residual_gradient(T color, T dcolor) {
+  return select(color > T(0.0f), dcolor, T(0.0f));
 }
 template <class S>
 BT_HD Vec3<S> residual_gradient(Vec3<S> color, Vec3<S> dcolor) {

@@ -48,33 +48,80 @@ BT_HD S texel_centre(int i, int r, S extent) {
   return extent * (S(2 * i + 1) / S(r) - S(1));
 }
 
-// The texels between which the fetch interpolates, as offsets from the tile's first (rows along v), their weights, and
-// the position from the first texel's centre, in texels.
+// Between which texels a position along one axis lies: `first`, a whole number, and the next, which weighs `fraction`.
+// A tile of one texel has no next: `first` stands for it. Beyond the outer texel centres, not `inside`, the position
+// stands still.
+template <class T>
+struct TexelAxis {
+  T first, fraction;
+  MaskOf<T> inside;
+};
+template <class S, class T>
+BT_HD TexelAxis<T> texel_axis(T u, int r, S extent) {
+  const T x = texel_position(u, r, extent), first = min_(floor_(x), T(S(r > 1 ? r - 2 : 0)));
+  return {first, x - first, (x > T(S(0))) & (x < T(S(r - 1)))};
+}
+// From a texel to the next ones along u and v, in texels (rows lie along v).
+struct TexelSteps {
+  int right, down;
+  BT_HD explicit TexelSteps(const int32_t* size) : right(size[0] > 1 ? 1 : 0), down(size[1] > 1 ? size[0] : 0) {}
+};
+
+// The bilinear fetch from four texels t (three channels or a vector of the processor), rows along v, and the gradient
+// of it along each axis, per texel: it is linear between texel centres.
+template <class S>
+BT_HD void texel_weights(S fx, S fy, S* weight) {
+  weight[0] = (S(1) - fx) * (S(1) - fy), weight[1] = fx * (S(1) - fy), weight[2] = (S(1) - fx) * fy;
+  weight[3] = fx * fy;
+}
+template <class V, class S>
+BT_HD V texel_mix(const V* t, const S* weight) {
+  return (weight[0] * t[0] + weight[1] * t[1]) + (weight[2] * t[2] + weight[3] * t[3]);
+}
+template <class V, class S>
+BT_HD V texel_slope_u(const V* t, S fy) {
+  return (S(1) - fy) * (t[1] - t[0]) + fy * (t[3] - t[2]);
+}
+template <class V, class S>
+BT_HD V texel_slope_v(const V* t, S fx) {
+  return (S(1) - fx) * (t[2] - t[0]) + fx * (t[3] - t[1]);
+}
+// Texels per unit of u.
+template <class S>
+BT_HD S texel_density(int r, S extent) {
+  return S(r) / (S(2) * extent);
+}
+
+// The texels of one fetch, as offsets from the tile's first, and their weights.
 template <class S>
 struct TexelCorners {
   int64_t at[4];
   S weight[4];
-  S x, y;
+  S fx, fy;
+  bool inside_u, inside_v;
 };
 template <class S>
-BT_HD TexelCorners<S> texel_corners(S u, S v, int r_u, int r_v, S extent) {
-  const S x = texel_position(u, r_u, extent), y = texel_position(v, r_v, extent);
-  const int x0 = int(x), y0 = int(y);
-  const S fx = x - S(x0), fy = y - S(y0);
-  const int64_t corner = int64_t(y0) * r_u + x0, right = x0 + 1 < r_u ? 1 : 0, down = y0 + 1 < r_v ? r_u : 0;
-  return {{corner, corner + right, corner + down, corner + down + right},
-          {(S(1) - fx) * (S(1) - fy), fx * (S(1) - fy), (S(1) - fx) * fy, fx * fy},
-          x,
-          y};
+BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* size, S extent) {
+  const TexelAxis<S> x = texel_axis(u, size[0], extent), y = texel_axis(v, size[1], extent);
+  const TexelSteps next(size);
+  TexelCorners<S> c;
+  c.at[0] = int64_t(y.first) * size[0] + int64_t(x.first);
+  c.at[1] = c.at[0] + next.right, c.at[2] = c.at[0] + next.down, c.at[3] = c.at[2] + next.right;
+  texel_weights(x.fraction, y.fraction, c.weight);
+  c.fx = x.fraction, c.fy = y.fraction, c.inside_u = x.inside, c.inside_v = y.inside;
+  return c;
 }
 
-// Residual colour there, and its vector-Jacobian products: the fetch is linear in the texels, and along u and v between
-// texel centres.
+// Residual colour there, and its vector-Jacobian products.
+template <class S>
+BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
+  for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
+}
 template <class S>
 BT_HD Vec3<S> texel_fetch(const S* tile, const TexelCorners<S>& c) {
-  Vec3<S> sum = c.weight[0] * load3(tile + 3 * c.at[0]);
-  for (int k = 1; k < 4; ++k) sum = sum + c.weight[k] * load3(tile + 3 * c.at[k]);
-  return sum;
+  Vec3<S> t[4];
+  load_corners(tile, c, t);
+  return texel_mix(t, c.weight);
 }
 // add(k, gradient of corner k).
 template <class S, class F>
@@ -85,17 +132,15 @@ template <class S>
 BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
   texel_corner_gradients(c, g, [&](int k, Vec3<S> d) { store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + d); });
 }
-// Adds the gradient with respect to u and v. It is 0 beyond the outer texel centres; at a centre, where the slope
-// jumps, it is that of the side of larger coordinates.
+// Adds the gradient with respect to u and v. It is 0 from the outer texel centres on; at a centre between them, where
+// the slope jumps, it is that of the side of larger coordinates.
 template <class S>
-BT_HD void texel_fetch_uv_vjp(const S* tile, const TexelCorners<S>& c, int r_u, int r_v, S extent, Vec3<S> g, S& du,
+BT_HD void texel_fetch_uv_vjp(const S* tile, const TexelCorners<S>& c, const int32_t* size, S extent, Vec3<S> g, S& du,
                               S& dv) {
-  S along[4];
-  for (int k = 0; k < 4; ++k) along[k] = dot(g, load3(tile + 3 * c.at[k]));
-  const S fx = c.weight[1] + c.weight[3], fy = c.weight[2] + c.weight[3];
-  // of the last texel the neighbour is itself: the difference is 0
-  if (c.x > S(0)) du += S(r_u) / (S(2) * extent) * ((S(1) - fy) * (along[1] - along[0]) + fy * (along[3] - along[2]));
-  if (c.y > S(0)) dv += S(r_v) / (S(2) * extent) * ((S(1) - fx) * (along[2] - along[0]) + fx * (along[3] - along[1]));
+  Vec3<S> t[4];
+  load_corners(tile, c, t);
+  if (c.inside_u) du += texel_density(size[0], extent) * dot(g, texel_slope_u(t, c.fy));
+  if (c.inside_v) dv += texel_density(size[1], extent) * dot(g, texel_slope_v(t, c.fx));
 }
 
 // Where a step takes a texel whose gradient is g.

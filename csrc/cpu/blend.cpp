@@ -3,30 +3,56 @@
 #include "ops/blend.h"
 
 #include "cpu/kernels.h"
+#include "cpu/patch.h"
 #include "cpu/runs.h"
 
 namespace bt {
 
 namespace {
+template <class S>
+BT_HD Four<S> depth_normal(S depth, const S* g) {
+  return {Quad<S>{depth, g[kNx], g[kNx + 1], g[kNx + 2]}};
+}
+
+// Behind the last fragment from i on that is of the same surfel.
+inline int64_t run_end(const int32_t* surfel, int64_t i, int64_t end) {
+  const int32_t id = surfel[i];
+  while (++i < end && surfel[i] == id) {
+  }
+  return i;
+}
+
 template <bool kMaps, class S>
-void forward(const BlendForward<S>& a) {
+BT_HD void blend_into(const BlendForward<S>& a, int64_t i, Four<S> color, const S* g) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const FragmentArrays<S>& f = a.of.fragments.f;
+  S* to = a.image + int64_t(f.pixel[i]) * channels;
+  add_blended<kMaps>(f.weight[i], color, g[kBeta], depth_normal(f.depth[i], g), to);
+}
+
+template <bool kMaps, class S>
+void forward(const BlendForward<S>& a) {
+  const FragmentArrays<S>& f = a.of.fragments.f;
   const int64_t *tile_start = a.of.fragments.layout.start, tiles = a.of.fragments.layout.tiles;
-  const S *geom = a.of.geom, bound = a.of.bound;
-  S* image = a.image;
-  std::fill(image, image + a.of.numbers(), S(0));
+  std::fill(a.image, a.image + a.of.numbers(), S(0));
   parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     for (int64_t i = tile_start[first]; i < tile_start[last];) {
-      const int32_t id = f.surfel[i];
-      const TexelPatch<S> patch(a.of.table, id);
-      const S* g = geom + int64_t(id) * kGeom;
-      for (; i < tile_start[last] && f.surfel[i] == id; ++i) {
-        Vec3<S> c = patch.view;
-        if (patch.textured() && f.weight[i] >= bound) c = patch.color(patch.corners(f.uv[i], f.uv[f.total + i]));
-        S color[3];
-        store3(color, c);
-        add_blended<kMaps>(f.weight[i], color, g[kBeta], f.depth[i], g + kNx, image + int64_t(f.pixel[i]) * channels);
+      const int64_t end = run_end(f.surfel, i, tile_start[last]);
+      const TexelPatch<S> patch(a.of.table, f.surfel[i]);
+      const S* g = a.of.geom + int64_t(f.surfel[i]) * kGeom;
+      const Four<S> view(patch.view, S(1));
+      if (!patch.textured()) {
+        for (; i < end; ++i) blend_into<kMaps>(a, i, view, g);
+        continue;
+      }
+      Patch<S> few(patch);
+      for (int64_t next; i < end; i = next) {
+        next = std::min<int64_t>(end, i + kFew);
+        const Textured of(f.weight + i, int(next - i), a.of.bound);
+        few.look(f.uv + i, f.uv + f.total + i, int(next - i));
+        for (int k = 0; k < of.others; ++k) blend_into<kMaps>(a, i + of.other[k], view, g);
+        for (int k = 0; k < of.count; ++k)
+          blend_into<kMaps>(a, i + of.at[k], shaded(view, few.texels(of.at[k]).mix()), g);
       }
     }
   });
@@ -35,45 +61,68 @@ void forward(const BlendForward<S>& a) {
 // What the fragments of a surfel add to its gradients: view colour, beta, and the normal with maps.
 template <class S>
 struct Sums {
-  Vec3<S> view = {S(0), S(0), S(0)};
-  S geom[4] = {};
+  Four<S> view = Four<S>(S(0)), normal = Four<S>(S(0));  // beside them nothing, and nothing before the normal
+  S beta = S(0);
 };
 
-// The gradients of one fragment; `dtile` null: not those of the texels.
+// The gradients of one fragment but those of u and v; returns that of its colour.
 template <bool kMaps, class S>
-void fragment_backward(const BlendBackward<S>& a, int64_t i, const TexelPatch<S>& patch, const S* g, S* dtile,
-                       Sums<S>& sums) {
+BT_HD Four<S> fragment_backward(const BlendBackward<S>& a, int64_t i, Four<S> color, const S* g, Sums<S>& sums) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const FragmentArrays<S>& f = a.of.fragments.f;
   const S w = f.weight[i];
-  const S* d = a.dimage + int64_t(f.pixel[i]) * channels;
-  const bool textured = patch.textured() && w >= a.of.bound;
-  TexelCorners<S> corners;
-  Vec3<S> c = patch.view;
-  if (textured) corners = patch.corners(f.uv[i], f.uv[f.total + i]), c = patch.color(corners);
-  S color[3];
-  store3(color, c);
-  a.dweight[i] = weight_gradient<kMaps>(d, color, g[kBeta], f.depth[i], g + kNx);
-  sums.geom[0] += w * d[4];
+  const S* row = a.dimage + int64_t(f.pixel[i]) * channels;
+  a.dweight[i] = weight_gradient<kMaps>(row, color, g[kBeta], depth_normal(f.depth[i], g));
+  sums.beta += w * row[4];
   if constexpr (kMaps) {
-    a.ddepth[i] = w * d[5];
-    sums.geom[1] += w * d[6], sums.geom[2] += w * d[7], sums.geom[3] += w * d[8];
+    const Four<S> dmaps = Four<S>::load(row + 5);
+    a.ddepth[i] = w * dmaps.v[0];
+    sums.normal = sums.normal + w * dmaps;
   }
-  const Vec3<S> dcolor = residual_gradient(c, w * load3(d));
+  const Four<S> dcolor = without_last(residual_gradient(color, w * Four<S>::load(row)));
   sums.view = sums.view + dcolor;
-  S du = S(0), dv = S(0);
-  if (textured) {
-    if (dtile) texel_fetch_vjp(corners, dcolor, dtile);
-    if (a.duv) patch.uv_vjp(corners, dcolor, du, dv);
+  return dcolor;
+}
+
+// Those of fragments of one surfel from i on. `rows`: gradients of its texels, rows of four; null: there are none.
+template <bool kMaps, class S>
+void run_backward(const BlendBackward<S>& a, int64_t i, int64_t end, const TexelPatch<S>& patch, Patch<S>& few, S* rows,
+                  Sums<S>& sums) {
+  const FragmentArrays<S>& f = a.of.fragments.f;
+  const S* g = a.of.geom + int64_t(f.surfel[i]) * kGeom;
+  const Four<S> view(patch.view, S(1));
+  const auto constant = [&](int64_t j) {
+    fragment_backward<kMaps>(a, j, view, g, sums);
+    if (a.duv) a.duv[j] = a.duv[f.total + j] = S(0);
+  };
+  if (!patch.textured()) {
+    for (; i < end; ++i) constant(i);
+    return;
   }
-  if (a.duv) a.duv[i] = du, a.duv[f.total + i] = dv;
+  for (int64_t next; i < end; i = next) {
+    next = std::min<int64_t>(end, i + kFew);
+    const Textured of(f.weight + i, int(next - i), a.of.bound);
+    few.look(f.uv + i, f.uv + f.total + i, int(next - i));
+    for (int k = 0; k < of.others; ++k) constant(i + of.other[k]);
+    for (int k = 0; k < of.count; ++k) {
+      const int64_t j = i + of.at[k];
+      const TexelFours<S> texels = few.texels(of.at[k]);
+      const Four<S> dcolor = fragment_backward<kMaps>(a, j, shaded(view, texels.mix()), g, sums);
+      if (rows) few.add_gradient(of.at[k], texels, dcolor, rows);
+      if (!a.duv) continue;
+      a.duv[j] = few.gradient_u(of.at[k], texels, dcolor);
+      a.duv[f.total + j] = few.gradient_v(of.at[k], texels, dcolor);
+    }
+  }
 }
 
 // Writes the gradients of a surfel.
 template <class S>
 void surfel_backward(const BlendBackward<S>& a, int64_t id, const Sums<S>& sums) {
-  store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), sums.view));
-  for (int k = 0; k < 4; ++k) a.dgeom[id * kGeom + kBeta + k] = sums.geom[k];
+  store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), sums.view.three()));
+  S* dgeom = a.dgeom + id * kGeom;
+  dgeom[kBeta] = sums.beta;
+  for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sums.normal.v[k + 1];
 }
 
 // Surfel after surfel: a thread adds to the tiles of its own. Also where they do not learn, so that the gradients of
@@ -86,16 +135,19 @@ void backward_by_surfel(const BlendBackward<S>& a) {
   for_surfels(runs, [&](int64_t first, int64_t last) {
     const int64_t id = runs.id(first);
     const TexelPatch<S> patch(a.of.table, id);
-    thread_local std::vector<S> own;  // the tile's gradient, where it is not kept
-    const int64_t area = int64_t(patch.size[0]) * patch.size[1];
-    if (a.moved) own.assign(3 * area, S(0));
-    S* dtile = a.moved ? own.data() : a.dtexels ? a.dtexels + 3 * patch.first : nullptr;
+    Patch<S> few(patch);
+    thread_local std::vector<S> own;  // gradients of the texels, rows of four
+    const int64_t area = a.moved || a.dtexels ? int64_t(patch.size[0]) * patch.size[1] : 0;
+    own.assign(4 * area, S(0));
     Sums<S> sums;
-    for (int64_t r = first; r < last; ++r)
-      for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i)
-        fragment_backward<kMaps>(a, i, patch, a.of.geom + id * kGeom, dtile, sums);
+    for (int64_t r = first; r < last; ++r) {
+      const int64_t* start = runs.start + runs.order[r];
+      run_backward<kMaps>(a, start[0], start[1], patch, few, area ? own.data() : nullptr, sums);
+    }
     surfel_backward(a, id, sums);
-    if (a.moved) move_texels(a.moved + 3 * patch.first, dtile, a.rate, a.share + patch.first, area);
+    if (a.dtexels)
+      for (int64_t t = 0; t < area; ++t) store3(a.dtexels + 3 * (patch.first + t), load3(own.data() + 4 * t));
+    if (a.moved) move_texels(a.moved + 3 * patch.first, own.data(), 4, a.rate, a.share + patch.first, area);
   });
 }
 
@@ -108,21 +160,19 @@ void backward_by_list(const BlendBackward<S>& a) {
   const int parts = parallel_tiles(tile_start, tiles, 64, [&](int part, int64_t first, int64_t last) {
     std::vector<Sums<S>>& own = partial[part];
     own.assign(n, {});
-    for (int64_t i = tile_start[first]; i < tile_start[last];) {
-      const int32_t id = f.surfel[i];
-      const TexelPatch<S> patch(a.of.table, id);
-      Sums<S> sums = own[id];
-      for (; i < tile_start[last] && f.surfel[i] == id; ++i)
-        fragment_backward<kMaps, S>(a, i, patch, a.of.geom + int64_t(id) * kGeom, nullptr, sums);
-      own[id] = sums;
+    for (int64_t i = tile_start[first], end; i < tile_start[last]; i = end) {
+      end = run_end(f.surfel, i, tile_start[last]);
+      const TexelPatch<S> patch(a.of.table, f.surfel[i]);
+      Patch<S> few(patch);
+      run_backward<kMaps, S>(a, i, end, patch, few, nullptr, own[f.surfel[i]]);
     }
   });
   parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t id = begin; id < end; ++id) {
       Sums<S> sums = partial[0][id];
       for (int p = 1; p < parts; ++p) {
-        sums.view = sums.view + partial[p][id].view;
-        for (int k = 0; k < 4; ++k) sums.geom[k] += partial[p][id].geom[k];
+        sums.view = sums.view + partial[p][id].view, sums.normal = sums.normal + partial[p][id].normal;
+        sums.beta += partial[p][id].beta;
       }
       surfel_backward(a, id, sums);
     }

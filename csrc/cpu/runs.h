@@ -53,10 +53,10 @@ struct FoundRuns {
   }
 };
 
-// Moves `count` texels by their gradients [count, 3] and shares.
+// Moves `count` texels by their shares and gradients, which lie `row` numbers apart.
 template <class S>
-void move_texels(S* texels, const S* gradients, S rate, const S* share, int64_t count) {
-  for (int64_t t = 0; t < count; ++t, texels += 3, gradients += 3)
+void move_texels(S* texels, const S* gradients, int row, S rate, const S* share, int64_t count) {
+  for (int64_t t = 0; t < count; ++t, texels += 3, gradients += row)
     store3(texels, texel_step(load3(texels), load3(gradients), rate, share[t]));
 }
 

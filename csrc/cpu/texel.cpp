@@ -103,7 +103,7 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
         if (duv) patch.uv_vjp(corners, g, duv[i], duv[f.total + i]);
       }
     if (dbase) store3(dbase + 3 * id, base_gradient(load3(table.base + 3 * id), sum));
-    if (moved) move_texels(moved + 3 * patch.first, dtile, a.rate, a.share + patch.first, area);
+    if (moved) move_texels(moved + 3 * patch.first, dtile, 3, a.rate, a.share + patch.first, area);
   });
 }
 

@@ -49,11 +49,11 @@ struct TexelPatch {
         extent(tiles.extent[id]),
         view(view_base(load3(tiles.base + 3 * id))) {}
   BT_HD bool textured() const { return size[0] > 0; }
-  BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size[0], size[1], extent); }
+  BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
   BT_HD Vec3<S> color(const TexelCorners<S>& at) const { return shaded(view, texel_fetch(tile, at)); }
   // adds the gradient with respect to u and v
   BT_HD void uv_vjp(const TexelCorners<S>& at, Vec3<S> g, S& du, S& dv) const {
-    texel_fetch_uv_vjp(tile, at, size[0], size[1], extent, g, du, dv);
+    texel_fetch_uv_vjp(tile, at, size, extent, g, du, dv);
   }
 };
 template <class S>

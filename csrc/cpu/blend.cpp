@@ -125,6 +125,23 @@ void surfel_backward(const BlendBackward<S>& a, int64_t id, const Sums<S>& sums)
   for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sums.normal.v[k + 1];
 }
 
+// Asks for what the runs after run k of `runs` read: they lie all over the list, and waiting for them would take most
+// of the time. First for where they begin, then for their fragments, then for the pixels of these.
+template <int channels, class S>
+BT_HD void ask_for_next(const BlendBackward<S>& a, const Runs& runs, int64_t k) {
+  const FragmentArrays<S>& f = a.of.fragments.f;
+  constexpr int64_t line = 64 / sizeof(S);
+  const auto run = [&](int64_t ahead) { return runs.start + runs.order[std::min(k + ahead, runs.count - 1)]; };
+  __builtin_prefetch(run(8));
+  const int64_t* next = run(3);
+  for (int64_t i = next[0]; i < next[1]; i += line) {
+    __builtin_prefetch(f.weight + i), __builtin_prefetch(f.pixel + i);
+    __builtin_prefetch(f.uv + i), __builtin_prefetch(f.uv + f.total + i);
+  }
+  next = run(1);
+  for (int64_t i = next[0]; i < next[1]; ++i) __builtin_prefetch(a.dimage + int64_t(f.pixel[i]) * channels);
+}
+
 // Surfel after surfel: a thread adds to the tiles of its own. Also where they do not learn, so that the gradients of
 // the surfels are the same.
 template <bool kMaps, class S>
@@ -141,6 +158,7 @@ void backward_by_surfel(const BlendBackward<S>& a) {
     own.assign(4 * area, S(0));
     Sums<S> sums;
     for (int64_t r = first; r < last; ++r) {
+      ask_for_next<kMaps ? kMapChannels : kImageChannels>(a, runs, r);
       const int64_t* start = runs.start + runs.order[r];
       run_backward<kMaps>(a, start[0], start[1], patch, few, area ? own.data() : nullptr, sums);
     }

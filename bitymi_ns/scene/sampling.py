@@ -16,7 +16,7 @@ AS_TRAINED = (0.75, 1.5)
 near and from far."""
 SMALLEST, LARGEST = 0.5, 2.0
 """Views beyond these sizes are drawn for what they are; in between it changes over, so that nothing jumps."""
-SAMPLE = 0.375
+SAMPLE = 0.42
 """A photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow."""
 MOST_SAMPLES = 4
 """Samples per pixel, along each axis."""

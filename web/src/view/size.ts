@@ -5,7 +5,7 @@ import type { Vec3 } from '../bundle/manifest';
 
 const AS_TRAINED = [0.75, 1.5]; // views between these sizes are drawn as in training
 const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, for what they are; in between it changes over
-const SAMPLE = 0.375; // a photograph's pixel is at least so many samples wide
+const SAMPLE = 0.42; // a photograph's pixel is at least so many samples wide
 const FARTHEST = [1 / 64, 64];
 
 export interface Sampling {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -23,29 +23,33 @@ from bitymi_ns.ops.field import FieldGeometry, field
 from .config import SceneConfig
 
 
+class Shading(NamedTuple):
+    """How the image of a view is made of its fragments.
+
+    Attributes:
+        bound: fragments of weight below this have no residual.
+        learns: whether the residual gets gradients.
+        moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
+        maps: also depth and normals.
+    """
+
+    bound: float
+    learns: bool
+    moves_surfels: bool
+    maps: bool
+
+
 class ResidualField(Protocol):
     """What colours the fragments of a scene beside the surfels' view colours."""
 
-    def image(
-        self,
-        fragments: Fragments,
-        projection: Projection,
-        base: Tensor,
-        bound: float,
-        learns: bool,
-        moves_surfels: bool,
-        maps: bool,
-    ) -> Tensor:
+    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
         """[H * W, C] what `composite_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
 
         Args:
             fragments: of an H x W view.
             projection: the view's.
             base: [N, 3] f_view of every surfel.
-            bound: fragments of weight below this have no residual.
-            learns: whether the residual gets gradients.
-            moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
-            maps: also depth and normals.
+            how: it is made.
         """
 
 
@@ -133,20 +137,11 @@ class HashField(nn.Module):
         """Table and MLP weights, in the order the operations take them."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
-    def image(
-        self,
-        fragments: Fragments,
-        projection: Projection,
-        base: Tensor,
-        bound: float,
-        learns: bool,
-        moves_surfels: bool,
-        maps: bool,
-    ) -> Tensor:
+    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
         """See `ResidualField`."""
-        weights = self.weights if learns else tuple(w.detach() for w in self.weights)
-        colors = shade(fragments, base, projection.frames, self.geometry, weights, bound, moves_surfels)
-        return composite_image(fragments, projection, colors, maps)
+        weights = self.weights if how.learns else tuple(w.detach() for w in self.weights)
+        colors = shade(fragments, base, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
+        return composite_image(fragments, projection, colors, how.maps)
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
@@ -216,20 +211,12 @@ class TexelField(nn.Module):
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
-    def image(
-        self,
-        fragments: Fragments,
-        projection: Projection,
-        base: Tensor,
-        bound: float,
-        learns: bool,
-        moves_surfels: bool,
-        maps: bool,
-    ) -> Tensor:
+    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
         """See `ResidualField`."""
-        descent = self.descent if learns else None
-        texels = self.texels if learns and descent is None else self.texels.detach()
-        return blended_image(fragments, projection, base, texels, self.tiles, bound, maps, moves_surfels, descent)
+        descent = self.descent if how.learns else None
+        texels = self.texels if how.learns and descent is None else self.texels.detach()
+        given = (texels, self.tiles, how.bound, how.maps, how.moves_surfels, descent)
+        return blended_image(fragments, projection, base, *given)
 
     @torch.no_grad()
     def residual(self, fragments: Fragments, bound: float) -> Tensor:

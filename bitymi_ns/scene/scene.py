@@ -30,7 +30,7 @@ from bitymi_ns.ops.constants import IMAGE_CHANNELS
 
 from .camera import Camera
 from .config import SceneConfig
-from .field import ResidualField, TexelField
+from .field import ResidualField, Shading, TexelField
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 """Names of the per-surfel parameters that every scene has."""
@@ -162,7 +162,7 @@ class Scene(nn.Module):
                 image = blended_image(fragments, part, base, maps=maps)
             else:
                 moves = learns and self.config.residual_moves_surfels
-                image = field.image(fragments, part, base, bound, learns, moves, maps)
+                image = field.image(fragments, part, base, Shading(bound, learns, moves, maps))
             if beta_alone:
                 image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)
             if overdraw_half is not None:

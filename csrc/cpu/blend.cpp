@@ -22,6 +22,26 @@ inline int64_t run_end(const int32_t* surfel, int64_t i, int64_t end) {
   return i;
 }
 
+// constant(i) for those fragments of a surfel from i on that show no texel, and textured(i, few, j) for the others:
+// few's fragment j.
+template <class S, class Constant, class WithTexel>
+BT_HD void each_fragment(const BlendedSurfels<S>& of, const TexelPatch<S>& patch, int64_t i, int64_t end,
+                         Constant&& constant, WithTexel&& textured) {
+  if (!patch.textured()) {
+    for (; i < end; ++i) constant(i);
+    return;
+  }
+  const FragmentArrays<S>& f = of.fragments.f;
+  PatchFragments<S> few(patch);
+  for (int64_t next; i < end; i = next) {
+    next = std::min<int64_t>(end, i + kFew);
+    const Textured here(f.weight + i, int(next - i), of.bound);
+    few.look(f.uv + i, f.uv + f.total + i, int(next - i));
+    for (int k = 0; k < here.others; ++k) constant(i + here.other[k]);
+    for (int k = 0; k < here.count; ++k) textured(i + here.at[k], few, here.at[k]);
+  }
+}
+
 template <bool kMaps, class S>
 BT_HD void blend_into(const BlendForward<S>& a, int64_t i, Four<S> color, const S* g) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
@@ -36,24 +56,16 @@ void forward(const BlendForward<S>& a) {
   const int64_t *tile_start = a.of.fragments.layout.start, tiles = a.of.fragments.layout.tiles;
   std::fill(a.image, a.image + a.of.numbers(), S(0));
   parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
-    for (int64_t i = tile_start[first]; i < tile_start[last];) {
-      const int64_t end = run_end(f.surfel, i, tile_start[last]);
+    for (int64_t i = tile_start[first], end; i < tile_start[last]; i = end) {
+      end = run_end(f.surfel, i, tile_start[last]);
       const TexelPatch<S> patch(a.of.table, f.surfel[i]);
       const S* g = a.of.geom + int64_t(f.surfel[i]) * kGeom;
       const Four<S> view(patch.view, S(1));
-      if (!patch.textured()) {
-        for (; i < end; ++i) blend_into<kMaps>(a, i, view, g);
-        continue;
-      }
-      Patch<S> few(patch);
-      for (int64_t next; i < end; i = next) {
-        next = std::min<int64_t>(end, i + kFew);
-        const Textured of(f.weight + i, int(next - i), a.of.bound);
-        few.look(f.uv + i, f.uv + f.total + i, int(next - i));
-        for (int k = 0; k < of.others; ++k) blend_into<kMaps>(a, i + of.other[k], view, g);
-        for (int k = 0; k < of.count; ++k)
-          blend_into<kMaps>(a, i + of.at[k], shaded(view, few.texels(of.at[k]).mix()), g);
-      }
+      each_fragment(
+          a.of, patch, i, end, [&](int64_t at) { blend_into<kMaps>(a, at, view, g); },
+          [&](int64_t at, const PatchFragments<S>& few, int j) {
+            blend_into<kMaps>(a, at, shaded(view, few.texels(j).mix()), g);
+          });
     }
   });
 }
@@ -86,34 +98,25 @@ BT_HD Four<S> fragment_backward(const BlendBackward<S>& a, int64_t i, Four<S> co
 
 // Those of fragments of one surfel from i on. `rows`: gradients of its texels, rows of four; null: there are none.
 template <bool kMaps, class S>
-void run_backward(const BlendBackward<S>& a, int64_t i, int64_t end, const TexelPatch<S>& patch, Patch<S>& few, S* rows,
+void run_backward(const BlendBackward<S>& a, int64_t i, int64_t end, const TexelPatch<S>& patch, S* rows,
                   Sums<S>& sums) {
-  const FragmentArrays<S>& f = a.of.fragments.f;
-  const S* g = a.of.geom + int64_t(f.surfel[i]) * kGeom;
+  const int64_t total = a.of.fragments.f.total;
+  const S* g = a.of.geom + int64_t(a.of.fragments.f.surfel[i]) * kGeom;
   const Four<S> view(patch.view, S(1));
-  const auto constant = [&](int64_t j) {
-    fragment_backward<kMaps>(a, j, view, g, sums);
-    if (a.duv) a.duv[j] = a.duv[f.total + j] = S(0);
-  };
-  if (!patch.textured()) {
-    for (; i < end; ++i) constant(i);
-    return;
-  }
-  for (int64_t next; i < end; i = next) {
-    next = std::min<int64_t>(end, i + kFew);
-    const Textured of(f.weight + i, int(next - i), a.of.bound);
-    few.look(f.uv + i, f.uv + f.total + i, int(next - i));
-    for (int k = 0; k < of.others; ++k) constant(i + of.other[k]);
-    for (int k = 0; k < of.count; ++k) {
-      const int64_t j = i + of.at[k];
-      const TexelFours<S> texels = few.texels(of.at[k]);
-      const Four<S> dcolor = fragment_backward<kMaps>(a, j, shaded(view, texels.mix()), g, sums);
-      if (rows) few.add_gradient(of.at[k], texels, dcolor, rows);
-      if (!a.duv) continue;
-      a.duv[j] = few.gradient_u(of.at[k], texels, dcolor);
-      a.duv[f.total + j] = few.gradient_v(of.at[k], texels, dcolor);
-    }
-  }
+  each_fragment(
+      a.of, patch, i, end,
+      [&](int64_t at) {
+        fragment_backward<kMaps>(a, at, view, g, sums);
+        if (a.duv) a.duv[at] = a.duv[total + at] = S(0);
+      },
+      [&](int64_t at, const PatchFragments<S>& few, int j) {
+        const TexelFours<S> texels = few.texels(j);
+        const Four<S> dcolor = fragment_backward<kMaps>(a, at, shaded(view, texels.mix()), g, sums);
+        if (rows) few.add_gradient(j, texels, dcolor, rows);
+        if (!a.duv) return;
+        a.duv[at] = few.gradient_u(j, texels, dcolor);
+        a.duv[total + at] = few.gradient_v(j, texels, dcolor);
+      });
 }
 
 // Writes the gradients of a surfel.
@@ -153,7 +156,6 @@ void backward_by_surfel(const BlendBackward<S>& a) {
   for_surfels(runs, [&](int64_t first, int64_t last) {
     const int64_t id = runs.id(first);
     const TexelPatch<S> patch(a.of.table, id);
-    Patch<S> few(patch);
     thread_local std::vector<S> own;  // gradients of the texels, rows of four
     const int64_t area = a.moved || a.dtexels ? int64_t(patch.size[0]) * patch.size[1] : 0;
     own.assign(4 * area, S(0));
@@ -161,7 +163,7 @@ void backward_by_surfel(const BlendBackward<S>& a) {
     for (int64_t r = first; r < last; ++r) {
       ask_for_next<kMaps ? kMapChannels : kImageChannels>(a, runs, r);
       const int64_t* start = runs.start + runs.order[r];
-      run_backward<kMaps>(a, start[0], start[1], patch, few, area ? own.data() : nullptr, sums);
+      run_backward<kMaps>(a, start[0], start[1], patch, area ? own.data() : nullptr, sums);
     }
     surfel_backward(a, id, sums);
     if (a.dtexels)
@@ -182,8 +184,7 @@ void backward_by_list(const BlendBackward<S>& a) {
     for (int64_t i = tile_start[first], end; i < tile_start[last]; i = end) {
       end = run_end(f.surfel, i, tile_start[last]);
       const TexelPatch<S> patch(a.of.table, f.surfel[i]);
-      Patch<S> few(patch);
-      run_backward<kMaps, S>(a, i, end, patch, few, nullptr, own[f.surfel[i]]);
+      run_backward<kMaps, S>(a, i, end, patch, nullptr, own[f.surfel[i]]);
     }
   });
   parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {

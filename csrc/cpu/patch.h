@@ -87,10 +87,11 @@ struct TexelFours {
   BT_HD Four<S> mix() const { return texel_mix(t, weight); }
 };
 
+// Up to kFew fragments of a surfel that has a tile.
 template <class S>
-class Patch {
+class PatchFragments {
  public:
-  BT_HD explicit Patch(const TexelPatch<S>& of)
+  BT_HD explicit PatchFragments(const TexelPatch<S>& of)
       : of_(of),
         next_(of.size),
         per_u_(texel_density(of.size[0], of.extent)),

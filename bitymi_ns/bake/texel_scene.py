@@ -29,7 +29,6 @@ from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.scene.visibility import add_coverage
 from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.views import View, shown
 
@@ -104,13 +103,22 @@ class TexelScene:
         geometry = (scene.surfels[name] for name in GEOMETRY)
         return project(*geometry, camera.to("cpu"), scene.near, scene.through_pixel)
 
-    def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
-        """What `coverage` gives, or its squares, to rounding, of views of which nothing is kept: their colours are not
-        worked out."""
+    def coverage(
+        self, views: Sequence[View], progress: Progress = no_progress, squares: Tensor | None = None
+    ) -> Tensor:
+        """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
+        weight times the bilinear weight, in pixels that count; 0 where no view sees it.
+
+        Args:
+            views: training views.
+            progress: called after every view.
+            squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.
+        """
         total, bound = torch.zeros_like(self.texels), self._baked.scene.weight_bound
-        for index, view in enumerate(views):
-            add_coverage(self.projection(view.camera), self.tiles, view.mask, bound, total, squared)
-            progress("tracing the training views", index + 1, len(views))
+        for done, view in enumerate(views, start=1):
+            lists = fitting_lists(self.projection(view.camera))
+            add_texel_coverage(lists, self.tiles, view.mask, bound, total, squares)
+            progress("tracing the training views", done, len(views))
         return total[:, :1]
 
     @torch.no_grad()
@@ -154,11 +162,17 @@ class TexelScene:
 
 
 class TexelViews(Sequence[TexelView]):
-    """Views of a scene, traced when they are needed and kept while there is budget for them."""
+    """Views of a scene, traced when they are needed and kept while there is budget for them.
+
+    Where it is too small for LEAST_KEPT of them none is: that would save less time than its memory is worth.
+    """
+
+    LEAST_KEPT = 1 / 8
 
     def __init__(self, scene: TexelScene, views: Sequence[View], budget: MemoryBudget) -> None:
         self._scene, self._views, self._budget = scene, views, budget
         self._kept: dict[int, TexelView] = {}
+        self._keeps: bool | None = None  # not known before the first view
 
     def __len__(self) -> int:
         return len(self._views)
@@ -167,7 +181,11 @@ class TexelViews(Sequence[TexelView]):
         if index in self._kept:
             return self._kept[index]
         view = self._scene.view(self._views[index])
-        if self._budget.reserve(view.nbytes):
+        if self._keeps is None:
+            self._keeps = self._budget.left >= self.LEAST_KEPT * len(self) * view.nbytes
+        if self._keeps:
+            self._keeps = self._budget.reserve(view.nbytes)
+        if self._keeps:
             self._kept[index] = view
         return view
 
@@ -176,23 +194,3 @@ class TexelViews(Sequence[TexelView]):
         scene = self._scene
         pictures = ((scene.shown(view, scene.render(view, texels)), view.target, view.mask) for view in self)
         return look(pictures, len(self), progress)
-
-
-@torch.no_grad()
-def coverage(
-    scene: TexelScene, views: TexelViews, progress: Progress = no_progress, squares: Tensor | None = None
-) -> Tensor:
-    """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
-    weight times the bilinear weight, in pixels that count; 0 where no view sees it.
-
-    Args:
-        squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.
-    """
-    total = torch.zeros_like(scene.texels)
-    for index in range(len(views)):
-        view = views[index]
-        add_texel_coverage(view.fragments, scene.tiles, view.mask, total)
-        if squares is not None:
-            add_texel_coverage(view.fragments, scene.tiles, view.mask, squares, squared=True)
-        progress("tracing the training views", index + 1, len(views))
-    return total[:, :1]

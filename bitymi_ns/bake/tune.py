@@ -14,7 +14,7 @@ from bitymi_ns.bake.looks import FEWEST_VIEWS, Looks, gain, set_aside
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.statistics import FineTuning
 from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder
-from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews, coverage
+from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.losses import numbers, photometric
@@ -109,14 +109,15 @@ def tune_atlas(
     started, cpu_started = time.perf_counter(), time.process_time()
     scene = TexelScene(baked, background)
     budget = MemoryBudget(options.cache_bytes)
-    held_in, tuned = (
-        TexelViews(scene, OnDemand(len(rows), lambda i, rows=rows: views[rows[i]]), budget)
+    parts = [
+        OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
         for rows in set_aside(len(views), options.held_in_every)
-    )
+    ]
+    held_in, tuned = (TexelViews(scene, part, budget) for part in parts)
     before = held_in.psnr(scene.texels, progress)  # first: these views are kept first
     looks = Looks(options, before, scene.texels)
     squares = None if baked.codes is None else torch.zeros_like(scene.texels)
-    share = 1.0 / (coverage(scene, tuned, progress, squares) + options.prior)  # [T, 1]
+    share = 1.0 / (scene.coverage(parts[1], progress, squares) + options.prior)  # [T, 1]
     _descend(scene, tuned, held_in, share, looks, options, progress)
     held_out = TexelViews(scene, eval_views, MemoryBudget(0))
     coder = _coding(baked, scene, squares, coding or TexelCodeOptions())

@@ -8,6 +8,7 @@ RuntimeError that says so. `baked.draw` draws a baked scene on both, by `baked_c
 from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image
 from .composite import beta_map, composite, composite_image, soft_overdraw
+from .coverage import add_texel_coverage
 from .errors import TooManyFragments
 from .field import FieldGeometry, field
 from .project import Projection, project
@@ -17,8 +18,6 @@ from .texel import (
     TexelDescent,
     TexelFragments,
     TexelTiles,
-    add_list_coverage,
-    add_texel_coverage,
     add_texel_gradient,
     texel_colors,
     texel_image,
@@ -37,7 +36,6 @@ __all__ = [
     "TexelFragments",
     "TexelTiles",
     "TooManyFragments",
-    "add_list_coverage",
     "add_texel_coverage",
     "add_texel_gradient",
     "band",

@@ -13,12 +13,17 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from .backend import cuda_backend
 from .constants import TILE
 from .errors import TooManyFragments
 from .project import Projection
 from .trace import Fragments, masked_counts, trace
 
 T = TypeVar("T")
+
+PASSING = 1 << 17
+"""Pixels of a list of the CPU that is looked at and dropped. Its memory then stays with the program; that of a whole
+view the system takes back and clears for the next, which takes longer than finding the fragments."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ class Bands:
 
 
 def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
-    """The fragments of a view, as one list, or as several of some rows of tiles each where one has too many.
+    """The fragments of a view, to be looked at and dropped: as one list on a CUDA device, on the CPU as lists of some
+    rows of tiles each; smaller ones where one has too many.
 
     Args:
         projection: of the view.
@@ -74,13 +80,14 @@ def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
     Raises:
         TooManyFragments: a single row of tiles has too many.
     """
-    height = projection.camera.height
+    width, height = projection.camera.width, projection.camera.height
+    parts = 1 if cuda_backend(projection.geom.device) else -(-width * height // PASSING)
 
     @torch.no_grad()  # of the generator, it would hold on to what it has yielded
     def find(top: int, bottom: int) -> Fragments:
         return trace(projection if bottom - top == height else band(projection, top, bottom), most=most)
 
-    for _, _, fragments in by_bands([(0, height)], find):
+    for _, _, fragments in by_bands(split(0, height, parts), find):
         yield fragments
         del fragments  # before the next list is made
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -244,29 +244,7 @@ def add_texel_gradient(
     )
 
 
-def add_texel_coverage(
-    fragments: TexelFragments, tiles: TexelTiles, mask: Tensor | None, total: Tensor, squared: bool = False
-) -> None:
-    """Adds to every texel how much of a view's picture it makes up, in pixels: the sum over the fragments of the
-    blending weight, or its square, times the bilinear weight.
-
-    Args:
-        fragments: of an H x W view.
-        tiles: where the T texels lie.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
-        total: [T, 3], added to, alike in all columns.
-        squared: the weights' squares.
-    """
-    if squared:
-        fragments = replace(fragments, weight=fragments.weight.square())
-    counts = total.new_ones(fragments.width * fragments.height, 3)
-    if mask is not None:
-        counts *= mask.reshape(-1, 1)
-    grey = total.new_zeros(len(tiles.size), 3)  # a colour of which no channel is cut off
-    add_texel_gradient(counts, fragments, grey, torch.zeros_like(total), tiles, 0.0, total)
-
-
-def _backward_memory(texels: Tensor, surfels: int, sums_texels: bool) -> dict[str, Tensor]:
+def backward_memory(texels: Tensor, surfels: int, sums_texels: bool) -> dict[str, Tensor]:
     """Working memory of the backward kernel of `texel_colors`, by name: none on the CPU.
 
     On CUDA: a row of four numbers per texel, where their gradients are added up; where torch is asked for deterministic
@@ -279,40 +257,6 @@ def _backward_memory(texels: Tensor, surfels: int, sums_texels: bool) -> dict[st
         return {"texel_work": texels.new_empty(entries)} if entries else {}
     numbers = module(texels.device).exact_size(entries, surfels, False)
     return {"exact_work": torch.empty(numbers, dtype=torch.int64, device=texels.device)}
-
-
-def add_list_coverage(
-    fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor, squared: bool = False
-) -> None:
-    """What `add_texel_coverage` adds, of a fragment list as it was traced; on either device.
-
-    Args:
-        fragments: of an H x W view.
-        tiles: where the T texels lie.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
-        bound: fragments of weight below this count as nothing.
-        total: [T, 3] of the fragments' dtype, dense, added to, alike in all columns.
-        squared: the weights' squares.
-    """
-    counts = dense(fragments.weight, total)
-    if squared:
-        counts = counts.square()
-    if mask is not None:
-        counts = counts * mask.reshape(-1)[fragments.pixel.long()]
-    share, base = total.new_ones(len(total)), total.new_zeros(fragments.surfels, 3)
-    grey = counts[:, None].expand(-1, 3).contiguous()  # as colours, too: where they are 0 there is nothing to count
-    # the gradient of colours of which no channel is cut off, as a step of length -1
-    kernel("texel_colors_backward", total)(
-        **by_name(fragments.arrays),
-        **tiles.arrays,
-        **_backward_memory(total, len(base), True),
-        **{"bound": bound, "base": base, "texels": total, "moved": total, "share": share, "rate": -1.0},
-        colors=grey,
-        dcolors=grey,
-        dbase=None,
-        dtexels=None,
-        duv=None,
-    )
 
 
 class _TexelColors(torch.autograd.Function):
@@ -338,7 +282,7 @@ class _TexelColors(torch.autograd.Function):
         given = {"colors": colors, "dcolors": dense(dcolors, texels), "rate": 0.0}
         if ctx.descent is not None:
             given |= {"moved": texels, "share": ctx.descent.share, "rate": ctx.descent.rate}
-        given |= _backward_memory(texels, len(base), dtexels is not None or ctx.descent is not None)
+        given |= backward_memory(texels, len(base), dtexels is not None or ctx.descent is not None)
         kernel("texel_colors_backward", texels)(**arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv)
         return dbase, dtexels, duv, None, None, None, None
 

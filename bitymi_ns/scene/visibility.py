@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Projection, TexelTiles, add_list_coverage, fitting_lists, project
+from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
@@ -80,27 +80,3 @@ def visibility(
         pixels = torch.maximum(pixels, here)
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, seen)
-
-
-@torch.no_grad()
-def add_coverage(
-    projection: Projection, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor, squared: bool = False
-) -> None:
-    """Adds to every texel how much of a view's picture it makes up, see `ops.add_list_coverage`.
-
-    Args:
-        projection: of the view.
-        tiles: where the T texels lie.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
-        bound: fragments of weight below this count as nothing.
-        total: [T, 3], added to, alike in all columns.
-        squared: the weights' squares.
-    """
-    camera, top = projection.camera, 0
-    if mask is not None:
-        mask = mask.to(total.device).reshape(camera.height, camera.width)
-    for fragments in fitting_lists(projection):
-        rows = None if mask is None else mask[top : top + fragments.height]
-        add_list_coverage(fragments, tiles, rows, bound, total, squared)
-        top += fragments.height
-        del fragments  # before the next list is made

@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.utils.hooks import RemovableHandle
 
-from bitymi_ns.ops import TexelDescent, project
+from bitymi_ns.ops import TexelDescent, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
-from bitymi_ns.scene.visibility import Visibility, add_coverage, visibility
+from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.losses import numbers
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.processes import ALONE, Processes
@@ -235,5 +235,5 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
         camera = view.camera.to(total.device)
         projection = project(*geometry, camera, scene.near, scene.config.through_pixel)
-        add_coverage(projection, field.tiles, view.mask, scene.config.weight_bound, total)
+        add_texel_coverage(fitting_lists(projection), field.tiles, view.mask, scene.config.weight_bound, total)
     return total[:, 0]

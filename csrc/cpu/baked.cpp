@@ -43,12 +43,12 @@ inline void eight_pairs(const uint8_t* patch, const int32_t* at, __m256i* left, 
 #endif
 template <class S>
 inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
-  Wide<uint32_t> left, right;
 #if defined(__AVX2__)
   __m256i l[2], r[2];
   eight_pairs(patch, at, l, r), eight_pairs(patch, at + 8, l + 1, r + 1);
-  std::memcpy(&left, l, sizeof l), std::memcpy(&right, r, sizeof r);
+  const Wide<uint32_t> left = joined(l[0], l[1]), right = joined(r[0], r[1]);
 #else
+  Wide<uint32_t> left, right;
   uint32_t pair[2];
   for (int i = 0; i < kLanes; ++i) {
     std::memcpy(pair, patch + 4 * int64_t(at[i]), sizeof pair);

@@ -131,6 +131,16 @@ BT_HD V smaller(const V& a, const V& b) {
   else
     return choose(a < b, a, b);
 }
+#if defined(__AVX2__)
+// Of the lower and the upper eight lanes; through the memory it would wait until both are written.
+BT_HD Wide<uint32_t> joined(__m256i low, __m256i high) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  return (Wide<uint32_t>)_mm512_inserti64x4(_mm512_zextsi256_si512(low), high, 1);
+#else
+  return {(Vector<uint32_t>)low, (Vector<uint32_t>)high};
+#endif
+}
+#endif
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 template <>
 BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {

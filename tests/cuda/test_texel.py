@@ -181,7 +181,7 @@ def test_what_was_learned_of_one_list_is_there_for_the_next(device: torch.device
     f, tiles = moved(case.fragments, device), moved(case.tiles, device)
     base, texels = torch.zeros_like(case.base).to(device).requires_grad_(), torch.zeros_like(case.texels).to(device)
     covered = torch.zeros_like(texels)
-    ops.add_list_coverage(f, tiles, None, 0.02, covered)
+    ops.add_texel_coverage([f], tiles, None, 0.02, covered)
     share = 1 / (covered[:, 0] + 0.1)
     with torch.no_grad():
         wanted = ops.texel_colors(f, base, 0.3 * case.texels.to(device), tiles, 0.02)
@@ -201,12 +201,14 @@ def test_coverage_against_the_cpu(masked: bool, device: torch.device, cpu: Conte
     total = torch.ones(len(case.texels), 3, dtype=torch.float64)  # of views before
     with cpu():
         want, weighed = total.clone(), ops.TexelFragments.of(f, f.weight >= 0.05)
-        ops.add_texel_coverage(weighed, case.tiles, mask, want)
+        counts = torch.ones(f.height * f.width, 3, dtype=torch.float64) * (1.0 if mask is None else mask.view(-1, 1))
+        grey = torch.zeros_like(case.base, dtype=torch.float64)
+        ops.add_texel_gradient(counts, weighed, grey, torch.zeros_like(want), case.tiles, 0.0, want)
         again = total.clone()
-        ops.add_list_coverage(f, case.tiles, mask, 0.05, again)
+        ops.add_texel_coverage([f], case.tiles, mask, 0.05, again)
     got = total.to(device)
     here = None if mask is None else mask.to(device)
-    ops.add_list_coverage(moved(f, device), moved(case.tiles, device), here, 0.05, got)
+    ops.add_texel_coverage([moved(f, device)], moved(case.tiles, device), here, 0.05, got)
     assert relative(got.cpu(), want) < 1e-12 and relative(again, want) < 1e-12 and want.max() > 2
 
 

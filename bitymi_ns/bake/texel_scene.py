@@ -161,13 +161,12 @@ class TexelScene:
         add_texel_gradient(dimage.reshape(-1, 3), view.fragments, view.base, texels, self.tiles, 0.0, out)
 
 
+LEAST_KEPT = 1 / 8
+"""Share of the views that fits where any are kept: of fewer, the memory is worth more than the time that they save."""
+
+
 class TexelViews(Sequence[TexelView]):
-    """Views of a scene, traced when they are needed and kept while there is budget for them.
-
-    Where it is too small for LEAST_KEPT of them none is: that would save less time than its memory is worth.
-    """
-
-    LEAST_KEPT = 1 / 8
+    """Views of a scene, traced when they are needed and kept while there is budget for them."""
 
     def __init__(self, scene: TexelScene, views: Sequence[View], budget: MemoryBudget) -> None:
         self._scene, self._views, self._budget = scene, views, budget
@@ -182,7 +181,7 @@ class TexelViews(Sequence[TexelView]):
             return self._kept[index]
         view = self._scene.view(self._views[index])
         if self._keeps is None:
-            self._keeps = self._budget.left >= self.LEAST_KEPT * len(self) * view.nbytes
+            self._keeps = self._budget.left >= LEAST_KEPT * len(self) * view.nbytes
         if self._keeps:
             self._keeps = self._budget.reserve(view.nbytes)
         if self._keeps:

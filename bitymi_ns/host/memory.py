@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import psutil
 import torch
 
+from bitymi_ns.bake.texel_scene import LEAST_KEPT
 from bitymi_ns.host.errors import say, warn
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES
 from bitymi_ns.ops import project
@@ -41,6 +42,8 @@ PER_TEXEL = 28
 """Bytes in training: the texel, how far it moves, and the two states in half precision that a run could go back to."""
 PER_BAKED_TEXEL = 96
 """Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
+PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
+"""Bytes of a view that the fine-tuning keeps, by its fragments, of which 22 to 43 % were measured to show a texel."""
 VIEWS_OF_TEXELS = 12
 """Beside the smallest tiles, all texels together are as many as those of so many views: 3.5 to 11 were measured."""
 
@@ -104,8 +107,11 @@ def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float,
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
+    fragments = most_fragments(scene, cameras)
+    if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
+        finetune_bytes = 0  # too few views would fit
     needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels
-    needed += _per_fragment(scene) * most_fragments(scene, cameras) + PER_SURFEL * learning
+    needed += _per_fragment(scene) * fragments + PER_SURFEL * learning
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")

@@ -88,6 +88,16 @@ def test_surfels_that_learn_in_an_export_take_what_they_take_in_training(
     assert needed[1] - needed[0] == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
 
 
+def test_views_are_counted_where_the_fine_tuning_keeps_them(
+    scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = []
+    for views in (10, 10_000_000):
+        memory.state_export(scene[0], [scene[1]] * views, 2e9)
+        needed.append(gigabytes(said(capsys)))
+    assert needed[0] - needed[1] == pytest.approx(2.0 - memory.PHOTOGRAPH_BYTES / 1e9, abs=0.11)
+
+
 def test_an_export_takes_copies_of_the_texels_that_were_learned(
     scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

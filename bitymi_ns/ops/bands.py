@@ -21,7 +21,7 @@ from .trace import Fragments, masked_counts, trace
 
 T = TypeVar("T")
 
-PASSING = 1 << 17
+PASSING = 1 << 18
 """Pixels of a list of the CPU that is looked at and dropped. Its memory then stays with the program; that of a whole
 view the system takes back and clears for the next, which takes longer than finding the fragments."""
 

@@ -128,9 +128,7 @@ class Coder:
         if baked.texels is not None:
             texels = TexelScene(baked, background)
             self._tiles, self._texels = texels.tiles, texels.texels
-            squares = torch.zeros_like(texels.texels)
-            texels.coverage(learned, progress, squares)
-            self._weights = squares[:, 0]
+            self._weights = texels.coverage(learned, progress, squared=True)[:, 0]
 
     @property
     def measured(self) -> bool:

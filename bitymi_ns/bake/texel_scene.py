@@ -103,23 +103,28 @@ class TexelScene:
         geometry = (scene.surfels[name] for name in GEOMETRY)
         return project(*geometry, camera.to("cpu"), scene.near, scene.through_pixel)
 
-    def coverage(
-        self, views: Sequence[View], progress: Progress = no_progress, squares: Tensor | None = None
-    ) -> Tensor:
+    def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
         """How much of the pictures every texel makes up, in pixels: [T, 1] sum over views and fragments of the blending
-        weight times the bilinear weight, in pixels that count; 0 where no view sees it.
+        weight, or its square, times the bilinear weight, in pixels that count; 0 where no view sees it."""
+        total = torch.zeros_like(self.texels)
+        self.add_coverage(views, None if squared else total, total if squared else None, progress)
+        return total[:, :1]
+
+    def add_coverage(
+        self, views: Sequence[View], total: Tensor | None, squares: Tensor | None, progress: Progress = no_progress
+    ) -> None:
+        """Adds the same of both kinds.
 
         Args:
             views: training views.
+            total: [T, 3], added to, alike in all columns; None = not wanted.
+            squares: [T, 3], added to: that of the blending weights' squares. None = not wanted.
             progress: called after every view.
-            squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.
         """
-        total, bound = torch.zeros_like(self.texels), self._baked.scene.weight_bound
         for done, view in enumerate(views, start=1):
             lists = fitting_lists(self.projection(view.camera))
-            add_texel_coverage(lists, self.tiles, view.mask, bound, total, squares)
+            add_texel_coverage(lists, self.tiles, view.mask, self._baked.scene.weight_bound, total, squares)
             progress("tracing the training views", done, len(views))
-        return total[:, :1]
 
     @torch.no_grad()
     def view(self, view: View) -> TexelView:
@@ -171,7 +176,7 @@ class TexelViews(Sequence[TexelView]):
     def __init__(self, scene: TexelScene, views: Sequence[View], budget: MemoryBudget) -> None:
         self._scene, self._views, self._budget = scene, views, budget
         self._kept: dict[int, TexelView] = {}
-        self._keeps: bool | None = None  # not known before the first view
+        self._keeps: bool | None = None  # whether any; not known before the first one
 
     def __len__(self) -> int:
         return len(self._views)
@@ -182,9 +187,7 @@ class TexelViews(Sequence[TexelView]):
         view = self._scene.view(self._views[index])
         if self._keeps is None:
             self._keeps = self._budget.left >= LEAST_KEPT * len(self) * view.nbytes
-        if self._keeps:
-            self._keeps = self._budget.reserve(view.nbytes)
-        if self._keeps:
+        if self._keeps and self._budget.reserve(view.nbytes):
             self._kept[index] = view
         return view
 

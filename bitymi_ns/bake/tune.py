@@ -109,15 +109,17 @@ def tune_atlas(
     started, cpu_started = time.perf_counter(), time.process_time()
     scene = TexelScene(baked, background)
     budget = MemoryBudget(options.cache_bytes)
-    parts = [
+    aside, learned = (
         OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
         for rows in set_aside(len(views), options.held_in_every)
-    ]
-    held_in, tuned = (TexelViews(scene, part, budget) for part in parts)
+    )
+    held_in, tuned = (TexelViews(scene, part, budget) for part in (aside, learned))
     before = held_in.psnr(scene.texels, progress)  # first: these views are kept first
     looks = Looks(options, before, scene.texels)
     squares = None if baked.codes is None else torch.zeros_like(scene.texels)
-    share = 1.0 / (scene.coverage(parts[1], progress, squares) + options.prior)  # [T, 1]
+    covered = torch.zeros_like(scene.texels)
+    scene.add_coverage(learned, covered, squares, progress)
+    share = 1.0 / (covered[:, :1] + options.prior)  # [T, 1]
     _descend(scene, tuned, held_in, share, looks, options, progress)
     held_out = TexelViews(scene, eval_views, MemoryBudget(0))
     coder = _coding(baked, scene, squares, coding or TexelCodeOptions())

@@ -18,7 +18,7 @@ def add_texel_coverage(
     tiles: TexelTiles,
     mask: Tensor | None,
     bound: float,
-    total: Tensor,
+    total: Tensor | None,
     squares: Tensor | None = None,
 ) -> None:
     """Adds to every texel how much of a view's picture it makes up, in pixels: the sum over the fragments of the
@@ -29,16 +29,18 @@ def add_texel_coverage(
         tiles: where the T texels lie.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
         bound: fragments of weight below this count as nothing.
-        total: [T, 3] of the fragments' dtype, dense, added to, alike in all columns.
+        total: [T, 3] of the tiles' dtype, dense, added to, alike in all columns; None = not wanted.
         squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.
     """
-    share, top = total.new_ones(len(total)), 0
-    mask = None if mask is None else mask.to(total.device).reshape(-1)
+    like, top = tiles.extent, 0
+    share = like.new_ones(tiles.count)
+    mask = None if mask is None else mask.to(like.device).reshape(-1)
     for fragments in lists:
         pixels = fragments.width * fragments.height
-        counts = total.new_ones(pixels) if mask is None else mask[top : top + pixels].to(total.dtype)
-        weight = dense(fragments.weight, total)
-        _add(fragments, weight, tiles, counts, bound, total, share)
+        counts = like.new_ones(pixels) if mask is None else mask[top : top + pixels].to(like.dtype)
+        weight = dense(fragments.weight, like)
+        if total is not None:
+            _add(fragments, weight, tiles, counts, bound, total, share)
         if squares is not None:
             _add(fragments, weight.square(), tiles, counts, bound * bound, squares, share)
         top += pixels

@@ -127,8 +127,10 @@ def test_coverage_is_what_the_pictures_change_by_with_the_texels(wrong: Baked, v
     scene = TexelScene(wrong, BACKGROUND)
     mask = torch.rand(40, 48, 1, generator=torch.Generator().manual_seed(0)) > 0.3
     views = [View(views[0].camera, views[0].image, mask), *views[1:5]]
-    squares, want, want_squares = (torch.zeros_like(scene.texels) for _ in range(3))
-    covered = scene.coverage(views, squares=squares)
+    both, squares, want, want_squares = (torch.zeros_like(scene.texels) for _ in range(4))
+    scene.add_coverage(views, both, squares)
+    covered = scene.coverage(views)
+    assert torch.equal(both[:, :1], covered) and torch.equal(scene.coverage(views, squared=True), squares[:, :1])
     for view in views:
         shown = scene.view(view)
         bright = replace(shown, base=torch.zeros_like(shown.base))

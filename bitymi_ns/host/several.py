@@ -172,6 +172,8 @@ def _work(config: TrainerConfig, rank: int, count: int, port: int) -> None:
         train_loop(rank, count, config)  # with the seed of the first process
         dist.destroy_process_group()
     except ProcessLost:  # another one has ended, and the first one says why
+        if config.machine.device_type != "cuda":  # a card may wait for one that is lost
+            dist.destroy_process_group()
         sys.exit(LOST)
     except BaseException as error:
         said = str(error) if isinstance(error, SystemExit) else traceback.format_exc()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -155,9 +155,10 @@ class Processes:
     def _reduce(self, tensors: Sequence[Tensor], how: Any) -> None:
         if self.count == 1:
             return
-        with _answering():
-            for work in [dist.all_reduce(tensor, how, async_op=True) for tensor in tensors]:
-                work.wait()
+        # all are waited for, also when one fails: what is left to gloo's threads aborts Python as it ends
+        with _answering(), ExitStack() as works:
+            for tensor in tensors:
+                works.callback(dist.all_reduce(tensor, how, async_op=True).wait)
 
 
 ALONE = Processes()

@@ -63,6 +63,7 @@ def main() -> None:
         result = train(inputs, Processes.joined(), ends)
     except ProcessLost as error:
         print(error, file=sys.stderr)
+        dist.destroy_process_group()
         sys.exit(LOST)
     torch.save(result, folder / f"end-{rank}.pt")
     dist.destroy_process_group()

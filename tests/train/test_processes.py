@@ -101,6 +101,31 @@ def test_a_process_that_ends_ends_the_others_with_a_word(tmp_path, inputs):
     assert "another process of the run has ended, or does not answer" in first.stderr.read()
 
 
+SUMS = """
+import os, sys, torch, torch.distributed as dist
+from bitymi_ns.train.processes import Processes, ProcessLost
+rank = int(sys.argv[2])
+dist.init_process_group("gloo", init_method=f"file://{sys.argv[1]}/meeting", rank=rank, world_size=2)
+processes = Processes.joined()
+processes.sum(torch.ones(3))
+if rank == 1:
+    os._exit(1)
+try:
+    processes.sum(*(torch.ones(100) for _ in range(400)))
+except ProcessLost:
+    sys.exit(3)
+"""
+
+
+@pytest.mark.slow
+def test_sums_that_are_lost_do_not_abort_the_process_as_it_ends(tmp_path):
+    """Works left to gloo's threads hold tensors of Python's, whose end there aborts the interpreter."""
+    command = [sys.executable, "-c", SUMS, str(tmp_path)]
+    first, second = (subprocess.Popen([*command, rank], stderr=subprocess.PIPE, text=True) for rank in "01")
+    assert second.wait(timeout=60) == 1
+    assert first.wait(timeout=60) == LOST, first.stderr.read()
+
+
 def test_views_are_dealt_out_in_the_order_of_training():
     dealt = [[*Processes(rank, 3, 2).numbers(step)] for step in range(2) for rank in range(3)]
     assert [number for numbers in dealt for number in numbers] == list(range(12))

@@ -13,14 +13,17 @@
 
 namespace bt {
 
-struct Extent : Outline<double> {
-  using S = double;
+template <class T>
+struct ExtentOf : Outline<T> {
   bool visible = false;
-  bool thin = false;                                 // the conic is too flat to intersect: use the box
-  S qa = 0, qb = 0, qc = 0, qd = 0, qe = 0, qf = 0;  // qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
+  MaskOf<T> thin = T(0.0f) < T(0.0f);  // the conic is too flat to intersect: use the box
+  T qa = T(0), qb = T(0), qc = T(0), qd = T(0), qe = T(0), qf = T(0);
+  // qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
 };
+using Extent = ExtentOf<double>;
 // The outermost points of a conic with a box.
-BT_HD void find_outermost(Extent& e) {
+template <class T>
+BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
 }
 
@@ -54,48 +57,66 @@ BT_HD Extent filtered_extent(const double* g) {
   return e;
 }
 
-template <class Kernel, class F>
-BT_HD Extent extent(const F* geom, double sharp = 1) {
-  using S = double;
-  S g[kGeom];
-  for (int i = 0; i < kGeom; ++i) g[i] = S(geom[i]);
-  if (filtered<Kernel>(g)) return filtered_extent(g);
-  Extent e;
-  const S ratio = times_drawn(g[kOpacity]), blurred = Kernel::kResized ? ratio * g[kArea] : ratio;
-  e.visible = max_(ratio, blurred) >= S(1);
-  if (!e.visible) return e;
-  const S level = log_(max_(ratio, S(1)));
-  const S rc2 = level_radius2(level, g[kBeta], S(1e-6));
+// The level set of a row that is not seen through a pixel. `room`: by how much its logarithm is larger; 0 for doubles.
+constexpr double kFloatRoom = 1e-5;
+template <class T>
+struct Level {
+  MaskOf<T> visible;
+  T r2, blur;  // r_c^2; radius of the low pass
+};
+template <class Kernel, class T>
+BT_HD Level<T> level_of(const T* g, double sharp, double room) {
+  const T one = T(1.0f), almost = T(1.0 - 0.1 * room), ratio = times_drawn(g[kOpacity]);
+  const T blurred = Kernel::kResized ? ratio * g[kArea] : ratio;
+  Level<T> l;
+  l.visible = max_(ratio, blurred) >= almost;
+  const T level = log_(max_(ratio, one)) + T(room);
+  l.r2 = level_radius2(level, g[kBeta], T(1e-6 + room));
+  l.blur = low_pass_radius(level);
   if constexpr (Kernel::kResized)
-    e.blur = blurred >= S(1) ? low_pass_radius(log_(blurred)) / sqrt_(sharp) : S(0);
-  else
-    e.blur = low_pass_radius(level);
-  const S u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
+    l.blur = select(blurred >= almost, low_pass_radius(log_(max_(blurred, one)) + T(room)) / T(sqrt_(sharp)), T(0.0f));
+  return l;
+}
+// Its conic and the box of that, in doubles.
+template <class T>
+BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur) {
+  const T zero = T(0.0f);
+  const T u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
+  ExtentOf<T> e;
+  e.blur = blur;
   e.qa = u1 * u1 + v1 * v1 - rc2 * w1 * w1;
   e.qb = u1 * u2 + v1 * v2 - rc2 * w1 * w2;
   e.qc = u2 * u2 + v2 * v2 - rc2 * w2 * w2;
   e.qd = -rc2 * w0 * w1, e.qe = -rc2 * w0 * w2, e.qf = -rc2 * w0 * w0;
   // dual conic by the adjugate of the point conic (entries needed for the box only)
-  const S c33 = e.qa * e.qc - e.qb * e.qb;
-  const S c13 = e.qb * e.qe - e.qc * e.qd, c23 = e.qb * e.qd - e.qa * e.qe;
-  const S c11 = e.qc * e.qf - e.qe * e.qe, c22 = e.qa * e.qf - e.qd * e.qd;
-  const S scale = abs_(e.qa) * abs_(e.qc);
+  const T c33 = e.qa * e.qc - e.qb * e.qb;
+  const T c13 = e.qb * e.qe - e.qc * e.qd, c23 = e.qb * e.qd - e.qa * e.qe;
+  const T c11 = e.qc * e.qf - e.qe * e.qe, c22 = e.qa * e.qf - e.qd * e.qd;
+  const T scale = abs_(e.qa) * abs_(e.qc);
+  const T mx = c13 / c33, my = c23 / c33;
+  const T hx = sqrt_(max_(mx * mx - c11 / c33, zero)), hy = sqrt_(max_(my * my - c22 / c33, zero));
+  const T pad = T(kBoundPad) + T(1e-4) * max_(hx, hy);
+  e.x0 = mx - hx - pad, e.x1 = mx + hx + pad, e.y0 = my - hy - pad, e.y1 = my + hy + pad;
   // an ellipse exactly when the whole disc lies in front of the camera plane
-  e.ellipse = c33 > S(1e-13) * scale && e.qa > S(0) && e.qc > S(0);
-  e.thin = !(c33 > S(1e-10) * scale);
-  if (!(w0 > S(0))) {  // seen exactly edge-on: no ray hits it, the low pass alone is drawn
-    e.ellipse = false;
-    return e;
-  }
-  e.whole = !e.ellipse;
-  if (e.whole) return e;
-  const S mx = c13 / c33, my = c23 / c33;
-  const S hx = sqrt_(max_(mx * mx - c11 / c33, S(0))), hy = sqrt_(max_(my * my - c22 / c33, S(0)));
-  e.x0 = mx - hx, e.x1 = mx + hx, e.y0 = my - hy, e.y1 = my + hy;
-  const S pad = S(kBoundPad) + S(1e-4) * max_(hx, hy);
-  e.x0 -= pad, e.x1 += pad, e.y0 -= pad, e.y1 += pad;
-  e.whole = !finite_(e.x0) || !finite_(e.x1) || !finite_(e.y0) || !finite_(e.y1);
-  find_outermost(e);
+  const MaskOf<T> before = (c33 > T(1e-13) * scale) & (e.qa > zero) & (e.qc > zero);
+  const MaskOf<T> boxed = before & finite_(e.x0) & finite_(e.x1) & finite_(e.y0) & finite_(e.y1);
+  const MaskOf<T> hit = w0 > zero;  // seen exactly edge-on no ray hits it, the low pass alone is drawn
+  e.ellipse = hit & before;
+  e.whole = hit & (select(boxed, zero, T(1.0f)) > zero);
+  e.thin = select(c33 > T(1e-10) * scale, zero, T(1.0f)) > zero;
+  return e;
+}
+
+template <class Kernel, class F>
+BT_HD Extent extent(const F* geom, double sharp = 1) {
+  double g[kGeom];
+  for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
+  if (filtered<Kernel>(g)) return filtered_extent(g);
+  const Level<double> level = level_of<Kernel>(g, sharp, 0);
+  if (!level.visible) return {};
+  Extent e = conic_extent(g, level.r2, level.blur);
+  e.visible = true;
+  if (e.ellipse && !e.whole) find_outermost(e);
   return e;
 }
 
@@ -153,9 +174,8 @@ BT_HD TileSpan tile_columns(const Extent& e, const F* geom, int row, int width) 
   return {int(max_(0.0, floor_(cx + x.x0))) / kTile, min_(tiles_across(width) - 1, last)};
 }
 // fn(row, first, last) for every row of tiles in which the surfel can touch those from `first` to `last`.
-template <class Kernel, class F, class Visit>
-BT_HD void for_tile_rows(const F* geom, int width, int height, Visit&& fn, double sharp = 1) {
-  const Extent e = extent<Kernel>(geom, sharp);
+template <class F, class Visit>
+BT_HD void for_tile_rows(const Extent& e, const F* geom, int width, int height, Visit&& fn) {
   const TileSpan rows = tile_rows(e, geom, height);
   for (int row = rows.first; row <= rows.last; ++row) {
     const TileSpan columns = tile_columns(e, geom, row, width);

@@ -22,20 +22,23 @@ BT_HD Pinhole<S> pinhole(const S* viewmat, const S* K) {
   c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
   return c;
 }
-template <class S>
-BT_HD Vec3<S> rotate(const S* R, Vec3<S> a) {
-  return {R[0] * a.x + R[1] * a.y + R[2] * a.z, R[3] * a.x + R[4] * a.y + R[5] * a.z,
-          R[6] * a.x + R[7] * a.y + R[8] * a.z};
+template <class S, class T>
+BT_HD Vec3<T> rotate(const S* R, Vec3<T> a) {
+  return {T(R[0]) * a.x + T(R[1]) * a.y + T(R[2]) * a.z, T(R[3]) * a.x + T(R[4]) * a.y + T(R[5]) * a.z,
+          T(R[6]) * a.x + T(R[7]) * a.y + T(R[8]) * a.z};
 }
 // Camera coordinates of a world point, accumulated in double: far from the origin R m and t cancel, and what is left of
 // float32 products would be their rounding.
-template <class S>
-BT_HD Vec3<S> to_camera(const Pinhole<S>& cam, const S* m) {
-  const double x = m[0], y = m[1], z = m[2];
+template <class S, class T>
+BT_HD Vec3<T> to_camera(const Pinhole<S>& cam, Vec3<T> m) {
+  using D = Widened<T>;
+  const D x = widened(m.x), y = widened(m.y), z = widened(m.z);
   const S *R = cam.R, *t = cam.t;
-  return {S(double(R[0]) * x + double(R[1]) * y + double(R[2]) * z + double(t[0])),
-          S(double(R[3]) * x + double(R[4]) * y + double(R[5]) * z + double(t[1])),
-          S(double(R[6]) * x + double(R[7]) * y + double(R[8]) * z + double(t[2]))};
+  const auto row = [&](int k) {
+    const D sum = D(double(R[3 * k])) * x + D(double(R[3 * k + 1])) * y + D(double(R[3 * k + 2])) * z + D(double(t[k]));
+    return narrowed<T>(sum);
+  };
+  return {row(0), row(1), row(2)};
 }
 template <class S>
 BT_HD Vec3<S> rotate_transposed(const S* R, Vec3<S> a) {

@@ -59,6 +59,16 @@ BT_HD T clamp_(T x, T low, T high) {
   return min_(max_(x, low), high);
 }
 
+// The double of a real, or doubles of a pack, and back.
+BT_HD double widened(float x) { return x; }
+BT_HD double widened(double x) { return x; }
+template <class T>
+using Widened = decltype(widened(std::declval<T>()));
+template <class T>
+BT_HD T narrowed(double x) {
+  return T(x);
+}
+
 // x^y for x > 0
 template <class T>
 BT_HD T power_(T x, T y) {
@@ -66,10 +76,10 @@ BT_HD T power_(T x, T y) {
 }
 
 // sigmoid without overflow for any finite x
-template <class S>
-BT_HD S sigmoid(S x) {
-  const S e = exp_(x < S(0) ? x : -x);
-  return (x < S(0) ? e : S(1)) / (S(1) + e);
+template <class T>
+BT_HD T sigmoid(T x) {
+  const T one = T(1.0f), e = exp_(-abs_(x));
+  return select(x < T(0.0f), e, one) / (one + e);
 }
 
 template <class S>

@@ -22,37 +22,27 @@ struct LevelSet {
 
 // The same of a row of ResizedKernel, whose low pass has the squared radius 1 / sharp and the height kArea.
 template <class S>
-BT_HD LevelSet<S> level_set(const S* g, S sharp) {
+BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
   LevelSet<S> l = {false, S(0), S(0)};
   const S ratio = times_drawn(g[kOpacity]), blurred = ratio * g[kArea], almost = S(1) - S(1e-6);
   l.visible = max_(ratio, blurred) >= almost;
   if (!l.visible) return l;
   l.r2 = level_radius2(log_(max_(ratio, S(1))) + S(1e-5), g[kBeta], S(4e-6));
   if (!(blurred >= almost)) return l;
-  const S reach = S(kLowPassReach), wide = S(1) / sharp;
-  const S least = g[kW0] - reach * sqrt_(wide) * (abs_(g[kW1]) + abs_(g[kW2]));
-  const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];
-  const bool covered = g[kArea] <= S(1) && least > S(0) &&
-                       S(kSupport2) * least * least >= (g[kBeta] + reach * reach) * wide * S(1.001) * slope;
-  l.blur2 = covered ? S(0) : (log_(max_(blurred, S(1))) + S(1e-5)) * wide;
+  const S wide = S(1) / sharp;
+  l.blur2 = covers_low_pass(g, near, wide) ? S(0) : (log_(max_(blurred, S(1))) + S(1e-5)) * wide;
   return l;
 }
 
 template <class S>
-BT_HD LevelSet<S> level_set(const S* g) {
+BT_HD LevelSet<S> level_set(const S* g, S near) {
   LevelSet<S> l = {false, S(0), S(0)};
   const S ratio = times_drawn(g[kOpacity]);
   l.visible = ratio >= S(1) - S(1e-6);
   if (!l.visible) return l;
   const S level = max_(log_(ratio), S(0)) + S(1e-5);
   l.r2 = level_radius2(level, g[kBeta], S(4e-6));
-  // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x),
-  // (1 - x)^beta >= exp(-d^2) holds out to d^2 = ln 255 where k >= beta + ln 255.
-  const S reach = S(kLowPassReach);
-  const S least = g[kW0] - reach * (abs_(g[kW1]) + abs_(g[kW2]));
-  const S slope = g[kU1] * g[kU1] + g[kU2] * g[kU2] + g[kV1] * g[kV1] + g[kV2] * g[kV2];
-  const bool covered = least > S(0) && S(kSupport2) * least * least >= (g[kBeta] + reach * reach) * S(1.001) * slope;
-  l.blur2 = covered ? S(0) : level;
+  l.blur2 = covers_low_pass(g, near, S(1)) ? S(0) : level;
   return l;
 }
 

@@ -27,28 +27,29 @@ struct Resize {
         share(photo_pixel * photo_pixel * sharp) {}
 };
 
-// Changes a row of geom; kArea then holds by how much the low pass is higher than the kernel at the centre. False when
+// Changes a row of geom; kArea then holds by how much the low pass is higher than the kernel at the centre. False where
 // the row is no longer finite.
-template <class S>
-BT_HD bool resize(const Resize<S>& to, S* g) {
-  g[kArea] = to.share;
-  if (to.variance == S(0) || !(g[kW0] > S(0))) return true;
+template <class S, class T>
+BT_HD MaskOf<T> resize(const Resize<S>& to, T* g) {
+  const T zero = T(0.0f), one = T(1.0f), two = T(2.0f);
+  g[kArea] = T(to.share);
+  const MaskOf<T> seen = g[kW0] > zero;
+  if (to.variance == S(0)) return finite_(one);
   // M' = (1 + c' M M^T)^(-1/2) M: sums of positive terms
-  const S c = to.variance * S(2 / kSupport2) * (g[kBeta] + S(2)), inv = S(1) / g[kW0];
-  const S u1 = g[kU1] * inv, u2 = g[kU2] * inv, v1 = g[kV1] * inv, v2 = g[kV2] * inv;
-  const S uu = c * (u1 * u1 + u2 * u2), uv = c * (u1 * v1 + u2 * v2), vv = c * (v1 * v1 + v2 * v2);
-  const S cross = c * (u1 * v2 - u2 * v1), root = sqrt_(S(1) + uu + vv + cross * cross);  // of the determinant
+  const T c = T(to.variance * S(2 / kSupport2)) * (g[kBeta] + two), inv = one / select(seen, g[kW0], one);
+  const T u1 = g[kU1] * inv, u2 = g[kU2] * inv, v1 = g[kV1] * inv, v2 = g[kV2] * inv;
+  const T uu = c * (u1 * u1 + u2 * u2), uv = c * (u1 * v1 + u2 * v2), vv = c * (v1 * v1 + v2 * v2);
+  const T cross = c * (u1 * v2 - u2 * v1), root = sqrt_(one + uu + vv + cross * cross);  // of the determinant
   // of A = 1 + c' M M^T the square root is (A + root) / t, its inverse the adjugate of A + root over root t
-  const S t = sqrt_(S(2) + uu + vv + S(2) * root), k = S(1) / (root * t);
-  const S a = (S(1) + vv + root) * k, b = -uv * k, d = (S(1) + uu + root) * k;
-  if (!finite_(a) || !finite_(b) || !finite_(d) || !finite_(root)) return false;
+  const T t = sqrt_(two + uu + vv + two * root), k = one / (root * t);
+  const T a = (one + vv + root) * k, b = -uv * k, d = (one + uu + root) * k;
   for (int j = 0; j < 2; ++j) {
-    const S u = g[kU1 + j], v = g[kV1 + j];
-    g[kU1 + j] = a * u + b * v, g[kV1 + j] = b * u + d * v;
+    const T u = g[kU1 + j], v = g[kV1 + j];
+    g[kU1 + j] = select(seen, a * u + b * v, u), g[kV1 + j] = select(seen, b * u + d * v, v);
   }
-  g[kOpacity] /= root;
-  g[kArea] *= root;
-  return true;
+  g[kOpacity] = select(seen, g[kOpacity] / root, g[kOpacity]);
+  g[kArea] = select(seen, g[kArea] * root, g[kArea]);
+  return finite_(select(seen, abs_(a) + abs_(b) + abs_(d) + root, one));
 }
 
 }  // namespace bt

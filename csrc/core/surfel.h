@@ -96,30 +96,47 @@ struct SurfelGradients {
   }
 };
 
-// Rotation matrix columns of a quaternion wxyz of any length.
-template <class S>
-struct Rotation {
-  Vec3<S> tu, tv, n;
-  S w, x, y, z;  // the unit quaternion
-  S inv;         // 1 / |q|
-  bool ok;
+// One of them; with packs, one in each lane.
+template <class T>
+struct SurfelRow {
+  Vec3<T> mean;
+  T quat[4], log_scale[2], opacity_logit, beta_raw;
 };
 template <class S>
-BT_HD Rotation<S> rotation(const S* q) {
-  Rotation<S> r;
-  S big = S(0);
+BT_HD SurfelRow<S> surfel_row(const Surfels<S>& in, int64_t i) {
+  const S *q = in.quats + 4 * i, *log_scale = in.log_scales + 2 * i;
+  return {load3(in.means + 3 * i),
+          {q[0], q[1], q[2], q[3]},
+          {log_scale[0], log_scale[1]},
+          in.opacity_logits[i],
+          in.beta_raw[i]};
+}
+
+// Rotation matrix columns of a quaternion wxyz of any length.
+template <class T>
+struct Rotation {
+  Vec3<T> tu, tv, n;
+  T w, x, y, z;  // the unit quaternion
+  T inv;         // 1 / |q|
+  MaskOf<T> ok;
+};
+template <class T>
+BT_HD Rotation<T> rotation(const T* q) {
+  const T zero = T(0.0f), one = T(1.0f), two = T(2.0f);
+  Rotation<T> r;
+  T big = zero;
   for (int i = 0; i < 4; ++i) big = max_(big, abs_(q[i]));
-  r.ok = big > S(0) && finite_(big);
-  const S scale = r.ok ? S(1) / big : S(0);
-  const S a = q[0] * scale, b = q[1] * scale, c = q[2] * scale, d = q[3] * scale;
-  const S length = sqrt_(a * a + b * b + c * c + d * d);
-  const S k = r.ok ? S(1) / length : S(0);
+  r.ok = (big > zero) & finite_(big);
+  const T scale = select(r.ok, one / select(r.ok, big, one), zero);
+  const T a = q[0] * scale, b = q[1] * scale, c = q[2] * scale, d = q[3] * scale;
+  const T length = sqrt_(a * a + b * b + c * c + d * d);
+  const T k = select(r.ok, one / select(r.ok, length, one), zero);
   r.inv = k * scale;
-  r.w = r.ok ? a * k : S(1), r.x = b * k, r.y = c * k, r.z = d * k;
-  const S w = r.w, x = r.x, y = r.y, z = r.z;
-  r.tu = {S(1) - S(2) * (y * y + z * z), S(2) * (x * y + w * z), S(2) * (x * z - w * y)};
-  r.tv = {S(2) * (x * y - w * z), S(1) - S(2) * (x * x + z * z), S(2) * (y * z + w * x)};
-  r.n = {S(2) * (x * z + w * y), S(2) * (y * z - w * x), S(1) - S(2) * (x * x + y * y)};
+  r.w = select(r.ok, a * k, one), r.x = b * k, r.y = c * k, r.z = d * k;
+  const T w = r.w, x = r.x, y = r.y, z = r.z;
+  r.tu = {one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)};
+  r.tv = {two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)};
+  r.n = {two * (x * z + w * y), two * (y * z - w * x), one - two * (x * x + y * y)};
   return r;
 }
 template <class S>
@@ -138,77 +155,76 @@ BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec3<S> dv, Vec3<S> dn
 }
 
 // s = exp of the clamped log scale; ds/dlog is s inside the range and 0 beyond.
-template <class S>
-BT_HD S surfel_scale(S log_scale) {
-  return exp_(clamp_(log_scale, S(-kLogScaleMax), S(kLogScaleMax)));
+template <class T>
+BT_HD T surfel_scale(T log_scale) {
+  return exp_(clamp_(log_scale, T(-kLogScaleMax), T(kLogScaleMax)));
 }
 template <class S>
 BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
-// Surfel i in the world, its centre in the camera's frame.
-template <class S>
+// A surfel in the world, its centre in the camera's frame.
+template <class T>
 struct WorldSurfel {
-  Rotation<S> rot;
-  S su, sv;  // scales
-  Vec3<S> p;
+  Rotation<T> rot;
+  T su, sv;  // scales
+  Vec3<T> p;
 };
-template <class S>
-BT_HD WorldSurfel<S> world_surfel(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i) {
-  return {rotation(in.quats + 4 * i), surfel_scale(in.log_scales[2 * i]), surfel_scale(in.log_scales[2 * i + 1]),
-          to_camera(cam, in.means + 3 * i)};
+template <class S, class T>
+BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& cam, const SurfelRow<T>& in) {
+  return {rotation(in.quat), surfel_scale(in.log_scale[0]), surfel_scale(in.log_scale[1]), to_camera(cam, in.mean)};
 }
 // And what else a camera sees of it: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and
 // scales.
-template <class S>
+template <class S, class T>
 struct CameraSurfel {
-  Vec3<S> a, b, n;
-  S np, sign, iz, ifx, ify, isu, isv;
+  Vec3<T> a, b, n;
+  T np, sign, iz, isu, isv;
+  S ifx, ify;
 };
-template <class S>
-BT_HD CameraSurfel<S> camera_surfel(const Pinhole<S>& cam, const WorldSurfel<S>& at) {
-  CameraSurfel<S> s;
+template <class S, class T>
+BT_HD CameraSurfel<S, T> camera_surfel(const Pinhole<S>& cam, const WorldSurfel<T>& at) {
+  const T one = T(1.0f);
+  CameraSurfel<S, T> s;
   s.a = rotate(cam.R, at.rot.tu), s.b = rotate(cam.R, at.rot.tv), s.n = rotate(cam.R, at.rot.n);
   s.np = dot(s.n, at.p);
-  s.sign = s.np < S(0) ? S(-1) : S(1);
-  s.iz = S(1) / at.p.z, s.ifx = S(1) / cam.fx, s.ify = S(1) / cam.fy, s.isu = S(1) / at.su, s.isv = S(1) / at.sv;
+  s.sign = select(s.np < T(0.0f), -one, one);
+  s.iz = one / at.p.z, s.isu = one / at.su, s.isv = one / at.sv;
+  s.ifx = S(1) / cam.fx, s.ify = S(1) / cam.fy;
   return s;
 }
 
-// Fills a row of geom and frames for surfel i; false (and untouched rows) when the surfel is not finite or its centre
-// is nearer than `near` (camera z).
-template <class Kernel, class S>
-BT_HD bool project(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, S* geom, S* frame) {
-  const S* log_scales = in.log_scales + 2 * i;
-  const S opacity_logit = in.opacity_logits[i], beta_raw = in.beta_raw[i];
-  const WorldSurfel<S> at = world_surfel(cam, in, i);
+// Fills a row of geom and of frames; false where the surfel is not finite or its centre is nearer than `near` (camera
+// z): the rows are then anything.
+template <class Kernel, class S, class T>
+BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T* g, T* frame) {
+  const WorldSurfel<T> at = world_surfel(cam, in);
   const auto& [rot, su, sv, p] = at;
-  if (!rot.ok || !finite_(p.x) || !finite_(p.y) || !finite_(p.z) || !(p.z > near)) return false;
-  if (!finite_(log_scales[0]) || !finite_(log_scales[1])) return false;
-  if (!finite_(opacity_logit) || !finite_(beta_raw)) return false;
-  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = camera_surfel(cam, at);
-  const Vec3<S> pa = cross(p, a), pb = cross(p, b);
-  S g[kGeom];
-  g[kCx] = cam.fx * p.x * iz + cam.cx;
-  g[kCy] = cam.fy * p.y * iz + cam.cy;
-  g[kU1] = -sign * pb.x * ifx * isu, g[kU2] = -sign * pb.y * ify * isu;
-  g[kV1] = sign * pa.x * ifx * isv, g[kV2] = sign * pa.y * ify * isv;
-  g[kW0] = sign * np * iz, g[kW1] = sign * n.x * ifx, g[kW2] = sign * n.y * ify;
+  const auto [a, b, n, np, sign, iz, isu, isv, ifx, ify] = camera_surfel(cam, at);
+  const Vec3<T> pa = cross(p, a), pb = cross(p, b);
+  g[kCx] = T(cam.fx) * p.x * iz + T(cam.cx);
+  g[kCy] = T(cam.fy) * p.y * iz + T(cam.cy);
+  g[kU1] = -sign * pb.x * T(ifx) * isu, g[kU2] = -sign * pb.y * T(ify) * isu;
+  g[kV1] = sign * pa.x * T(ifx) * isv, g[kV2] = sign * pa.y * T(ify) * isv;
+  g[kW0] = sign * np * iz, g[kW1] = sign * n.x * T(ifx), g[kW2] = sign * n.y * T(ify);
   g[kZ] = p.z;
-  g[kOpacity] = sigmoid(opacity_logit);
-  g[kBeta] = S(kBetaMax) * sigmoid(beta_raw);
+  g[kOpacity] = sigmoid(in.opacity_logit);
+  g[kBeta] = T(kBetaMax) * sigmoid(in.beta_raw);
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
-  // discs of a million pixels need no filter, and their squared areas would overflow
-  const S area = cam.fx * cam.fy * su * sv * iz * iz;
-  g[kArea] = Kernel::kPixel && area < S(1e12) ? area : S(0);
-  for (int i = 0; i < kGeom; ++i)
-    if (!finite_(g[i])) return false;
-  for (int i = 0; i < kGeom; ++i) geom[i] = g[i];
-  store3(frame, load3(in.means + 3 * i));
-  store3(frame + 3, su * rot.tu);
-  store3(frame + 6, sv * rot.tv);
-  return true;
+  g[kArea] = T(0.0f);
+  if constexpr (Kernel::kPixel) {
+    // discs of a million pixels need no filter, and their squared areas would overflow
+    const T area = T(cam.fx) * T(cam.fy) * su * sv * iz * iz;
+    g[kArea] = select(area < T(1e12), area, T(0.0f));
+  }
+  MaskOf<T> ok = rot.ok & finite_(p.x) & finite_(p.y) & (p.z > T(near)) & finite_(in.log_scale[0]);
+  ok = ok & finite_(in.log_scale[1]) & finite_(in.opacity_logit) & finite_(in.beta_raw);
+  for (int i = 0; i < kGeom; ++i) ok = ok & finite_(g[i]);
+  const Vec3<T> tu = su * rot.tu, tv = sv * rot.tv;
+  const T f[kFrame] = {in.mean.x, in.mean.y, in.mean.z, tu.x, tu.y, tu.z, tv.x, tv.y, tv.z};
+  for (int i = 0; i < kFrame; ++i) frame[i] = f[i];
+  return ok;
 }
 
 // Gradients of the parameters of surfel i from those of its rows; they are written, not added, and 0 where the camera
@@ -227,9 +243,9 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   const S none[kFrame] = {};
   if (!dframe) dframe = none;
   const S* log_scales = in.log_scales + 2 * i;
-  const WorldSurfel<S> at = world_surfel(cam, in, i);
+  const WorldSurfel<S> at = world_surfel(cam, surfel_row(in, i));
   const auto& [rot, su, sv, p] = at;
-  const auto [a, b, n, np, sign, iz, ifx, ify, isu, isv] = camera_surfel(cam, at);
+  const auto [a, b, n, np, sign, iz, isu, isv, ifx, ify] = camera_surfel(cam, at);
 
   const Vec3<S> dpb = {-sign * ifx * isu * dgeom[kU1], -sign * ify * isu * dgeom[kU2], S(0)};
   const Vec3<S> dpa = {sign * ifx * isv * dgeom[kV1], sign * ify * isv * dgeom[kV2], S(0)};

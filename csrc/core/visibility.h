@@ -15,26 +15,45 @@ BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
   return finite;
 }
 
-// Rows of surfel i in geom, frames and radii (half extents of the level set's box in pixels); all 0 where the camera
-// does not see it. False when that is because a parameter is not finite.
+// What a camera sees of a surfel, or of one in each lane: rows of geom and frames, and half extents of the level set's
+// box in pixels. `projected`: it is finite and in front of the camera; `seen`: and its box meets the image.
+template <class T>
+struct Sight {
+  T geom[kGeom], frame[kFrame], radii[2];
+  MaskOf<T> projected, seen;
+};
+// Marks those whose box meets the image, of the ones that are visible at all.
+template <class T, class E>
+BT_HD void find_seen(MaskOf<T> visible, const E& extent, int width, int height, Sight<T>& s) {
+  const auto columns = columns_of(extent), rows = rows_of(extent);
+  const T x0 = narrowed<T>(columns.x0), x1 = narrowed<T>(columns.x1), y0 = narrowed<T>(rows.x0),
+          y1 = narrowed<T>(rows.x1), zero = T(0.0f), most = T(1e6);
+  const T cx = s.geom[kCx], cy = s.geom[kCy];
+  s.seen = s.projected & visible & (x0 < x1) & (cx + x1 >= zero) & (T(width) >= cx + x0);
+  s.seen = s.seen & (cy + y1 >= zero) & (T(height) >= cy + y0);
+  s.radii[0] = min_(most, max_(x1, -x0)), s.radii[1] = min_(most, max_(y1, -y0));
+}
+template <class Kernel, class S>
+BT_HD Sight<S> sight(const Pinhole<S>& cam, int width, int height, const SurfelRow<S>& in, S near,
+                     const Resize<S>& to) {
+  Sight<S> s;
+  s.projected = project<Kernel>(cam, in, near, s.geom, s.frame);
+  if constexpr (Kernel::kResized) s.projected = s.projected && resize(to, s.geom);
+  const Extent e = extent<Kernel>(s.geom, double(to.sharp));
+  find_seen(e.visible, e, width, height, s);
+  return s;
+}
+
+// Writes the rows of surfel i; all 0 where the camera does not see it. False when that is because a parameter is not
+// finite.
 template <class Kernel, class S>
 BT_HD bool project_visible(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near,
                            const Resize<S>& to, S* geom, S* frames, S* radii) {
-  S g[kGeom], f[kFrame], r[2] = {S(0), S(0)};
-  bool projected = project<Kernel>(cam, in, i, near, g, f);
-  if constexpr (Kernel::kResized) projected = projected && resize(to, g);
-  bool seen = projected;
-  if (projected) {
-    const Extent e = extent<Kernel>(g, double(to.sharp));
-    const Interval<double> x = columns_of(e), y = rows_of(e);
-    seen = e.visible && g[kCx] + x.x1 >= 0 && g[kCx] + x.x0 <= width && g[kCy] + y.x1 >= 0 && g[kCy] + y.x0 <= height;
-    const double most = 1e6;
-    if (seen) r[0] = S(min_(most, max_(x.x1, -x.x0))), r[1] = S(min_(most, max_(y.x1, -y.x0)));
-  }
-  for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = seen ? g[k] : S(0);
-  for (int k = 0; k < kFrame; ++k) frames[i * kFrame + k] = seen ? f[k] : S(0);
-  radii[2 * i] = r[0], radii[2 * i + 1] = r[1];
-  return projected || surfel_finite(in, i);
+  const Sight<S> s = sight<Kernel>(cam, width, height, surfel_row(in, i), near, to);
+  for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = s.seen ? s.geom[k] : S(0);
+  for (int k = 0; k < kFrame; ++k) frames[i * kFrame + k] = s.seen ? s.frame[k] : S(0);
+  for (int k = 0; k < 2; ++k) radii[2 * i + k] = s.seen ? s.radii[k] : S(0);
+  return s.projected || surfel_finite(in, i);
 }
 
 }  // namespace bt

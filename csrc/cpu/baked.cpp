@@ -28,33 +28,42 @@ inline Texels<S> texels_of(const Wide<uint32_t>& rgba) {
   for (int c = 0; c < 3; ++c) t.rgb[c] = from_integers<S>(rgba >> 8 * c & 255u);
   return t;
 }
-#if defined(__AVX2__)
-// Of eight lanes, those at `at`: from 8 bytes for each, which hold both.
-inline void eight_pairs(const uint8_t* patch, const int32_t* at, __m256i* left, __m256i* right) {
+// The texels at 16 places and their right neighbours, from 8 bytes for each, which hold both.
+inline void pairs_of(const uint8_t* patch, const int32_t* at, Wide<uint32_t>* left, Wide<uint32_t>* right) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  const auto eight = [&](const int32_t* places) {
+    const __m256i p = _mm256_loadu_si256((const __m256i*)places);
+    return _mm512_mask_i32gather_epi64(_mm512_setzero_si512(), __mmask8(0xff), p, patch, 4);
+  };
+  const __m512i low = eight(at), high = eight(at + 8);
+  const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+  const __m512i odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+  *left = (Wide<uint32_t>)_mm512_permutex2var_epi32(low, even, high);
+  *right = (Wide<uint32_t>)_mm512_permutex2var_epi32(low, odd, high);
+#elif defined(__AVX2__)
   const auto two = [&](int i) {
     const __m128i first = _mm_loadl_epi64((const __m128i*)(patch + 4 * int64_t(at[i])));
     int64_t second;
     std::memcpy(&second, patch + 4 * int64_t(at[i + 1]), sizeof second);
     return _mm_insert_epi64(first, second, 1);
   };
-  const __m256 a = (__m256)_mm256_set_m128i(two(4), two(0)), b = (__m256)_mm256_set_m128i(two(6), two(2));
-  *left = (__m256i)_mm256_shuffle_ps(a, b, 0x88), *right = (__m256i)_mm256_shuffle_ps(a, b, 0xdd);
-}
-#endif
-template <class S>
-inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
-#if defined(__AVX2__)
-  __m256i l[2], r[2];
-  eight_pairs(patch, at, l, r), eight_pairs(patch, at + 8, l + 1, r + 1);
-  const Wide<uint32_t> left = joined(l[0], l[1]), right = joined(r[0], r[1]);
+  const auto eight = [&](int i, Vector<uint32_t>& l, Vector<uint32_t>& r) {
+    const __m256 a = (__m256)_mm256_set_m128i(two(i + 4), two(i)), b = (__m256)_mm256_set_m128i(two(i + 6), two(i + 2));
+    l = (Vector<uint32_t>)_mm256_shuffle_ps(a, b, 0x88), r = (Vector<uint32_t>)_mm256_shuffle_ps(a, b, 0xdd);
+  };
+  eight(0, left->low, right->low), eight(8, left->high, right->high);
 #else
-  Wide<uint32_t> left, right;
   uint32_t pair[2];
   for (int i = 0; i < kLanes; ++i) {
     std::memcpy(pair, patch + 4 * int64_t(at[i]), sizeof pair);
-    set_lane(left, i, pair[0]), set_lane(right, i, pair[1]);
+    set_lane(*left, i, pair[0]), set_lane(*right, i, pair[1]);
   }
 #endif
+}
+template <class S>
+inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
+  Wide<uint32_t> left, right;
+  pairs_of(patch, at, &left, &right);
   return {texels_of<S>(left), texels_of<S>(right)};
 }
 template <class S>
@@ -120,60 +129,91 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
 }
 
 namespace {
+// What a surfel is drawn from besides its row of geom, in one place: in every tile that it touches it is looked up.
+template <class S>
+struct DrawnSurfel {
+  S view[3];             // its colour without a residual
+  S bound;               // fragments of smaller weight have none
+  S flat[3];             // the residual where there are no texels
+  S k;                   // texels per scale unit are k times the texels along a side
+  const Patches* level;  // null: no texels
+  int64_t first;
+  int32_t sides[2];
+};
+
 // The level of a surfel's tile that a view shows; null: its mean alone.
 template <class S>
 const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
   const int32_t* sides = a.patches->sides.data() + 2 * id;
+  if (!sides[0]) return nullptr;
+  if (!a.coarser[0]) return a.patches;
   int level = tile_level(a.view.geom + id * kGeom, sides[0], sides[1], extent, a.view.photo_pixel);
   if (level == kTileLevels) return a.residual.mean_residual ? nullptr : a.patches;
   while (level && !(a.coarser[level - 1] && a.coarser[level - 1]->sides[2 * id])) --level;
   return level ? a.coarser[level - 1] : a.patches;
 }
 
-// Residuals of a surfel's level at surfel coordinates.
 template <class S>
-inline Texels<S> fetch(const Patches& level, int64_t id, S extent, Pack<S> u, Pack<S> v, const BakedResidual& atlas) {
-  const int32_t* sides = level.sides.data() + 2 * id;
-  const Pack<S> x = texel_position(u, sides[0], extent), y = texel_position(v, sides[1], extent);
-  const int64_t first = 4 * level.first[id];
-  Texels<S> t = level.floats.empty() ? bilinear<S>(level.bytes.data() + first, sides[0], x, y)
-                                     : bilinear<S>(level.floats.data() + first, sides[0], x, y);
-  for (auto& channel : t.rgb) channel = Pack<S>(S(atlas.offset)) + Pack<S>(S(atlas.scale)) * channel;
+DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t id) {
+  const BakedResidual& atlas = a.residual;
+  const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
+  DrawnSurfel<S> d;
+  store3(d.view, view_base(load3(a.base + 3 * id)));
+  for (int c = 0; c < 3; ++c) d.flat[c] = atlas.mean_residual ? S(atlas.mean_residual[3 * id + c]) : S(0);
+  d.k = S(1) / (S(2) * extent);
+  d.level = level_of(a, id, extent);
+  d.first = d.level ? 4 * d.level->first[id] : 0;
+  for (int k = 0; k < 2; ++k) d.sides[k] = d.level ? d.level->sides[2 * id + k] : 0;
+  const bool plain = !d.level && d.flat[0] == 0 && d.flat[1] == 0 && d.flat[2] == 0;
+  d.bound = plain ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
+  return d;
+}
+
+// Residuals of a surfel at surfel coordinates.
+template <class S>
+inline Texels<S> residual_of(const DrawnSurfel<S>& d, Pack<S> u, Pack<S> v, const BakedResidual& atlas) {
+  using P = Pack<S>;
+  if (!d.level) return {P(d.flat[0]), P(d.flat[1]), P(d.flat[2])};
+  const P x = texel_position_scaled(u, S(d.sides[0] - 1), d.k), y = texel_position_scaled(v, S(d.sides[1] - 1), d.k);
+  Texels<S> t = d.level->floats.empty() ? bilinear<S>(d.level->bytes.data() + d.first, d.sides[0], x, y)
+                                        : bilinear<S>(d.level->floats.data() + d.first, d.sides[0], x, y);
+  for (auto& channel : t.rgb) channel = P(S(atlas.offset)) + P(S(atlas.scale)) * channel;
   return t;
 }
 
 // Asks for what a surfel that comes soon is drawn from: a tile's list names surfels from all over the memory.
 constexpr int kAhead = 3;
 template <class S>
-void prefetch(const BakedForward<S>& a, int64_t id) {
+void prefetch(const BakedForward<S>& a, const DrawnSurfel<S>* drawn, int64_t id) {
   __builtin_prefetch(a.view.geom + id * kGeom);
   __builtin_prefetch(a.view.radii + 2 * id);
-  __builtin_prefetch(a.base + 3 * id);
-  __builtin_prefetch(a.patches->sides.data() + 2 * id);
-  __builtin_prefetch(a.patches->first.data() + id);
+  __builtin_prefetch(a.bins->level.data() + 2 * id);
+  __builtin_prefetch(drawn + id);
 }
 // And later for its first texels.
 template <class S>
-void prefetch_texels(const BakedForward<S>& a, int64_t id) {
-  if (a.patches->bytes.empty()) return;
-  const uint8_t* p = a.patches->bytes.data() + 4 * a.patches->first[id];
+void prefetch_texels(const DrawnSurfel<S>& d) {
+  if (!d.level || d.level->bytes.empty()) return;
+  const uint8_t* p = d.level->bytes.data() + d.first;
   for (int line = 0; line < 4; ++line) __builtin_prefetch(p + 64 * line);
 }
 
-template <class Kernel, class S>
+template <class Kernel, bool kMaps, class S>
 void baked_forward(const BakedForward<S>& a) {
   using P = Pack<S>;
-  const S *geom = a.view.geom, *radii = a.view.radii, *base = a.base, near = a.view.near;
   const int width = a.view.width, height = a.view.height;
-  const bool maps = a.maps;
   const Bins& bins = *a.bins;
   const BakedResidual& atlas = a.residual;
   S* image = a.image;
   int32_t* overdraw = a.overdraw;
-  constexpr float kNone[3] = {0, 0, 0};
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
-  const int channels = maps ? kMapChannels : kBakedChannels;
+  constexpr int channels = kMaps ? kMapChannels : kBakedChannels;
   const S photo_pixel = a.view.photo_pixel, sharp = Resize<S>(photo_pixel).sharp;
+  std::vector<DrawnSurfel<S>> drawn(a.view.n);
+  parallel_parts(a.view.n, 1024, [&](int, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i)
+      if (a.view.radii[2 * i] > S(0)) drawn[i] = drawn_surfel(a, i);
+  });
 #pragma omp parallel for num_threads(num_threads()) schedule(dynamic, 2)
   for (int64_t tile = 0; tile < tiles; ++tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
@@ -182,33 +222,23 @@ void baked_forward(const BakedForward<S>& a) {
     for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
-      if (k + kAhead < bins.start[tile + 1]) prefetch(a, bins.surfels[k + kAhead]);
-      if (k + 1 < bins.start[tile + 1]) prefetch_texels(a, bins.surfels[k + 1]);
-      const S* g = geom + id * kGeom;
-      const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
-      bool tiled = a.patches->sides[2 * id] != 0;
-      // found when a fragment asks for texels, which those below the weight bound do not
-      const Patches* level = a.coarser[0] ? nullptr : a.patches;
-      const float* flat = atlas.mean_residual ? atlas.mean_residual + 3 * id : kNone;
-      const bool plain_only = !tiled && flat[0] == 0 && flat[1] == 0 && flat[2] == 0;
-      const S bound = plain_only ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
-      S view[3];
-      store3(view, view_base(load3(base + 3 * id)));
-      state.template blend<Kernel>(
-          g, radii + 2 * id, near,
+      if (k + kAhead < bins.start[tile + 1]) prefetch(a, drawn.data(), bins.surfels[k + kAhead]);
+      if (k + 1 < bins.start[tile + 1]) prefetch_texels(drawn[bins.surfels[k + 1]]);
+      const DrawnSurfel<S>& d = drawn[id];
+      state.template blend<Kernel, kMaps>(
+          a.view, bins, id,
           [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
-            const typename P::M textures = taken & (weight >= P(bound));
+            const typename P::M textures = taken & (weight >= P(d.bound));
             const P w = select(taken, weight, P(S(0)));
-            P colour[3] = {P(view[0]), P(view[1]), P(view[2])};
+            P colour[3] = {P(d.view[0]), P(d.view[1]), P(d.view[2])};
             if (bits(textures)) {
-              if (tiled && !level) level = level_of(a, id, extent), tiled = level != nullptr;
-              const Texels<S> residual = tiled ? fetch<S>(*level, id, extent, f.u, f.v, atlas)
-                                               : Texels<S>{P(S(flat[0])), P(S(flat[1])), P(S(flat[2]))};
+              const Texels<S> residual = residual_of(d, f.u, f.v, atlas);
               for (int c = 0; c < 3; ++c) colour[c] = select(textures, shaded(colour[c], residual.rgb[c]), colour[c]);
             }
             for (int c = 0; c < 3; ++c) sums[c][pack] += w * colour[c];
             sums[3][pack] += w;
-            if (maps) {
+            if constexpr (kMaps) {
+              const S* g = a.view.geom + id * kGeom;
               sums[4][pack] += w * P(g[kBeta]);
               sums[5][pack] += select(taken, w * f.depth, P(S(0)));
               for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
@@ -234,8 +264,10 @@ void baked_forward(const BakedForward<S>& a) {
 template <class S>
 void baked_forward(const BakedForward<S>& a) {
   bin(a.view, *a.bins);
-  with_kernel(a.view.through_pixel, float(a.view.photo_pixel),
-              [&](auto kernel) { baked_forward<decltype(kernel)>(a); });
+  with_kernel(a.view.through_pixel, float(a.view.photo_pixel), [&](auto kernel) {
+    using Kernel = decltype(kernel);
+    a.maps ? baked_forward<Kernel, true>(a) : baked_forward<Kernel, false>(a);
+  });
 }
 
 template void baked_forward(const BakedForward<float>&);

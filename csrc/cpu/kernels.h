@@ -26,13 +26,15 @@ void project_forward(const ProjectForward<S>& a);
 template <class S>
 void project_backward(const ProjectBackward<S>& a);
 
-// Per tile, the visible surfels front to back.
+// Per tile, the visible surfels front to back, and of each where it may be drawn: the squared radius of its kernel's
+// level set, in scale units, and that of the low pass's in pixels, 0 where that is nowhere above the kernel.
 struct Bins {
   Bins() = default;
   Bins(const Bins&) = delete;  // nanobind would else offer copies
   int tiles_x = 0, tiles_y = 0;
   std::vector<int64_t> start;    // [tiles + 1]
   std::vector<int32_t> surfels;  // [start.back()]
+  std::vector<float> level;      // [n, 2], of the visible ones
 };
 template <class S>
 void bin(const View<S>& view, Bins& bins);

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstring>
+#include <limits>
 #include <type_traits>
 
 #include "core/common.h"
@@ -18,14 +19,16 @@ template <class S>
 struct LaneTypes;
 template <>
 struct LaneTypes<float> {
-  using M = decltype(Wide<float>{} > Wide<float>{});  // lanes of 0 or -1
+  using M = decltype(above(Wide<float>{}, Wide<float>{}));
+  using I = Wide<int32_t>;
   using U = Wide<uint32_t>;
   typedef float O __attribute__((vector_size(32)));
   typedef float Q __attribute__((vector_size(16)));
 };
 template <>
 struct LaneTypes<double> {
-  using M = decltype(Wide<double>{} > Wide<double>{});
+  using M = decltype(above(Wide<double>{}, Wide<double>{}));
+  using I = Wide<int64_t>;
   using U = Wide<uint64_t>;
   typedef double O __attribute__((vector_size(64)));
   typedef double Q __attribute__((vector_size(32)));
@@ -43,7 +46,8 @@ struct IndexOf<Pack<S>> {
 template <class S>
 struct Pack {
   using V = Wide<S>;
-  using M = typename LaneTypes<S>::M;
+  using M = typename LaneTypes<S>::M;  // a mask
+  using I = typename LaneTypes<S>::I;  // whole numbers
   V v;
   Pack() = default;
   BT_HD Pack(const V& value) : v(value) {}
@@ -84,18 +88,18 @@ BT_HD Pack<S>& operator-=(Pack<S>& a, Pack<S> b) {
   a.v = a.v - b.v;
   return a;
 }
-// Comparisons give lane masks, which combine with & | ~.
+// Comparisons give masks, which combine with & | ~.
 template <class S>
 BT_HD typename Pack<S>::M operator>(Pack<S> a, Pack<S> b) {
-  return a.v > b.v;
+  return above(a.v, b.v);
 }
 template <class S>
 BT_HD typename Pack<S>::M operator<(Pack<S> a, Pack<S> b) {
-  return a.v < b.v;
+  return above(b.v, a.v);
 }
 template <class S>
 BT_HD typename Pack<S>::M operator>=(Pack<S> a, Pack<S> b) {
-  return a.v >= b.v;
+  return at_least(a.v, b.v);
 }
 template <class S>
 BT_HD Pack<S> select(typename Pack<S>::M m, Pack<S> yes, Pack<S> no) {
@@ -119,7 +123,7 @@ BT_HD Pack<S> relu(Pack<S> a) {
 // that few operations wait for one another.
 BT_HD Pack<float> exp_(Pack<float> x) {
   using V = Pack<float>::V;
-  using M = Pack<float>::M;
+  using I = Pack<float>::I;
   V a = min_(max_(x, Pack<float>(-87.0f)), Pack<float>(88.0f)).v;
   const V magic = Pack<float>(12582912.0f).v;  // 1.5 * 2^23: adding it rounds to an integer
   const V n = (a * 1.44269504f + magic) - magic;
@@ -127,16 +131,16 @@ BT_HD Pack<float> exp_(Pack<float> x) {
   // exp(f) = 1 + f + f^2 q
   const V q = (0.166665211f * f + 0.49999994f) + f2 * ((8.36871658e-3f * f + 4.16683890e-2f) + f2 * 1.38145988e-3f);
   const V p = (1.0f + f) + f2 * q;
-  const V two_n = same_bits<V>((convert<M>(n) + 127) << 23);
+  const V two_n = same_bits<V>((convert<I>(n) + 127) << 23);
   return choose(x.v < -87.0f, V{}, p * two_n);
 }
 BT_HD Pack<float> log_(Pack<float> x) {
   using V = Pack<float>::V;
-  using M = Pack<float>::M;
-  const M bits = same_bits<M>(x.v);
+  using I = Pack<float>::I;
+  const I bits = same_bits<I>(x.v);
   // mantissa in [sqrt(1/2), sqrt(2)), so that the logarithm keeps its relative accuracy near 1
-  const M shifted = bits - 0x3f3504f3;
-  const M e = shifted >> 23;
+  const I shifted = bits - 0x3f3504f3;
+  const I e = shifted >> 23;
   const V m = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3);
   const V f = m - 1.0f, f2 = f * f, f4 = f2 * f2;
   // log(1 + f) = f - f^2 / 2 + f^3 q
@@ -146,6 +150,47 @@ BT_HD Pack<float> log_(Pack<float> x) {
   const V n = convert<V>(e);
   return (r + n * 1.42860677e-6f) + n * 0.693145752f;
 }
+// x^y for x in (0, 1] and y >= 0, below 1e-6 of it where it is above 1e-3: as exp_ of y log_(x), which is as accurate
+// wherever x is, in half of the operations; at least 2^-126, as smaller numbers are slow. Logarithm and power are those
+// of 2.
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+// 1 / m and its logarithm's opposite in the middles of 16 parts of [1, 2)
+alignas(64) inline constexpr float kInverse[16] = {
+    0.969696999f, 0.914285719f, 0.864864886f, 0.820512831f, 0.780487776f, 0.744186044f, 0.711111128f, 0.680851042f,
+    0.653061211f, 0.627451003f, 0.603773594f, 0.581818163f, 0.561403513f, 0.542372882f, 0.524590135f, 0.507936537f};
+alignas(64) inline constexpr float kLogarithm[16] = {
+    0.0443940759f, 0.129283011f, 0.209453329f, 0.285402209f, 0.357552052f, 0.426264763f, 0.491853058f, 0.554588914f,
+    0.614709854f,  0.67242527f,  0.727920413f, 0.781359732f, 0.832889974f, 0.882643044f, 0.930737436f, 0.977279842f};
+BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) {
+  constexpr __mmask16 kAll = 0xffff;
+  using V = Pack<float>::V;
+  const __m512 m = _mm512_maskz_getmant_ps(kAll, (__m512)x.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src);
+  const __m512i part = _mm512_maskz_srli_epi32(kAll, (__m512i)m, 19);  // of which four bits count below
+  const V c = (V)_mm512_maskz_permutexvar_ps(kAll, part, _mm512_load_ps(kInverse));
+  const V l = (V)_mm512_maskz_permutexvar_ps(kAll, part, _mm512_load_ps(kLogarithm));
+  const V r = (V)m * c - 1.0f;
+  const V q = (0.481303573f * r - 0.721644163f) * r + 1.4426949f;
+  const V a = larger(y.v * ((V)_mm512_maskz_getexp_ps(kAll, (__m512)x.v) + (r * q + l)), Pack<float>(-126.0f).v);
+  const V n = (V)_mm512_maskz_roundscale_ps(kAll, (__m512)a, _MM_FROUND_TO_NEAREST_INT);
+  const V f = a - n, f2 = f * f;
+  const V p = (0.693147004f + 0.240222424f * f) + f2 * ((5.55073358e-2f + 9.67151299e-3f * f) + f2 * 1.32647273e-3f);
+  return (V)_mm512_maskz_scalef_ps(kAll, (__m512)(f * p + 1.0f), (__m512)n);
+}
+#else
+BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) {
+  using V = Pack<float>::V;
+  using I = Pack<float>::I;
+  const I shifted = same_bits<I>(x.v) - 0x3f3504f3;
+  const V r = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3) - 1.0f, r2 = r * r;  // m - 1, m in [sqrt(1/2), sqrt(2))
+  const V low = (1.44269478f - 0.721357167f * r) + r2 * (0.480939448f - 0.360087216f * r);
+  const V high = (0.286707461f - 0.250069052f * r) + r2 * (0.23689033f - 0.145744368f * r);
+  const V a = larger(y.v * (convert<V>(shifted >> 23) + r * (low + (r2 * r2) * high)), Pack<float>(-126.0f).v);
+  const V magic = Pack<float>(12582912.0f).v, moved = a + magic;  // as in exp_
+  const V f = a - (moved - magic), f2 = f * f;
+  const V p = (0.693147004f + 0.240222424f * f) + f2 * ((5.55073358e-2f + 9.67151299e-3f * f) + f2 * 1.32647273e-3f);
+  return same_bits<V>(same_bits<I>(f * p + 1.0f) + (same_bits<I>(moved) << 23));
+}
+#endif
 BT_HD Pack<double> exp_(Pack<double> x) {
   Pack<double> r;
   for (int i = 0; i < kLanes; ++i) r.set(i, std::exp(x[i]));
@@ -155,6 +200,20 @@ BT_HD Pack<double> log_(Pack<double> x) {
   Pack<double> r;
   for (int i = 0; i < kLanes; ++i) r.set(i, std::log(x[i]));
   return r;
+}
+
+BT_HD Pack<double> widened(Pack<float> a) { return all_widened(a.v); }
+BT_HD Pack<double> widened(Pack<double> a) { return a; }
+template <class T>
+BT_HD T narrowed(Pack<double> a) {
+  if constexpr (std::is_same_v<T, Pack<float>>)
+    return all_narrowed(a.v);
+  else
+    return a;
+}
+template <class S>
+BT_HD typename Pack<S>::M finite_(Pack<S> a) {
+  return abs_(a) < Pack<S>(std::numeric_limits<S>::infinity());  // not for NaN
 }
 
 // The lanes named by `keep`, next to each other; `to` has room for a whole pack.
@@ -179,14 +238,11 @@ BT_HD Pack<S> sqrt_(Pack<S> a) {
 }
 template <class S>
 BT_HD Pack<S> floor_(Pack<S> a) {
-  // truncation, then one less where that went up; exact below 2^31
-  using V = typename Pack<S>::V;
-  const V t = convert<V>(convert<typename Pack<S>::M>(a.v));
-  return t - choose(t > a.v, Pack<S>(S(1)).v, V{});
+  return round_down(a.v);
 }
 template <class S>
 BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
-  return same_bits<typename IndexOf<Pack<S>>::type>(convert<typename Pack<S>::M>(a.v));
+  return same_bits<typename IndexOf<Pack<S>>::type>(convert<typename Pack<S>::I>(a.v));
 }
 // Lanes of integers below 2^24, and such lanes as integers.
 template <class S>

@@ -8,12 +8,15 @@
 namespace bt {
 
 constexpr int kPackSide = 4, kPacksAcross = kTile / kPackSide, kPacks = kPacksAcross * kPacksAcross;
-constexpr uint32_t kColumns = 0x1111;  // a bit for the first pack of each row
 static_assert(kPacks == kLanes && kPacksAcross == 4, "a bit and a lane for each pack of a tile");
 
 // A pack's first pixel in its tile.
 inline int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
 inline int pack_row(int pack) { return pack / kPacksAcross * kPackSide; }
+template <class S>
+inline constexpr S kPackColumn[kPacks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
+template <class S>
+inline constexpr S kPackRow[kPacks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
 
 // A tile's transmittance while its surfels are drawn front to back.
 template <class S>
@@ -43,31 +46,37 @@ struct TileState {
     }
   }
 
-  // Blends a surfel: fn(pack, mask of its pixels, fragment, weight) for every pack in which some pixel takes it.
-  template <class Kernel, class F>
-  void blend(const S* g, const S* radius, S near, F&& fn, S sharp = S(1)) {
-    const S cx = g[kCx] - x0, cy = g[kCy] - y0;
-    uint32_t packs = open_packs & boxed(cx, cy, radius);
-    const Reached r = filtered<Kernel>(g) ? Reached{packs, 0} : reached<Kernel>(g, cx, cy, sharp);
-    packs &= r.support | r.centre;
+  // Blends surfel `id`: fn(pack, mask of its pixels, fragment, weight) for every pack in which some pixel takes it.
+  // Without kAll the fragment has no depth and does not tell whether the low pass is drawn.
+  template <class Kernel, bool kAll, class F>
+  void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp = S(1)) {
+    const S *g = view.geom + id * kGeom, cx = g[kCx] - x0, cy = g[kCy] - y0;
+    const Reached r = reached<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
+    uint32_t packs = open_packs & (r.support | r.centre);
     // all fragments first: what a branch on one of them waits for is then known
     Fragment<P> found[kPacks];
     int at[kPacks], n = 0;
     for (; packs; packs &= packs - 1) {
       const int pack = __builtin_ctz(packs);
-      const P dx = lane_x + P(S(pack_column(pack)) - cx), dy = lane_y + P(S(pack_row(pack)) - cy);
+      const P dx = lane_x + P(kPackColumn<S>[pack] - cx), dy = lane_y + P(kPackRow<S>[pack] - cy);
+      Fragment<P> f;
       if (filtered<Kernel>(g)) {
         const FilteredHit<P> hit = filtered_hit<S, P>(g, dx, dy);
-        if (bits(open[pack] & in_support(hit))) found[n] = filtered_fragment<S, P>(g, near, hit), at[n++] = pack;
-        continue;
+        if (!bits(open[pack] & in_support(hit))) continue;
+        f = filtered_fragment<S, P>(g, view.near, hit);
+      } else {
+        f = fragment<Kernel>(g, view.near, dx, dy, r.centre >> pack & 1, sharp);
       }
-      found[n] = fragment<Kernel>(g, near, dx, dy, r.centre >> pack & 1, sharp), at[n++] = pack;
+      Fragment<P>& to = found[n];
+      to.u = f.u, to.v = f.v, to.sigma = f.sigma;
+      if constexpr (kAll) to.depth = f.depth, to.low_pass = f.low_pass;
+      at[n++] = pack;
     }
     for (int i = 0; i < n; ++i) take_fragment(at[i], found[i], fn);
   }
 
  private:
-  // Packs with a pixel in a surfel's support, and with one near its centre.
+  // Packs with a pixel in the kernel's level set, and with one in the low pass's.
   struct Reached {
     uint32_t support, centre;
   };
@@ -81,35 +90,21 @@ struct TileState {
     if (bits(v.takes)) fn(pack, v.takes, f, b.weight);
     if (!bits(open[pack])) open_packs &= ~(1u << pack);
   }
-  // Packs that the box around a surfel's level set meets.
-  static uint32_t boxed(S cx, S cy, const S* radius) {
-    const int left = first(cx - radius[0]), right = last(cx + radius[0]);
-    const int top = first(cy - radius[1]), bottom = last(cy + radius[1]);
-    if (left > right || top > bottom) return 0;
-    const uint32_t columns = (2u << right) - (1u << left);
-    const uint32_t rows = (2u << (kPacksAcross * bottom + kPacksAcross - 1)) - (1u << kPacksAcross * top);
-    return rows & columns * kColumns;
-  }
-  // Packs in which a pixel may lie in a surfel's support or near its centre: never one too few, few too many. Within a
-  // pack a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
+  // Never one too few, few too many. Within a pack a plane differs from its value in the middle by no more than
+  // `spread`, and by what rounding may add.
   template <class Kernel>
-  Reached reached(const S* g, S cx, S cy, S sharp) const {
+  Reached reached(const S* g, S cx, S cy, const S* radius, const float* level) const {
     constexpr S kHalf = S(0.5 * (kPackSide - 1)), kRounding = S(1e-6), kPixelSlack = S(1e-3);
-    const P zero = P(S(0)), x = middle_x - P(cx), y = middle_y - P(cy);
+    const P zero = P(S(0)), x = middle_x - P(cx), y = middle_y - P(cy), far_x = abs_(x), far_y = abs_(y);
     const S half_x = kHalf + kRounding * (S(kTile) + abs_(cx)), half_y = kHalf + kRounding * (S(kTile) + abs_(cy));
+    const uint32_t box = bits((far_x < P(radius[0] + half_x)) & (far_y < P(radius[1] + half_y)));
+    if (filtered<Kernel>(g)) return {box, 0};
     const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
     const Planes<P> p = planes(g, x, y);
     const Planes<P> nearest = {max_(abs_(p.U) - P(spread(kU1)), zero), max_(abs_(p.V) - P(spread(kV1)), zero),
                                abs_(p.W) + P(spread(kW1) + kRounding * abs_(g[kW0]))};
-    const P dx = max_(abs_(x) - P(half_x + kPixelSlack), zero), dy = max_(abs_(y) - P(half_y + kPixelSlack), zero);
-    return {bits(within(nearest, P(S(kSupport2 * (1 + 1e-5))))), bits(near_centre<Kernel>(dx, dy, sharp))};
-  }
-  static int first(S offset) {  // pack that holds the pixel at this offset, at least 0
-    return offset <= S(0) ? 0 : int(offset) / kPackSide;
-  }
-  static int last(S offset) {
-    if (offset < S(0)) return -1;
-    return offset >= S(kTile) ? kPacksAcross - 1 : int(offset) / kPackSide;
+    const P dx = max_(far_x - P(half_x + kPixelSlack), zero), dy = max_(far_y - P(half_y + kPixelSlack), zero);
+    return {box & bits(within(nearest, P(S(level[0]) * S(1 + 1e-5)))), box & bits(dx * dx + dy * dy < P(S(level[1])))};
   }
 };
 

@@ -23,7 +23,6 @@ template <class Kernel, class S>
 void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
   using P = Pack<S>;
   using Block = typename FoundFragments<S>::Block;
-  const S *geom = view.geom, *radii = view.radii, near = view.near;
   const int width = view.width, height = view.height;
   const Bins& bins = to.bins;
   FoundFragments<S>& list = to.list;
@@ -55,29 +54,28 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
     TileState<S> state(tx, ty, width, height);
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
-      state.template blend<Kernel>(geom + int64_t(id) * kGeom, radii + 2 * int64_t(id), near,
-                                   [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
-                                     const uint32_t lanes = bits(taken);
-                                     if (!keep) {
-                                       count += __builtin_popcount(lanes);
-                                       return;
-                                     }
-                                     const int64_t at = from + count;
-                                     const int32_t corner =
-                                         (ty * kTile + pack_row(pack)) * width + tx * kTile + pack_column(pack);
-                                     int n = 0;
-                                     for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
-                                       const int lane = __builtin_ctz(rest);
-                                       a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
-                                       a.surfel[at + n] = id;
-                                     }
-                                     compress(&a.weight[at], weight, lanes);
-                                     compress(&a.u[at], f.u, lanes);
-                                     compress(&a.v[at], f.v, lanes);
-                                     compress(&a.depth[at], f.depth, lanes);
-                                     compress(&a.sigma[at], listed_sigma(f), lanes);
-                                     count += n;
-                                   });
+      state.template blend<Kernel, true>(
+          view, bins, id, [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
+            const uint32_t lanes = bits(taken);
+            if (!keep) {
+              count += __builtin_popcount(lanes);
+              return;
+            }
+            const int64_t at = from + count;
+            const int32_t corner = (ty * kTile + pack_row(pack)) * width + tx * kTile + pack_column(pack);
+            int n = 0;
+            for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
+              const int lane = __builtin_ctz(rest);
+              a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
+              a.surfel[at + n] = id;
+            }
+            compress(&a.weight[at], weight, lanes);
+            compress(&a.u[at], f.u, lanes);
+            compress(&a.v[at], f.v, lanes);
+            compress(&a.depth[at], f.depth, lanes);
+            compress(&a.sigma[at], listed_sigma(f), lanes);
+            count += n;
+          });
     }
     if (keep) a.used += count;
     found.fetch_add(count, std::memory_order_relaxed);

@@ -41,8 +41,19 @@ BT_VECTOR(uint64_t)
 template <class T>
 using Vector = typename VectorOf<T>::type;
 
-// Lanes of 0 or -1, as the compiler makes them: which of its 64-bit integers they are differs.
+// Masks are lanes of 0 or -1, as the compiler makes them: which of its 64-bit integers they are differs. AVX-512 has
+// registers with a bit for each lane, between which and such lanes the compiler goes to and fro: there the mask of
+// floats is what lies in one of these.
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+struct MaskOfFloats {
+  __mmask16 m;
+};
+BT_HD MaskOfFloats operator&(MaskOfFloats a, MaskOfFloats b) { return {__mmask16(a.m & b.m)}; }
+BT_HD MaskOfFloats operator|(MaskOfFloats a, MaskOfFloats b) { return {__mmask16(a.m | b.m)}; }
+BT_HD MaskOfFloats operator~(MaskOfFloats a) { return {__mmask16(~a.m)}; }
+#else
 using MaskOfFloats = decltype(Vector<float>{} > Vector<float>{});
+#endif
 using MaskOfDoubles = decltype(Vector<double>{} > Vector<double>{});
 
 // Two of them, or two pairs; lanes lie in memory as in one vector.
@@ -116,6 +127,26 @@ BT_HD V choose(const M& m, const V& yes, const V& no) {
   else
     return m ? yes : no;
 }
+// Masks of comparisons.
+template <class V>
+BT_HD auto above(const V& a, const V& b) {
+  return a > b;
+}
+template <class V>
+BT_HD auto at_least(const V& a, const V& b) {
+  return a >= b;
+}
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+BT_HD MaskOfFloats above(const Vector<float>& a, const Vector<float>& b) {
+  return {_mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ)};
+}
+BT_HD MaskOfFloats at_least(const Vector<float>& a, const Vector<float>& b) {
+  return {_mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ)};
+}
+BT_HD Vector<float> choose(MaskOfFloats m, const Vector<float>& yes, const Vector<float>& no) {
+  return (Vector<float>)_mm512_mask_blend_ps(m.m, (__m512)no, (__m512)yes);
+}
+#endif
 // a > b ? a : b and a < b ? a : b, for which processors have one instruction that the compiler does not find.
 template <class V>
 BT_HD V larger(const V& a, const V& b) {
@@ -131,24 +162,14 @@ BT_HD V smaller(const V& a, const V& b) {
   else
     return choose(a < b, a, b);
 }
-#if defined(__AVX2__)
-// Of the lower and the upper eight lanes; through the memory it would wait until both are written.
-BT_HD Wide<uint32_t> joined(__m256i low, __m256i high) {
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-  return (Wide<uint32_t>)_mm512_inserti64x4(_mm512_zextsi256_si512(low), high, 1);
-#else
-  return {(Vector<uint32_t>)low, (Vector<uint32_t>)high};
-#endif
-}
-#endif
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 template <>
 BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
-  return (Vector<float>)_mm512_max_ps((__m512)a, (__m512)b);
+  return (Vector<float>)_mm512_maskz_max_ps(__mmask16(0xffff), (__m512)a, (__m512)b);
 }
 template <>
 BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
-  return (Vector<float>)_mm512_min_ps((__m512)a, (__m512)b);
+  return (Vector<float>)_mm512_maskz_min_ps(__mmask16(0xffff), (__m512)a, (__m512)b);
 }
 #elif defined(__AVX2__)
 template <>
@@ -192,10 +213,55 @@ BT_HD void set_lane(V& v, int i, T value) {
     v[i] = value;
 }
 
+// Floats as doubles, which are twice as wide, and back.
+BT_HD Two<Vector<double>> widened_vector(const Vector<float>& a) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  const auto eight = [](__m256d half) { return _mm512_maskz_cvtps_pd(__mmask8(0xff), (__m256)half); };
+  const __m512d all = (__m512d)a;
+  return {(Vector<double>)eight(_mm512_maskz_extractf64x4_pd(0xf, all, 0)),
+          (Vector<double>)eight(_mm512_maskz_extractf64x4_pd(0xf, all, 1))};
+#elif defined(__AVX2__)
+  return {(Vector<double>)_mm256_cvtps_pd(_mm256_castps256_ps128((__m256)a)),
+          (Vector<double>)_mm256_cvtps_pd(_mm256_extractf128_ps((__m256)a, 1))};
+#else
+  Two<Vector<double>> r;
+  constexpr int n = kVectorBytes / 8;
+  for (int i = 0; i < n; ++i) r.low[i] = a[i], r.high[i] = a[n + i];
+  return r;
+#endif
+}
+BT_HD Vector<float> narrowed_vector(const Two<Vector<double>>& a) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  const auto eight = [](const Vector<double>& v) { return (__m256d)_mm512_maskz_cvtpd_ps(0xff, (__m512d)v); };
+  return (Vector<float>)_mm512_maskz_insertf64x4(0xff, _mm512_zextpd256_pd512(eight(a.low)), eight(a.high), 1);
+#elif defined(__AVX2__)
+  return (Vector<float>)_mm256_set_m128(_mm256_cvtpd_ps((__m256d)a.high), _mm256_cvtpd_ps((__m256d)a.low));
+#else
+  Vector<float> r;
+  constexpr int n = kVectorBytes / 8;
+  for (int i = 0; i < n; ++i) r[i] = float(a.low[i]), r[n + i] = float(a.high[i]);
+  return r;
+#endif
+}
+template <class V>
+BT_HD auto all_widened(const V& a) {
+  if constexpr (is_two<V>)
+    return Wide<double>{widened_vector(a.low), widened_vector(a.high)};
+  else
+    return widened_vector(a);
+}
+template <class V>
+BT_HD Wide<float> all_narrowed(const V& a) {
+  if constexpr (is_two<std::remove_const_t<decltype(a.low)>>)
+    return {narrowed_vector(a.low), narrowed_vector(a.high)};
+  else
+    return narrowed_vector(a);
+}
+
 // One bit per lane of a mask.
 BT_HD uint32_t bits(const MaskOfFloats& m) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
-  return _mm512_movepi32_mask((__m512i)m);
+  return m.m;
 #elif defined(__AVX2__)
   return _mm256_movemask_ps((__m256)m);
 #else
@@ -213,6 +279,29 @@ template <class H>
 BT_HD uint32_t bits(const Two<H>& m) {
   return bits(m.low) | bits(m.high) << (sizeof(H) / sizeof(m[0]));
 }
+
+// The largest whole numbers that are no larger.
+template <class V>
+BT_HD V round_down(const V& a) {
+  if constexpr (is_two<V>) {
+    return {round_down(a.low), round_down(a.high)};
+  } else {
+    V r;
+    for (size_t i = 0; i < sizeof(V) / sizeof(a[0]); ++i) r[i] = floor_(a[i]);
+    return r;
+  }
+}
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+template <>
+BT_HD Vector<float> round_down(const Vector<float>& a) {
+  return (Vector<float>)_mm512_maskz_roundscale_ps(__mmask16(0xffff), (__m512)a, _MM_FROUND_TO_NEG_INF);
+}
+#elif defined(__AVX2__)
+template <>
+BT_HD Vector<float> round_down(const Vector<float>& a) {
+  return (Vector<float>)_mm256_floor_ps((__m256)a);
+}
+#endif
 
 BT_HD Vector<float> square_root(const Vector<float>& a) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)

@@ -68,17 +68,17 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
     const Surfels<float>& in = s.geometry;
     float geom[kGeom], frame[kFrame];
     const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
-    seen = project<Kernel>(camera, in, i, s.near, geom, frame);
+    seen = project<Kernel>(camera, surfel_row(in, i), s.near, geom, frame);
     const Resize<float> to(f.photo_pixel);
     if constexpr (Kernel::kResized) seen = seen && resize(to, geom);
     if (seen) {
       LevelSet<float> level;
       if constexpr (Kernel::kResized)
-        level = level_set(geom, to.sharp);
+        level = level_set(geom, s.near, to.sharp);
       else if (filtered<Kernel>(geom))
         level = {filtered_bounds(geom).visible, 0, -geom[kArea]};
       else
-        level = level_set(geom);
+        level = level_set(geom, s.near);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
       const Footprint area = footprint<Kernel>(row, v.height);

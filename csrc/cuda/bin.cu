@@ -62,8 +62,8 @@ __global__ void __launch_bounds__(kThreads)
   const bool visible = radii[2 * i] > S(0);
   int64_t count = 0;
   if (visible)
-    for_tile_rows<Kernel>(geom + i * kGeom, width, height,
-                          [&](int, int first, int last) { count += last - first + 1; });
+    for_tile_rows(extent<Kernel>(geom + i * kGeom), geom + i * kGeom, width, height,
+                  [&](int, int first, int last) { count += last - first + 1; });
   w.keys[i] = visible ? sort_key(geom[i * kGeom + kZ]) : ~typename SortKey<S>::type(0);
   w.rows[i] = int32_t(i);
   w.counts[i] = int32_t(count);  // at most the tiles of an image
@@ -88,7 +88,8 @@ __global__ void __launch_bounds__(kThreads)
   const int lane = int(threadIdx.x) % kWarp, across = tiles_across(width);
   const int64_t from = r < n ? slot_start[r] : 0, count = r < n ? slot_start[r + 1] - from : 0;
   const auto list = [&](int32_t id, int64_t at, int64_t end, int mine, int step) {
-    for_tile_rows<Kernel>(geom + int64_t(id) * kGeom, width, height, [&](int row, int first, int last) {
+    const S* g = geom + int64_t(id) * kGeom;
+    for_tile_rows(extent<Kernel>(g), g, width, height, [&](int row, int first, int last) {
       for (int column = first + mine; column <= last; column += step) {
         const int64_t slot = at + column - first;
         if (slot >= end) break;

@@ -34,11 +34,11 @@ BT_HD void add_moments(S k, S a, S b, S* means) {
 // a b; a pixel p of weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
 template <class S>
 BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
-  const S c1 = S(kSsimC1), c2 = S(kSsimC2), two = S(2);
+  const S c1 = S(kSsimC1), c2 = S(kSsimC2), one = S(1.0f), two = S(2.0f);
   const S p = two * a * b + c1, q = two * (ab - a * b) + c2;
   const S r = a * a + b * b + c1, t = (aa - a * a) + (bb - b * b) + c2;
-  const S i = S(1) / (r * t), value = p * q * i;
-  d[0] = two * (b * (q - p) * i - a * value * (S(1) / r - S(1) / t));
+  const S i = one / (r * t), value = p * q * i;
+  d[0] = two * (b * (q - p) * i - a * value * (one / r - one / t));
   d[1] = -value / t;
   d[2] = two * p * i;
   return value;
@@ -46,7 +46,7 @@ BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
 // The gradient of pixel a from the sums over its windows of k d[0], k d[1] and k d[2].
 template <class S>
 BT_HD S ssim_pixel_gradient(S a, S b, S d0, S d1, S d2) {
-  return d0 + S(2) * a * d1 + b * d2;
+  return d0 + S(2.0f) * a * d1 + b * d2;
 }
 
 }  // namespace bt

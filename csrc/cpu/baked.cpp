@@ -1,4 +1,5 @@
 // The baked renderer: forward only, no fragment list, texels instead of the field.
+#include <memory>
 #include <stdexcept>
 #include <string>
 
@@ -209,7 +210,7 @@ void baked_forward(const BakedForward<S>& a) {
   const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   constexpr int channels = kMaps ? kMapChannels : kBakedChannels;
   const S photo_pixel = a.view.photo_pixel, sharp = Resize<S>(photo_pixel).sharp;
-  std::vector<DrawnSurfel<S>> drawn(a.view.n);
+  const std::unique_ptr<DrawnSurfel<S>[]> drawn(new DrawnSurfel<S>[a.view.n]);  // of the visible ones
   parallel_parts(a.view.n, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)
       if (a.view.radii[2 * i] > S(0)) drawn[i] = drawn_surfel(a, i);
@@ -222,7 +223,7 @@ void baked_forward(const BakedForward<S>& a) {
     for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
-      if (k + kAhead < bins.start[tile + 1]) prefetch(a, drawn.data(), bins.surfels[k + kAhead]);
+      if (k + kAhead < bins.start[tile + 1]) prefetch(a, drawn.get(), bins.surfels[k + kAhead]);
       if (k + 1 < bins.start[tile + 1]) prefetch_texels(drawn[bins.surfels[k + 1]]);
       const DrawnSurfel<S>& d = drawn[id];
       state.template blend<Kernel, kMaps>(

@@ -6,6 +6,7 @@
 #include "cpu/kernels.h"
 #include "cpu/pack_extent.h"
 #include "cpu/threads.h"
+#include "cpu/tiles.h"
 
 namespace bt {
 
@@ -119,6 +120,25 @@ class Extents {
   Extent found_[kLanes];
 };
 
+// fn(tile) for every tile that a disc may touch which comes near the camera's plane and has no box.
+template <class S, class F>
+void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn) {
+  using P = Pack<S>;
+  constexpr S kHalf = S(0.5 * (kTile - 1));
+  const S half_x = cell_half(kHalf, g[kCx], S(bins.tiles_x * kTile));
+  const S half_y = cell_half(kHalf, g[kCy], S(bins.tiles_y * kTile));
+  P column;
+  for (int lane = 0; lane < kLanes; ++lane) column.set(lane, S(lane * kTile) + S(0.5 * kTile) - g[kCx]);
+  for (int row = 0; row < bins.tiles_y; ++row)
+    for (int first = 0; first < bins.tiles_x; first += kLanes) {
+      const P y = P(S(row * kTile) + S(0.5 * kTile) - g[kCy]);
+      const Reached r = reached_cells(g, column + P(S(first * kTile)), y, half_x, half_y, level);
+      const int there = std::min(kLanes, bins.tiles_x - first);
+      for (uint32_t some = (r.support | r.centre) & ((1u << there) - 1); some; some &= some - 1)
+        fn(row * bins.tiles_x + first + __builtin_ctz(some));
+    }
+}
+
 template <class Kernel, class S>
 void bin(const View<S>& view, Bins& bins) {
   const S *geom = view.geom, *radii = view.radii;
@@ -154,12 +174,17 @@ void bin(const View<S>& view, Bins& bins) {
         ++at[t][only];
         continue;
       }
-      for_tile_rows(e, geom + int64_t(order[k].second) * kGeom, width, height, [&](int row, int first, int last) {
-        for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) {
-          list.push_back(tile);
-          ++at[t][tile];
-        }
-      });
+      const auto touch = [&](int tile) {
+        list.push_back(tile);
+        ++at[t][tile];
+      };
+      const int64_t id = order[k].second;
+      if (e.whole && !filtered<Kernel>(geom + id * kGeom))
+        for_reached_tiles(geom + id * kGeom, bins.level.data() + 2 * id, bins, touch);
+      else
+        for_tile_rows(e, geom + id * kGeom, width, height, [&](int row, int first, int last) {
+          for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) touch(tile);
+        });
       list[head] = int32_t(list.size() - head - 1);
     }
   }

@@ -224,13 +224,11 @@ BT_HD void compress(S* to, Pack<S> a, uint32_t keep) {
 
 template <class S>
 BT_HD Pack<S> load(const S* p) {
-  Pack<S> r;
-  std::memcpy(&r.v, p, sizeof r.v);
-  return r;
+  return load_vector<typename Pack<S>::V>(p);
 }
 template <class S>
 BT_HD void store(S* p, Pack<S> a) {
-  std::memcpy(p, &a.v, sizeof a.v);
+  store_vector(p, a.v);
 }
 template <class S>
 BT_HD Pack<S> sqrt_(Pack<S> a) {

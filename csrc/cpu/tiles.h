@@ -18,6 +18,29 @@ inline constexpr S kPackColumn[kPacks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12,
 template <class S>
 inline constexpr S kPackRow[kPacks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
 
+// Of 16 cells of an image those with a pixel in the kernel's level set, and in the low pass's.
+struct Reached {
+  uint32_t support, centre;
+};
+// How far pixels lie from a cell's middle, with what rounding may add; offsets of pixels are up to `largest`.
+template <class S>
+S cell_half(S half, S centre, S largest) {
+  return half + S(1e-6) * (largest + abs_(centre));
+}
+// x, y: offsets of the middles from the surfel's projected centre. Never one cell too few, few too many: within a cell
+// a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
+template <class S>
+BT_HD Reached reached_cells(const S* g, Pack<S> x, Pack<S> y, S half_x, S half_y, const float* level) {
+  using P = Pack<S>;
+  const P zero = P(S(0));
+  const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
+  const Planes<P> p = planes(g, x, y);
+  const Planes<P> nearest = {max_(abs_(p.U) - P(spread(kU1)), zero), max_(abs_(p.V) - P(spread(kV1)), zero),
+                             p.W + P(spread(kW1) + S(1e-6) * abs_(g[kW0]))};
+  const P dx = max_(abs_(x) - P(half_x + S(1e-3)), zero), dy = max_(abs_(y) - P(half_y + S(1e-3)), zero);
+  return {bits(within_in_front(nearest, P(S(level[0]) * S(1 + 1e-5)))), bits(dx * dx + dy * dy < P(S(level[1])))};
+}
+
 // A tile's transmittance while its surfels are drawn front to back.
 template <class S>
 struct TileState {
@@ -76,10 +99,6 @@ struct TileState {
   }
 
  private:
-  // Packs with a pixel in the kernel's level set, and with one in the low pass's.
-  struct Reached {
-    uint32_t support, centre;
-  };
   template <class F>
   void take_fragment(int pack, const Fragment<P>& f, F& fn) {
     const Blend<P> b = bt::blend(f.sigma, transmittance[pack]);
@@ -90,21 +109,15 @@ struct TileState {
     if (bits(v.takes)) fn(pack, v.takes, f, b.weight);
     if (!bits(open[pack])) open_packs &= ~(1u << pack);
   }
-  // Never one too few, few too many. Within a pack a plane differs from its value in the middle by no more than
-  // `spread`, and by what rounding may add.
   template <class Kernel>
   Reached reached(const S* g, S cx, S cy, const S* radius, const float* level) const {
-    constexpr S kHalf = S(0.5 * (kPackSide - 1)), kRounding = S(1e-6), kPixelSlack = S(1e-3);
-    const P zero = P(S(0)), x = middle_x - P(cx), y = middle_y - P(cy), far_x = abs_(x), far_y = abs_(y);
-    const S half_x = kHalf + kRounding * (S(kTile) + abs_(cx)), half_y = kHalf + kRounding * (S(kTile) + abs_(cy));
-    const uint32_t box = bits((far_x < P(radius[0] + half_x)) & (far_y < P(radius[1] + half_y)));
+    constexpr S kHalf = S(0.5 * (kPackSide - 1));
+    const P x = middle_x - P(cx), y = middle_y - P(cy);
+    const S half_x = cell_half(kHalf, cx, S(kTile)), half_y = cell_half(kHalf, cy, S(kTile));
+    const uint32_t box = bits((abs_(x) < P(radius[0] + half_x)) & (abs_(y) < P(radius[1] + half_y)));
     if (filtered<Kernel>(g)) return {box, 0};
-    const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
-    const Planes<P> p = planes(g, x, y);
-    const Planes<P> nearest = {max_(abs_(p.U) - P(spread(kU1)), zero), max_(abs_(p.V) - P(spread(kV1)), zero),
-                               abs_(p.W) + P(spread(kW1) + kRounding * abs_(g[kW0]))};
-    const P dx = max_(far_x - P(half_x + kPixelSlack), zero), dy = max_(far_y - P(half_y + kPixelSlack), zero);
-    return {box & bits(within(nearest, P(S(level[0]) * S(1 + 1e-5)))), box & bits(dx * dx + dy * dy < P(S(level[1])))};
+    const Reached r = reached_cells(g, x, y, half_x, half_y, level);
+    return {box & r.support, box & r.centre};
   }
 };
 

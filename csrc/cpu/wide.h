@@ -205,6 +205,25 @@ BT_HD V all_lanes(T value) {
     return value - V{};
   }
 }
+// From and to memory; the halves one by one, which the compiler would else copy through the stack.
+template <class V, class T>
+BT_HD V load_vector(const T* p) {
+  if constexpr (is_two<V>) {
+    using Half = decltype(V::low);
+    return {load_vector<Half>(p), load_vector<Half>(p + sizeof(Half) / sizeof(T))};
+  } else {
+    V r;
+    std::memcpy(&r, p, sizeof r);
+    return r;
+  }
+}
+template <class V, class T>
+BT_HD void store_vector(T* p, const V& v) {
+  if constexpr (is_two<V>)
+    store_vector(p, v.low), store_vector(p + sizeof(v.low) / sizeof(T), v.high);
+  else
+    std::memcpy(p, &v, sizeof v);
+}
 template <class V, class T>
 BT_HD void set_lane(V& v, int i, T value) {
   if constexpr (is_two<V>)

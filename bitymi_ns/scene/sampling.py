@@ -16,8 +16,9 @@ AS_TRAINED = (0.75, 1.5)
 near and from far."""
 SMALLEST, LARGEST = 0.5, 2.0
 """Views beyond these sizes are drawn for what they are; in between it changes over, so that nothing jumps."""
-SAMPLE = 0.42
-"""A photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow."""
+ONE_SAMPLE, SAMPLE = 0.6, 0.42
+"""A photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow: with one sample
+per pixel, and with several, whose mean forgives more."""
 MOST_SAMPLES = 4
 """Samples per pixel, along each axis."""
 MOST_PIXELS = 1 << 24
@@ -69,9 +70,11 @@ def sampling_of(size: float, pixels: int) -> Sampling:
     low, high = AS_TRAINED
     if low <= size <= high:
         return Sampling()
-    wanted = math.ceil(SAMPLE / size)
+    wanted = 1 if size >= ONE_SAMPLE else max(2, math.ceil(SAMPLE / size))
     samples = max(1, min(wanted, MOST_SAMPLES, math.isqrt(MOST_PIXELS // max(pixels, 1))))
     shown = samples * size
+    if samples > 1:
+        return Sampling(samples, shown)
     if SMALLEST < size < low:
         shown = SMALLEST ** (math.log(low / size) / math.log(low / SMALLEST))
     elif high < size < LARGEST:

@@ -5,7 +5,8 @@ import type { Vec3 } from '../bundle/manifest';
 
 const AS_TRAINED = [0.75, 1.5]; // views between these sizes are drawn as in training
 const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, for what they are; in between it changes over
-const SAMPLE = 0.42; // a photograph's pixel is at least so many samples wide
+// a photograph's pixel is at least so many samples wide, with one sample per pixel and with several
+const [ONE_SAMPLE, SAMPLE] = [0.6, 0.42];
 const FARTHEST = [1 / 64, 64];
 
 export interface Sampling {
@@ -38,8 +39,10 @@ export function samplingOf(size: number, pixels: number, mostSamples: number, mo
   const [low, high] = AS_TRAINED;
   if (low <= size && size <= high) return { samples: 1, photoPixel: 1 };
   const room = Math.floor(Math.sqrt(mostPixels / Math.max(pixels, 1)));
-  const samples = Math.max(1, Math.min(Math.ceil(SAMPLE / size), mostSamples, room));
+  const wanted = size >= ONE_SAMPLE ? 1 : Math.max(2, Math.ceil(SAMPLE / size));
+  const samples = Math.max(1, Math.min(wanted, mostSamples, room));
   let photoPixel = samples * size;
+  if (samples > 1) return { samples, photoPixel };
   if (SMALLEST < size && size < low) photoPixel = SMALLEST ** (Math.log(low / size) / Math.log(low / SMALLEST));
   else if (high < size && size < LARGEST) photoPixel = LARGEST ** (Math.log(size / high) / Math.log(LARGEST / high));
   return { samples, photoPixel };

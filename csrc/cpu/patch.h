@@ -25,6 +25,15 @@ struct Four {
     std::memcpy(&r.v, p, sizeof r.v);
     return r;
   }
+  // Three numbers and a 0: what lies behind them is not read.
+  BT_HD static Four load_three(const S* p) {
+#if defined(__AVX__)
+    if constexpr (std::is_same_v<S, float>)
+      return {(Quad<S>)_mm_maskload_ps(p, _mm_setr_epi32(-1, -1, -1, 0))};
+    else
+#endif
+      return {load3(p), S(0)};
+  }
   BT_HD void store(S* p) const { std::memcpy(p, &v, sizeof v); }
 };
 template <class S>
@@ -115,8 +124,8 @@ class PatchFragments {
     TexelFours<S> q;
     const S* t = of_.tile + 3 * int64_t(first_[j]);
     const int right = 3 * next_.right, down = 3 * next_.down;
-    q.t[0] = Four<S>(load3(t), S(0)), q.t[1] = Four<S>(load3(t + right), S(0));
-    q.t[2] = Four<S>(load3(t + down), S(0)), q.t[3] = Four<S>(load3(t + down + right), S(0));
+    q.t[0] = Four<S>::load_three(t), q.t[1] = Four<S>::load_three(t + right);
+    q.t[2] = Four<S>::load_three(t + down), q.t[3] = Four<S>::load_three(t + down + right);
     texel_weights(fx_[j], fy_[j], q.weight);
     return q;
   }

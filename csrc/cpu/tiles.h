@@ -11,12 +11,18 @@ constexpr int kPackSide = 4, kPacksAcross = kTile / kPackSide, kPacks = kPacksAc
 static_assert(kPacks == kLanes && kPacksAcross == 4, "a bit and a lane for each pack of a tile");
 
 // A pack's first pixel in its tile.
-inline int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
-inline int pack_row(int pack) { return pack / kPacksAcross * kPackSide; }
+constexpr int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
+constexpr int pack_row(int pack) { return pack / kPacksAcross * kPackSide; }
+// The same as reals, which would else be converted for every pack that is drawn.
 template <class S>
-inline constexpr S kPackColumn[kPacks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
+struct PackOffsets {
+  S column[kPacks] = {}, row[kPacks] = {};
+  constexpr PackOffsets() {
+    for (int p = 0; p < kPacks; ++p) column[p] = S(pack_column(p)), row[p] = S(pack_row(p));
+  }
+};
 template <class S>
-inline constexpr S kPackRow[kPacks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
+inline constexpr PackOffsets<S> kPackOffsets;
 
 // Of 16 cells of an image those with a pixel in the kernel's level set, and in the low pass's.
 struct Reached {
@@ -62,10 +68,11 @@ struct TileState {
     }
     for (int p = 0; p < kPacks; ++p) {
       transmittance[p] = P(S(1));
-      const P px = P(x0 + S(pack_column(p))) + lane_x, py = P(y0 + S(pack_row(p))) + lane_y;
+      const S column = kPackOffsets<S>.column[p], row = kPackOffsets<S>.row[p];
+      const P px = P(x0 + column) + lane_x, py = P(y0 + row) + lane_y;
       open[p] = (px < P(S(width))) & (py < P(S(height)));
       open_packs |= uint32_t(bits(open[p]) != 0) << p;
-      middle_x.set(p, S(pack_column(p)) + S(0.5 * kPackSide)), middle_y.set(p, S(pack_row(p)) + S(0.5 * kPackSide));
+      middle_x.set(p, column + S(0.5 * kPackSide)), middle_y.set(p, row + S(0.5 * kPackSide));
     }
   }
 
@@ -81,7 +88,7 @@ struct TileState {
     int at[kPacks], n = 0;
     for (; packs; packs &= packs - 1) {
       const int pack = __builtin_ctz(packs);
-      const P dx = lane_x + P(kPackColumn<S>[pack] - cx), dy = lane_y + P(kPackRow<S>[pack] - cy);
+      const P dx = lane_x + P(kPackOffsets<S>.column[pack] - cx), dy = lane_y + P(kPackOffsets<S>.row[pack] - cy);
       Fragment<P> f;
       if (filtered<Kernel>(g)) {
         const FilteredHit<P> hit = filtered_hit<S, P>(g, dx, dy);

@@ -67,6 +67,12 @@ def test_golden_textured_scene(device: torch.device, cpu) -> None:
     assert differs.double().mean() <= most(device, 0, 1e-3)
 
 
+def test_the_low_pass_stays_where_the_near_plane_cuts_the_kernel(device: torch.device, cpu) -> None:
+    """Surfels right before the camera, whose kernels end at the near plane within the reach of their low passes."""
+    golden = load_golden("inside_the_scene")
+    check(scene_of(golden), camera_of(golden), device, cpu, golden.background.float())
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_random_scenes(seed: int, device: torch.device, cpu) -> None:
     case = random_scene(120, seed, width=61, height=45)

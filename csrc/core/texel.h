@@ -59,7 +59,8 @@ struct TexelAxis {
 template <class S, class T>
 BT_HD TexelAxis<T> texel_axis(T u, int r, S extent) {
   const T x = texel_position(u, r, extent), first = min_(floor_(x), T(S(r > 1 ? r - 2 : 0)));
-  return {first, x - first, (x > T(S(0))) & (x < T(S(r - 1)))};
+  const MaskOf<T> inside = (x > T(S(0))) & (x < T(S(r - 1)));
+  return {first, x - first, inside};
 }
 // From a texel to the next ones along u and v, in texels (rows lie along v).
 struct TexelSteps {

@@ -252,7 +252,7 @@ BT_HD Two<Vector<double>> widened_vector(const Vector<float>& a) {
 BT_HD Vector<float> narrowed_vector(const Two<Vector<double>>& a) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
   const auto eight = [](const Vector<double>& v) { return (__m256d)_mm512_maskz_cvtpd_ps(0xff, (__m512d)v); };
-  return (Vector<float>)_mm512_maskz_insertf64x4(0xff, _mm512_zextpd256_pd512(eight(a.low)), eight(a.high), 1);
+  return (Vector<float>)_mm512_maskz_insertf64x4(0xff, _mm512_castpd256_pd512(eight(a.low)), eight(a.high), 1);
 #elif defined(__AVX2__)
   return (Vector<float>)_mm256_set_m128(_mm256_cvtpd_ps((__m256d)a.high), _mm256_cvtpd_ps((__m256d)a.low));
 #else

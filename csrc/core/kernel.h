@@ -9,12 +9,10 @@
 
 namespace bt {
 
-// `sharp` here and below: 1 / squared radius of the low pass, which ResizedKernel alone looks at.
-template <class Kernel = LowPassKernel, class S = float, class T>
-BT_HD MaskOf<T> near_centre(T dx, T dy, S sharp = S(1)) {
-  const T d2 = dx * dx + dy * dy;
-  if constexpr (Kernel::kResized) return d2 * T(sharp) < T(kLowPassReach * kLowPassReach);
-  return d2 < T(kLowPassReach * kLowPassReach);
+// Whether the low pass may be drawn there.
+template <class T>
+BT_HD MaskOf<T> near_centre(T dx, T dy) {
+  return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
 }
 
 // The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the
@@ -80,7 +78,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
 }
 
 // Without kBlur the low pass is left out, for pixels that are not near the centre; where sigma is 0 the rest is then
-// anything.
+// anything. `sharp` here and below: 1 / squared radius of the low pass, which ResizedKernel alone looks at.
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));

@@ -27,10 +27,9 @@ BT_HD S low_pass_radius(S level) {
 }
 
 // Whether the kernel of a row is nowhere below the low pass of the squared radius `wide` and no more than its height.
-// With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x), (1 -
-// x)^beta
-// >= exp(-d^2 / wide) holds out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide. As far the plane has to lie
-// behind `near`, which cuts the kernel alone.
+// With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x), the
+// kernel (1 - x)^beta is at least exp(-d^2 / wide) out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide. As far
+// the plane has to lie behind `near`, which cuts the kernel alone.
 template <class T>
 BT_HD MaskOf<T> covers_low_pass(const T* g, T near, T wide) {
   const T reach = T(kLowPassReach), change = reach * sqrt_(wide) * (abs_(g[kW1]) + abs_(g[kW2]));

@@ -76,6 +76,7 @@ class Extents {
       for (int lane = 0; lane < next_ - first_; ++lane) {
         const S* g = row(lane);
         found_[lane] = extent<Kernel>(g, sharp_);
+        if (filtered<Kernel>(g)) continue;  // has no level set of its own
         double wide[kGeom];
         for (int c = 0; c < kGeom; ++c) wide[c] = double(g[c]);
         const Level<double> l = level_of<Kernel>(wide, sharp_, kFloatRoom);

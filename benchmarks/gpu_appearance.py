@@ -12,9 +12,9 @@ texels and their gradients, 4 a look-up of 12 and 16 bytes.
   ... backward,
     field frozen      28 f + 12 n; 9 f
   ... learning        28 f + 52 t + 12 n + 64 MB; 9 f + 3850 t; gathers and additions 256 L t
-  texel colours       32 f + 28 t; 6 f + 50 t; gathers 48 t
+  blend, texels       16 f + 44 b + 20 p; 16 f + 50 t; gathers 48 t   (b pairs of surfel and tile, p pixels)
   ... backward, with
-    a step            40 f + 28 t + 12 n + 60 e; 9 f + 75 t; gathers and additions 112 t
+    a step            24 f + 48 b + 20 p + 96 n + 60 e; 27 f + 75 t; gathers and additions 112 t
   SSIM, forward and
     backward          60 x; 411 x   (both images twice, three parts of the gradient written and read, the gradient)
   Adam                28 q; 14 q
@@ -48,6 +48,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.ops.field_tiles import field_tiles
+from bitymi_ns.scene.field import Shading
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.optimizers import make_optimizers
 
@@ -55,7 +56,7 @@ LEVELS = 4
 LOOK_UP = 1550
 LEARN = 3850
 NEEDS = ("view_color_forward_f32", "shade_forward_f32", "shade_backward_f32", "ssim_f32", "field_tiles_f32")
-NEEDS += ("texel_colors_forward_f32", "texel_colors_backward_f32")
+NEEDS += ("blend_forward_f32", "blend_backward_f32")
 
 
 @dataclass(frozen=True)
@@ -170,27 +171,31 @@ def _texel_cases(n: int, width: int, height: int, device: torch.device) -> list[
     with torch.no_grad():
         projection = ops.project(*(q[name] for name in GEOMETRY), camera, scene.near)
         fragments = ops.trace(projection, scene.config.rim)
-    fragments = replace(fragments, uv=fragments.uv.detach().requires_grad_())
-    f, t, e = len(fragments), int((fragments.weight >= bound).sum()), len(field.texels)
+    weight, uv = (x.detach().requires_grad_() for x in (fragments.weight, fragments.uv))
+    fragments = replace(fragments, weight=weight, uv=uv)
+    projection = replace(projection, geom=projection.geom.detach().requires_grad_())
+    f, t, e = len(fragments), int((weight >= bound).sum()), len(field.texels)
+    b, p = fragments.layout.pairs, width * height
     base = scene.base_color(projection).detach().requires_grad_()
 
-    def colors() -> Tensor:
-        return field.shade(fragments, base, projection.frames, bound, True, True)
+    def image() -> Tensor:
+        return field.image(fragments, projection, base, Shading(bound, learns=True, moves_surfels=True, maps=False))
 
-    back = backward(colors(), (base, fragments.uv))
-    count = 40 * f + 28 * t + 12 * n
+    back = backward(image(), (weight, uv, projection.geom, base))
+    count = 24 * f + 48 * b + 20 * p + 96 * n
+    work = 27 * f + 75 * t
     return [
-        Case("texel colours", f, "fragments", 32 * f + 28 * t, 6 * f + 50 * t, without_graph(colors), 48.0 * t),
-        Case("texel colours, backward and step", f, "fragments", count + 60 * e, 9 * f + 75 * t, back, 112.0 * t),
         Case(
-            "... with deterministic sums",
+            "blend, texels",
             f,
             "fragments",
-            count + 92 * e,
-            9 * f + 75 * t,
-            deterministic(back),
-            176.0 * t,
+            16 * f + 44 * b + 20 * p,
+            16 * f + 50 * t,
+            without_graph(image),
+            48.0 * t,
         ),
+        Case("blend, texels, backward and step", f, "fragments", count + 60 * e, work, back, 112.0 * t),
+        Case("... with deterministic sums", f, "fragments", count + 92 * e, work, deterministic(back), 176.0 * t),
     ]
 
 

@@ -10,6 +10,8 @@ and tile, f fragments and p pixels (gathers count once; what a later kernel of t
   trace backward      32 f + 132 b + 72 n  (of the weights alone, as in training)
   composite           16 f + 44 b + 20 p
   composite backward  36 f + 16 b + 20 p + 72 n
+  blend               8 f + 44 b + 20 p    (shading and compositing of surfels alone)
+  blend backward      12 f + 48 b + 20 p + 96 n
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY, Scene
 
 OPERATIONS = ("project_forward_f32", "trace_mark_f32", "trace_backward_f32", "composite_backward_f32")
+OPERATIONS += ("blend_forward_f32", "blend_backward_f32")
 STEP = (*OPERATIONS, "view_color_forward_f32", "shade_forward_f32", "shade_backward_f32")
-STEP += ("texel_colors_forward_f32", "texel_colors_backward_f32")
 
 
 def operations(options: Options) -> str:
@@ -97,6 +99,8 @@ def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tupl
     bins = trace_cuda.tile_lists(geom, projection)
     colors = torch.rand(len(fragments), 3, device=geom.device).requires_grad_()
     image = ops.composite_image(fragments, projection, colors)
+    base = torch.rand(len(scene), 3, device=geom.device).requires_grad_()
+    blended = ops.blended_image(fragments, projection, base)
 
     def trace() -> object:
         layout, _ = trace_cuda.blended(geom, projection, bins)
@@ -119,6 +123,16 @@ def _operations(scene: Scene, camera: Camera) -> tuple[dict[str, int], list[tupl
             "composite backward",
             36 * f + 16 * b + 20 * p + 72 * n,
             backward(image, (fragments.weight, projection.geom, colors)),
+        ),
+        (
+            "blend",
+            8 * f + 44 * b + 20 * p,
+            without_graph(lambda: ops.blended_image(fragments, projection, base)),
+        ),
+        (
+            "blend backward",
+            12 * f + 48 * b + 20 * p + 96 * n,
+            backward(blended, (fragments.weight, projection.geom, base)),
         ),
     ]
 

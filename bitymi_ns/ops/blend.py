@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel
-from .composite import check_projection, composite_image
+from .composite import check_projection
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
-from .shade import shade
-from .texel import TexelDescent, TexelTiles, check_texels, texel_colors
+from .texel import TexelDescent, TexelTiles, backward_memory, check_texels
 from .trace import FRAGMENT, Fragments, by_name
+
+
+@functools.lru_cache(maxsize=4)
+def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTiles:
+    """Tiles of surfels without texels. Kept: a step on a card should not clear them anew."""
+    size = torch.zeros(surfels, 2, dtype=torch.int32, device=device)
+    return TexelTiles.of_sizes(size, torch.zeros(surfels, dtype=dtype, device=device))
 
 
 class _BlendedImage(torch.autograd.Function):
@@ -39,7 +47,10 @@ class _BlendedImage(torch.autograd.Function):
         if ctx.descent is not None:
             step = {"moved": texels, "share": ctx.descent.share, "rate": ctx.descent.rate}
         inputs = {"geom": geom, "base": base, "texels": texels, "dimage": dense(dimage, geom)}
-        kernel("blend_backward", geom)(**ctx.given, **arrays, **inputs, **step, **out)
+        work = backward_memory(texels, 0, learns or ctx.descent is not None)
+        if cuda_backend(geom.device):  # what a pair of surfel and tile adds to its surfel
+            work["partial"] = geom.new_empty(ctx.given["layout"].pairs, 8 if ctx.given["maps"] else 4)
+        kernel("blend_backward", geom)(**ctx.given, **arrays, **inputs, **step, **work, **out)
         gradients = (out[name] for name in ("dweight", "ddepth", "duv", "dgeom", "dbase", "dtexels"))
         return *gradients, None, None, None, None, None
 
@@ -57,9 +68,10 @@ def blended_image(
 ) -> Tensor:
     """What `composite_image` gives for the colours of `texel_colors`, or of `shade` where there are no texels.
 
-    On the CPU it is one pass over the fragments, and one backward, which list neither colours nor their gradients: of
-    64 bytes per fragment 40 are left. Where there are texels, the backward pass gives whole surfels to each thread, so
-    that sums do not depend on the number of threads, nor on what learns.
+    It is one pass over the fragments, and one backward, which list neither colours nor their gradients: of 64 bytes per
+    fragment 40 are left. On the CPU, where there are texels, the backward pass gives whole surfels to each thread, so
+    that sums do not depend on the number of threads, nor on what learns. On a card only the gradients of texels depend
+    on the order of sums, and not even they after torch.use_deterministic_algorithms(True).
 
     Args:
         fragments: F fragments of an H x W view.
@@ -74,17 +86,10 @@ def blended_image(
     Raises:
         ValueError: what `composite_image` and `texel_colors` raise.
     """
-    if cuda_backend(fragments.weight.device):
-        if texels is None or tiles is None:
-            colors = shade(fragments, base, projection.frames)
-        else:
-            colors = texel_colors(fragments, base, texels, tiles, bound, move_surfels, descent)
-        return composite_image(fragments, projection, colors, maps)
     check_projection(fragments, projection)
     if texels is None or tiles is None:
-        n = fragments.surfels
-        nothing = torch.zeros(n, dtype=torch.int64), torch.zeros(n, 2, dtype=torch.int32), base.new_zeros(n)
-        texels, tiles, move_surfels, descent = base.new_zeros(0, 3), TexelTiles(*nothing), False, None
+        tiles = _no_tiles(fragments.surfels, base.dtype, base.device)
+        texels, move_surfels, descent = base.new_zeros(0, 3), False, None
     check_texels(fragments, base, texels, tiles, descent)
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     given = (projection.geom, base, texels, fragments, tiles, bound, maps, descent)

@@ -108,8 +108,6 @@ void bind_operations(nb::module_& m) {
   bind_tracer<S>(m);
   bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
   bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
-  bind_operation(m, name("blend_forward"), &blend_forward<S>);
-  bind_operation(m, name("blend_backward"), &blend_backward<S>);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }
 }  // namespace

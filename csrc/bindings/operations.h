@@ -11,6 +11,8 @@
   each(trace_backward)        \
   each(composite_forward)     \
   each(composite_backward)    \
+  each(blend_forward)         \
+  each(blend_backward)        \
   each(view_color_forward)    \
   each(view_color_backward)   \
   each(lean_color)            \

@@ -96,7 +96,7 @@ BT_HD S texel_density(int r, S extent) {
 // The texels of one fetch, as offsets from the tile's first, and their weights.
 template <class S>
 struct TexelCorners {
-  int64_t at[4];
+  int32_t at[4];
   S weight[4];
   S fx, fy;
   bool inside_u, inside_v;
@@ -106,7 +106,7 @@ BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* size, S extent) {
   const TexelAxis<S> x = texel_axis(u, size[0], extent), y = texel_axis(v, size[1], extent);
   const TexelSteps next(size);
   TexelCorners<S> c;
-  c.at[0] = int64_t(y.first) * size[0] + int64_t(x.first);
+  c.at[0] = int32_t(y.first) * size[0] + int32_t(x.first);
   c.at[1] = c.at[0] + next.right, c.at[2] = c.at[0] + next.down, c.at[3] = c.at[2] + next.right;
   texel_weights(x.fraction, y.fraction, c.weight);
   c.fx = x.fraction, c.fy = y.fraction, c.inside_u = x.inside, c.inside_v = y.inside;
@@ -133,15 +133,18 @@ template <class S>
 BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
   texel_corner_gradients(c, g, [&](int k, Vec3<S> d) { store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + d); });
 }
-// Adds the gradient with respect to u and v. It is 0 from the outer texel centres on; at a centre between them, where
-// the slope jumps, it is that of the side of larger coordinates.
+// How the fetch changes with u and v, given its four texels: 0 from the outer texel centres on; at a centre between
+// them, where the slope jumps, that of the side of larger coordinates.
 template <class S>
-BT_HD void texel_fetch_uv_vjp(const S* tile, const TexelCorners<S>& c, const int32_t* size, S extent, Vec3<S> g, S& du,
-                              S& dv) {
-  Vec3<S> t[4];
-  load_corners(tile, c, t);
-  if (c.inside_u) du += texel_density(size[0], extent) * dot(g, texel_slope_u(t, c.fy));
-  if (c.inside_v) dv += texel_density(size[1], extent) * dot(g, texel_slope_v(t, c.fx));
+struct TexelSlopes {
+  Vec3<S> u, v;
+};
+template <class S>
+BT_HD TexelSlopes<S> texel_slopes(const Vec3<S>* t, const TexelCorners<S>& c, const int32_t* size, S extent) {
+  TexelSlopes<S> s = {};
+  if (c.inside_u) s.u = texel_density(size[0], extent) * texel_slope_u(t, c.fy);
+  if (c.inside_v) s.v = texel_density(size[1], extent) * texel_slope_v(t, c.fx);
+  return s;
 }
 
 // Where a step takes a texel whose gradient is g.

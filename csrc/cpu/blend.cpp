@@ -9,6 +9,14 @@
 namespace bt {
 
 namespace {
+// A view as the kernels of the CPU take it.
+template <class S>
+using Blended = BlendedSurfels<S, TileStarts>;
+template <class S>
+using Forward = BlendForward<S, TileStarts>;
+template <class S>
+using Backward = BlendBackward<S, TileStarts>;
+
 template <class S>
 BT_HD Four<S> depth_normal(S depth, const S* g) {
   return {Quad<S>{depth, g[kNx], g[kNx + 1], g[kNx + 2]}};
@@ -25,8 +33,8 @@ inline int64_t run_end(const int32_t* surfel, int64_t i, int64_t end) {
 // constant(i) for those fragments of a surfel from i on that show no texel, and textured(i, few, j) for the others:
 // few's fragment j.
 template <class S, class Constant, class WithTexel>
-BT_HD void each_fragment(const BlendedSurfels<S>& of, const TexelPatch<S>& patch, int64_t i, int64_t end,
-                         Constant&& constant, WithTexel&& textured) {
+BT_HD void each_fragment(const Blended<S>& of, const TexelPatch<S>& patch, int64_t i, int64_t end, Constant&& constant,
+                         WithTexel&& textured) {
   if (!patch.textured()) {
     for (; i < end; ++i) constant(i);
     return;
@@ -43,7 +51,7 @@ BT_HD void each_fragment(const BlendedSurfels<S>& of, const TexelPatch<S>& patch
 }
 
 template <bool kMaps, class S>
-BT_HD void blend_into(const BlendForward<S>& a, int64_t i, Four<S> color, const S* g) {
+BT_HD void blend_into(const Forward<S>& a, int64_t i, Four<S> color, const S* g) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const FragmentArrays<S>& f = a.of.fragments.f;
   S* to = a.image + int64_t(f.pixel[i]) * channels;
@@ -51,7 +59,7 @@ BT_HD void blend_into(const BlendForward<S>& a, int64_t i, Four<S> color, const 
 }
 
 template <bool kMaps, class S>
-void forward(const BlendForward<S>& a) {
+void forward(const Forward<S>& a) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   const int64_t *tile_start = a.of.fragments.layout.start, tiles = a.of.fragments.layout.tiles;
   std::fill(a.image, a.image + a.of.numbers(), S(0));
@@ -79,7 +87,7 @@ struct Sums {
 
 // The gradients of one fragment but those of u and v; returns that of its colour.
 template <bool kMaps, class S>
-BT_HD Four<S> fragment_backward(const BlendBackward<S>& a, int64_t i, Four<S> color, const S* g, Sums<S>& sums) {
+BT_HD Four<S> fragment_backward(const Backward<S>& a, int64_t i, Four<S> color, const S* g, Sums<S>& sums) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const FragmentArrays<S>& f = a.of.fragments.f;
   const S w = f.weight[i];
@@ -98,8 +106,7 @@ BT_HD Four<S> fragment_backward(const BlendBackward<S>& a, int64_t i, Four<S> co
 
 // Those of fragments of one surfel from i on. `rows`: gradients of its texels, rows of four; null: there are none.
 template <bool kMaps, class S>
-void run_backward(const BlendBackward<S>& a, int64_t i, int64_t end, const TexelPatch<S>& patch, S* rows,
-                  Sums<S>& sums) {
+void run_backward(const Backward<S>& a, int64_t i, int64_t end, const TexelPatch<S>& patch, S* rows, Sums<S>& sums) {
   const int64_t total = a.of.fragments.f.total;
   const S* g = a.of.geom + int64_t(a.of.fragments.f.surfel[i]) * kGeom;
   const Four<S> view(patch.view, S(1));
@@ -121,7 +128,7 @@ void run_backward(const BlendBackward<S>& a, int64_t i, int64_t end, const Texel
 
 // Writes the gradients of a surfel.
 template <class S>
-void surfel_backward(const BlendBackward<S>& a, int64_t id, const Sums<S>& sums) {
+void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
   store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), sums.view.three()));
   S* dgeom = a.dgeom + id * kGeom;
   dgeom[kBeta] = sums.beta;
@@ -132,7 +139,7 @@ void surfel_backward(const BlendBackward<S>& a, int64_t id, const Sums<S>& sums)
 // of the time. First for where they begin, then for their fragments, then for the pixels of these. Always inlined: GCC
 // drops calls of a function that does nothing else.
 template <int channels, class S>
-BT_HD void ask_for_next(const BlendBackward<S>& a, const Runs& runs, int64_t k) {
+BT_HD void ask_for_next(const Backward<S>& a, const Runs& runs, int64_t k) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   constexpr int64_t line = 64 / sizeof(S);
   const auto run = [&](int64_t ahead) { return runs.start + runs.order[std::min(k + ahead, runs.count - 1)]; };
@@ -149,7 +156,7 @@ BT_HD void ask_for_next(const BlendBackward<S>& a, const Runs& runs, int64_t k) 
 // Surfel after surfel: a thread adds to the tiles of its own. Also where they do not learn, so that the gradients of
 // the surfels are the same.
 template <bool kMaps, class S>
-void backward_by_surfel(const BlendBackward<S>& a) {
+void backward_by_surfel(const Backward<S>& a) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   const FoundRuns found(f.surfel, f.total, a.of.table.n);
   const Runs runs{f.surfel, found.start.data(), found.order.data(), int64_t(found.order.size())};
@@ -174,7 +181,7 @@ void backward_by_surfel(const BlendBackward<S>& a) {
 
 // In the order of the list, which is faster where there are no tiles.
 template <bool kMaps, class S>
-void backward_by_list(const BlendBackward<S>& a) {
+void backward_by_list(const Backward<S>& a) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   const int64_t *tile_start = a.of.fragments.layout.start, tiles = a.of.fragments.layout.tiles, n = a.of.table.n;
   std::vector<std::vector<Sums<S>>> partial(std::max(num_threads(), 1));
@@ -200,7 +207,7 @@ void backward_by_list(const BlendBackward<S>& a) {
 }
 
 template <bool kMaps, class S>
-void backward(const BlendBackward<S>& a) {
+void backward(const Backward<S>& a) {
   const TexelTiles<S>& table = a.of.table;
   std::fill(a.dgeom, a.dgeom + table.n * kGeom, S(0));
   std::fill(a.dbase, a.dbase + 3 * table.n, S(0));
@@ -210,17 +217,17 @@ void backward(const BlendBackward<S>& a) {
 }  // namespace
 
 template <class S>
-void blend_forward(const BlendForward<S>& a) {
+void blend_forward(const BlendForward<S, TileStarts>& a) {
   a.of.maps ? forward<true>(a) : forward<false>(a);
 }
 template <class S>
-void blend_backward(const BlendBackward<S>& a) {
+void blend_backward(const BlendBackward<S, TileStarts>& a) {
   a.of.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                              \
-  template void blend_forward(const BlendForward<S>&); \
-  template void blend_backward(const BlendBackward<S>&);
+#define BT_INSTANTIATE(S)                                          \
+  template void blend_forward(const BlendForward<S, TileStarts>&); \
+  template void blend_backward(const BlendBackward<S, TileStarts>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

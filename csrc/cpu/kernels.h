@@ -136,9 +136,9 @@ void texel_colors_forward(const TexelColorsForward<S>& a);
 template <class S>
 void texel_colors_backward(const TexelColorsBackward<S>& a);
 template <class S>
-void blend_forward(const BlendForward<S>& a);
+void blend_forward(const BlendForward<S, TileStarts>& a);
 template <class S>
-void blend_backward(const BlendBackward<S>& a);
+void blend_backward(const BlendBackward<S, TileStarts>& a);
 template <class S>
 void ssim(const Ssim<S>& a);
 

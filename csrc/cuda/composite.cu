@@ -48,22 +48,15 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
                     S* dweight, S* dcolors, S* ddepth) {
   constexpr int kChannels = kMaps ? kMapChannels : kImageChannels, kSums = kMaps ? 4 : 1;
   constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
-  __shared__ S gradient[kTileThreads * kChannels];  // both counts of channels are odd: lanes hit different banks
+  __shared__ S gradient[kTileThreads * kChannels];
   __shared__ S out[kWorkers][3 * kRunLanes];
   // Pairs behind those of the tiles have no fragments, but slots: they are left to the last block.
   const int64_t first = p.tile_pairs[blockIdx.x];
   const int64_t end = blockIdx.x + 1 < gridDim.x ? p.tile_pairs[blockIdx.x + 1] : p.pairs;
   if (first == end) return;
-  const int across = tiles_across(p.width), tile = int(blockIdx.x);
-  const int left = tile % across * kTile, top = tile / across * kTile;
-  const int columns = min_(kTile, p.width - left), rows = min_(kTile, p.height - top);
-  for (int j = int(threadIdx.x); j < kTileThreads * kChannels; j += kTileThreads) {
-    const int row = j / (kTile * kChannels), column = j - row * (kTile * kChannels);
-    if (row < rows && column < columns * kChannels)
-      gradient[j] = dimage[(int64_t(top + row) * p.width + left) * kChannels + column];
-  }
+  const TilePart tile(p);
+  tile.load<kChannels>(dimage, gradient);
   __syncthreads();
-  const RowOf row_of(p.width);
   const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
   S* const put = out[worker];
   // The runs of a warp take their turns together.
@@ -92,8 +85,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
       }
       __syncwarp();  // no load is put off until its number is used: one wait is for all
       if (mine) {
-        const int row = row_of(pixel);
-        const S* d = gradient + ((row - top) * kTile + (pixel - row * p.width - left)) * kChannels;
+        const S* d = gradient + tile.at(pixel) * kChannels;
         dweight[i] = weight_gradient<kMaps>(d, color, beta, depth, normal);
         BT_UNROLL
         for (int c = 0; c < 3; ++c) put[3 * lane + c] = w * d[c];

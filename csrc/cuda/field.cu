@@ -98,7 +98,7 @@ void field_backward(const FieldBackward<S>& a, Stream stream) {
   const size_t shared = sizeof(BackwardShared<S>);
   const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
   if (work.exact) {
-    const ExactSums exact = begin_exact(work.exact, field.table_size(), &field, 0, false, a.n, a.drho, stream);
+    const ExactSums exact = begin_exact(work.exact, field.table_size(), &field, 0, false, a.n, 3 * a.n, a.drho, stream);
     const auto kernel = field_backward_kernel<S, true>;
     BT_ALLOW_SHARED(kernel, shared);
     BT_LAUNCH(kernel, grid, block, shared, stream, a.n, field, a.x, a.drho, out.table, exact, work.mlp, a.dx);

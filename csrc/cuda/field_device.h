@@ -284,11 +284,12 @@ struct ExactSums {
   ExactRange* range = nullptr;
 };
 // Clears the exact sums in memory of exact_size(entries, surfels, frames) and finds their units, such that no sum of
-// `count` gradients [count, 3] can overflow. The entries are those of the field's table; without a field, sums of
-// shares of the gradients, of at most 1 each in all. frames tells whether those of the surfels are summed.
+// `count` gradients can overflow, of which none is larger than the largest of `numbers` given. The entries are those of
+// the field's table; without a field, sums of shares of the gradients, of at most 1 each in all. frames tells whether
+// those of the surfels are summed.
 template <class S>
 ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
-                      int64_t count, const S* gradients, Stream stream);
+                      int64_t count, int64_t numbers, const S* gradients, Stream stream);
 // Writes the exact sums as numbers: where not null, dtable (of a given field), dbase and dframes.
 template <class S>
 void end_exact(const ExactSums& exact, const FieldArrays<S>* field, int64_t surfels, S* dtable, S* dbase, S* dframes,

@@ -111,14 +111,14 @@ void convert(int64_t n, const unsigned long long* from, const double* scale, S* 
 
 template <class S>
 ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
-                      int64_t count, const S* gradients, Stream stream) {
+                      int64_t count, int64_t numbers, const S* gradients, Stream stream) {
   ExactSums e;
   e.table = reinterpret_cast<unsigned long long*>(memory);
   e.range = reinterpret_cast<ExactRange*>(e.table + entries);
   e.base = e.table + entries + kExactRange;
   e.frames = e.base + 3 * surfels;
   fill_zero(memory, exact_size(entries, surfels, frames), stream);
-  largest(3 * count, gradients, &e.range->gradient, stream);
+  largest(numbers, gradients, &e.range->gradient, stream);
   if (frames) largest(entries, field->table, &e.range->entry, stream);
   FieldArrays<S> f = {};
   f.half = S(1);
@@ -141,10 +141,10 @@ void sum_weights(const S* partial, int blocks, int levels, const FieldGradients<
             blocks, levels, out);
 }
 
-#define BT_INSTANTIATE(S)                                                                                       \
-  template ExactSums begin_exact<S>(int64_t*, int64_t, const FieldArrays<S>*, int64_t, bool, int64_t, const S*, \
-                                    Stream);                                                                    \
-  template void end_exact<S>(const ExactSums&, const FieldArrays<S>*, int64_t, S*, S*, S*, Stream);             \
+#define BT_INSTANTIATE(S)                                                                                      \
+  template ExactSums begin_exact<S>(int64_t*, int64_t, const FieldArrays<S>*, int64_t, bool, int64_t, int64_t, \
+                                    const S*, Stream);                                                         \
+  template void end_exact<S>(const ExactSums&, const FieldArrays<S>*, int64_t, S*, S*, S*, Stream);            \
   template void sum_weights<S>(const S*, int, int, const FieldGradients<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

@@ -5,9 +5,8 @@
 #include "cuda/device.h"
 #include "cuda/pairs.h"
 #include "ops/appearance.h"
+#include "ops/blend.h"
 #include "ops/field.h"
-#include "ops/texel.h"
-#include "ops/visibility.h"
 
 namespace bt::cuda {
 
@@ -122,6 +121,10 @@ template <class S>
 void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream);
 template <class S>
 void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream);
+template <class S>
+void blend_forward(const BlendForward<S, Pairs>& a, Stream stream);
+template <class S>
+void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream);
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream);
 
 template <class S>

@@ -138,6 +138,61 @@ __device__ inline void for_each_fragment(const Pairs& p, const TileThread& s, Lo
   }
 }
 
+// A stretch of the list that a tile's block takes through shared memory: the next pairs, 32 at most, whose fragments
+// are no more than kHeld. A warp has about ten fragments of a pair, the block some hundreds of a stretch: all of its
+// threads read, work out or write them one after the other, and lanes find those of their pixels by the masks.
+template <int kHeld>
+class Stretch {
+  static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
+
+ public:
+  int pairs, count;  // from `first` on; of their fragments
+  int64_t base;      // the first of these in the list
+
+  // All threads of the block, and a barrier between this and `each_pair`.
+  __device__ Stretch(const Pairs& p, const TileThread& s, int64_t first, int64_t end, int (&bits)[kTileWarps][kWarp])
+      : base(p.offsets[first]), bits_(bits) {
+    const int64_t own = first + s.lane;  // one lane per pair
+    const bool some = own < end;
+    from_ = some ? int(p.offsets[own] - base) : 0;
+    const int behind = some ? int(p.offsets[own + 1] - base) : kHeld + 1;
+    mark_ = some ? p.masks[s.warp * p.pairs + own] : 0;
+    pairs = __popc(__ballot_sync(kFullMask, behind <= kHeld));
+    count = __shfl_sync(kFullMask, behind, pairs ? pairs - 1 : 0);
+    if (s.lane >= pairs) mark_ = 0;
+    bits[s.warp][s.lane] = __popc(mark_);
+  }
+  // use(j, i, mine) for the pairs first + j that have a fragment in the calling warp, front to back: fragment base + i
+  // is that of the lane's pixel, if it is `mine`.
+  template <class Use>
+  __device__ void each_pair(const TileThread& s, Use&& use) const {
+    const unsigned below = (1u << s.lane) - 1;
+    int from = from_;
+    BT_UNROLL
+    for (int w = 0; w < kTileWarps - 1; ++w) from += w < s.warp ? bits_[w][s.lane] : 0;
+    unsigned todo = __ballot_sync(kFullMask, mark_ != 0);
+    while (todo) {
+      const int j = __ffs(int(todo)) - 1;
+      todo &= todo - 1;
+      const unsigned taken = __shfl_sync(kFullMask, mark_, j);
+      use(j, __shfl_sync(kFullMask, from, j) + __popc(taken & below), bool(taken >> s.lane & 1u));
+    }
+  }
+  // each(i, base + i) by all threads; a warp begins at a multiple of 32 of the list, so that it reads and writes whole
+  // sectors.
+  template <class Each>
+  __device__ void each_fragment(Each&& each) const {
+    BT_UNROLL_BY(1)
+    for (int i = int(threadIdx.x) - int(base % kWarp); i < count; i += kTileThreads)
+      if (i >= 0) each(i, base + i);
+  }
+
+ private:
+  int (&bits_)[kTileWarps][kWarp];  // fragments of a warp and a pair
+  uint32_t mark_;                   // of the lane's pair: the warp's pixels that blend it
+  int from_;                        // where the pair begins
+};
+
 // The row of a pixel of an image. A division of integers takes 25 instructions; the product with the reciprocal is off
 // by one at most, below 2^21 rows.
 class RowOf {
@@ -151,6 +206,36 @@ class RowOf {
  private:
   int width_;
   float inverse_;
+};
+
+// A tile's part of an image, in shared memory. Counts of channels are odd, so that lanes hit different banks.
+class TilePart {
+ public:
+  __device__ explicit TilePart(const Pairs& p)
+      : width_(p.width),
+        left_(int(blockIdx.x) % tiles_across(p.width) * kTile),
+        top_(int(blockIdx.x) / tiles_across(p.width) * kTile),
+        columns_(min_(kTile, p.width - left_)),
+        rows_(min_(kTile, p.height - top_)),
+        row_of_(p.width) {}
+  // By all threads of the block; a barrier has to follow.
+  template <int kChannels, class S>
+  __device__ void load(const S* image, S* to) const {
+    for (int j = int(threadIdx.x); j < kTileThreads * kChannels; j += kTileThreads) {
+      const int row = j / (kTile * kChannels), column = j - row * (kTile * kChannels);
+      if (row < rows_ && column < columns_ * kChannels)
+        to[j] = image[(int64_t(top_ + row) * width_ + left_) * kChannels + column];
+    }
+  }
+  // Where a pixel of the image lies in it.
+  __device__ int at(int32_t pixel) const {
+    const int row = row_of_(pixel);
+    return (row - top_) * kTile + (pixel - row * width_ - left_);
+  }
+
+ private:
+  int width_, left_, top_, columns_, rows_;
+  RowOf row_of_;
 };
 
 // The other way through the list: kRunLanes lanes per pair, which take the fragments of its run in turns. Fragments of

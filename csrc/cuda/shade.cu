@@ -247,7 +247,7 @@ void shade_backward(const ShadeBackward<S>& a, Stream stream) {
   };
   if (a.work.exact) {
     const ExactSums exact = begin_exact(a.work.exact, learned ? learned->table_size() : 0, learned, a.n,
-                                        a.dframes != nullptr, a.f.total, a.dcolors, stream);
+                                        a.dframes != nullptr, a.f.total, 3 * a.f.total, a.dcolors, stream);
     trains_field ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
     end_exact(exact, learned, a.n, out.table, a.dbase, a.dframes, stream);
   } else {

@@ -1,4 +1,5 @@
-// Colours of fragments from the texels of their surfels, and the step of the texels: one thread per fragment.
+// Colours of fragments from the texels of their surfels, and their backward pass: one thread per fragment. Training
+// takes blend.cu; this is for who wants the colours themselves, and for the coverage of texels.
 //
 // Work, single precision. For each fragment the forward pass reads 8 bytes of the list and 32 of its surfel, which its
 // neighbours share, and writes 12; for a textured one it also reads 8 bytes of the list and four texels of 12. The
@@ -8,9 +9,8 @@
 // of a tile of one texel do. Every texel is cleared (16 bytes) and looked at (16), and those that were seen move (28).
 // A look-up is about 50 operations, with its derivatives 75: memory and additions are the limit. The backward kernel
 // takes 48 registers on compute capability 9.0.
-#include "cuda/field_device.h"
 #include "cuda/kernels.h"
-#include "cuda/warp.h"
+#include "cuda/texel_sums.h"
 
 namespace bt::cuda {
 
@@ -28,22 +28,6 @@ __global__ void __launch_bounds__(kThreads) colors_kernel(TexelColors<S> of, S* 
   if (of.f.weight[i] >= of.bound && patch.textured())
     c = patch.color(patch.corners(of.f.uv[i], of.f.uv[of.f.total + i]));
   store3(colors + 3 * i, c);
-}
-
-// Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels. Row: that of
-// the first corner in the list of texels, -1 where there is none; sums have rows of four.
-template <class S, bool kExact>
-__device__ void add_to_texels(int64_t row, const TexelCorners<S>& at, Vec3<S> g, int lane, const Adder<S, kExact>& to) {
-  S value[12];
-  texel_corner_gradients(at, g, [&](int k, Vec3<S> d) { store3(value + 3 * k, d); });
-  const unsigned run = run_of(row, lane);
-  sum_over_run(run, lane, value);
-  if (row < 0 || count_below(run, lane)) return;
-  BT_UNROLL
-  for (int k = 0; k < 4; ++k) {
-    const S d[4] = {value[3 * k], value[3 * k + 1], value[3 * k + 2], S(0)};
-    if (d[0] != S(0) || d[1] != S(0) || d[2] != S(0)) to.add4(4 * (row + at.at[k] - at.at[0]), d);
-  }
 }
 
 // Null is what is not asked for; without `sums` and exact sums the texels get no gradient.
@@ -79,43 +63,17 @@ __global__ void __launch_bounds__(kThreads)
     duv[i] = du, duv[f.total + i] = dv;
   }
   if (!has_texels) return;
-  Adder<S, kExact> to;
-  if constexpr (kExact)
-    to = {exact.table, exact.range->table};
-  else
-    to = {sums};
+  const Adder<S, kExact> to = texel_adder<kExact>(sums, exact);
   add_to_texels(textured ? patch.first + at.at[0] : int64_t(-1), at, g, lane, to);
-}
-
-// What becomes of the sums: the gradient, or a step of the texels.
-template <class S, bool kExact>
-__global__ void __launch_bounds__(kThreads)
-    finish_kernel(int64_t texels, S* sums, ExactSums exact, const S* __restrict__ share, S rate,
-                  S* __restrict__ dtexels, S* __restrict__ moved) {
-  const int64_t t = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (t >= texels) return;
-  Adder<S, kExact> of;
-  if constexpr (kExact)
-    of = {exact.table, exact.range->table};
-  else
-    of = {sums};
-  const Vec3<S> g = {of.sum(4 * t), of.sum(4 * t + 1), of.sum(4 * t + 2)};
-  if (dtexels) store3(dtexels + 3 * t, g);
-  if (moved && (g.x != S(0) || g.y != S(0) || g.z != S(0)))
-    store3(moved + 3 * t, texel_step(load3(moved + 3 * t), g, rate, share[t]));
 }
 
 template <class S, bool kExact>
 void run_backward(const TexelColorsBackward<S>& a, const ExactSums& exact, Stream stream) {
-  const int64_t texels = a.of.table.texels;
   const auto gradient = gradient_kernel<S, kExact>;
   if (a.of.f.total)
     BT_LAUNCH(gradient, blocks_for(a.of.f.total), dim3(kThreads), 0, stream, a.of, a.colors, a.dcolors, a.dbase, a.duv,
               a.work.sums, exact, a.dbase != nullptr, a.sums_texels());
-  const auto finish = finish_kernel<S, kExact>;
-  if (a.sums_texels() && texels)
-    BT_LAUNCH(finish, blocks_for(texels), dim3(kThreads), 0, stream, texels, a.work.sums, exact, a.share, a.rate,
-              a.dtexels, a.moved);
+  if (a.sums_texels()) finish_texels<kExact>(a, a.of.table.texels, exact, stream);
 }
 }  // namespace
 
@@ -129,7 +87,7 @@ void texel_colors_backward(const TexelColorsBackward<S>& a, Stream stream) {
   const int64_t n = a.of.table.n, entries = a.sums_texels() ? 4 * a.of.table.texels : 0;
   if (a.work.exact) {
     const ExactSums exact = begin_exact(a.work.exact, entries, static_cast<const FieldArrays<S>*>(nullptr), n, false,
-                                        a.of.f.total, a.dcolors, stream);
+                                        a.of.f.total, 3 * a.of.f.total, a.dcolors, stream);
     run_backward<S, true>(a, exact, stream);
     end_exact(exact, static_cast<const FieldArrays<S>*>(nullptr), n, static_cast<S*>(nullptr), a.dbase,
               static_cast<S*>(nullptr), stream);

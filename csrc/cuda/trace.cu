@@ -94,10 +94,6 @@ __global__ void __launch_bounds__(kThreads)
   if (t <= tiles) tile_start[t] = offsets[tile_pairs[t]];
 }
 
-// Fragments that a block holds in shared memory before it writes them: those of one pair at least.
-template <class S>
-constexpr int kHeld = 4096 / sizeof(S);
-
 // A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes. If each warp wrote its own, most
 // sectors would be written in parts, by several warps, and memory takes longer for a part than for a whole sector. So a
 // block collects the fragments of up to 32 pairs, in the list's order, and writes them as one contiguous stretch.
@@ -108,31 +104,22 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
   struct alignas(16) Row {
     S g[kGeom];
   };
-  static_assert(kHeld<S> >= kTileThreads && kGeom % (kTileThreads / kWarp) == 0);
+  constexpr int kHeld = 4096 / sizeof(S), kLoaders = kTileThreads / kWarp;  // threads per row
+  static_assert(kGeom % kLoaders == 0);
   __shared__ Row rows[kWarp];
-  __shared__ int bits[kTileWarps][kWarp];  // fragments of a warp and a pair
-  __shared__ int32_t ids[kWarp], surfels[kHeld<S>], pixels[kHeld<S>];
-  __shared__ S weights[kHeld<S>], us[kHeld<S>], vs[kHeld<S>], depths[kHeld<S>], sigmas[kHeld<S>];
-  constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
+  __shared__ int bits[kTileWarps][kWarp];
+  __shared__ int32_t ids[kWarp], surfels[kHeld], pixels[kHeld];
+  __shared__ S weights[kHeld], us[kHeld], vs[kHeld], depths[kHeld], sigmas[kHeld];
   const TileThread s = tile_thread(p.width);
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   const int32_t pixel = int32_t(s.y * p.width + s.x);
-  const unsigned below = (1u << s.lane) - 1;
   const int64_t end = p.tile_pairs[blockIdx.x + 1];
   S transmittance = S(1);
   int taken_pairs = 0;
   for (int64_t first = p.tile_pairs[blockIdx.x]; first < end; first += taken_pairs) {
-    // one lane per pair: the next ones whose fragments fit
-    const int64_t own = first + s.lane, base = p.offsets[first];
-    const bool some = own < end;
-    const int from_base = some ? int(p.offsets[own] - base) : 0;
-    const int behind = some ? int(p.offsets[own + 1] - base) : kHeld<S> + 1;
-    uint32_t mark = some ? p.masks[s.warp * p.pairs + own] : 0;
-    taken_pairs = __popc(__ballot_sync(kFullMask, behind <= kHeld<S>));
-    if (!taken_pairs) return;  // no pair has more than a tile's pixels
-    const int count = __shfl_sync(kFullMask, behind, taken_pairs - 1);
-    if (s.lane >= taken_pairs) mark = 0;
-    bits[s.warp][s.lane] = __popc(mark);
+    const Stretch<kHeld> part(p, s, first, end, bits);
+    taken_pairs = part.pairs;
+    if (!taken_pairs) return;
     const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
     if (row < taken_pairs) {
       const int32_t id = p.surfel[first + row];
@@ -141,45 +128,31 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
       for (int c = 0; c < kGeom; c += kLoaders) rows[row].g[c + column] = geom[int64_t(id) * kGeom + c + column];
     }
     __syncthreads();  // the rows are there, and what was held is written
-    int from = from_base;
-    BT_UNROLL
-    for (int w = 0; w < kTileWarps - 1; ++w) from += w < s.warp ? bits[w][s.lane] : 0;
-    unsigned todo = __ballot_sync(kFullMask, mark != 0);
-    while (todo) {
-      const int j = __ffs(int(todo)) - 1;
-      todo &= todo - 1;
-      const unsigned taken = __shfl_sync(kFullMask, mark, j);
-      const int i = __shfl_sync(kFullMask, from, j) + __popc(taken & below);
-      const bool mine = taken >> s.lane & 1u;
+    part.each_pair(s, [&](int j, int i, bool mine) {
       S g[kGeom];
       load_shape(rows[j].g, g);
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
-      if (mine) {
-        // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here,
-        // may find nothing, and the gradient would divide by it.
-        const S sigma = max_(plain(f.sigma), S(kAlphaMin));
-        const Blend<S> b = blend(sigma, transmittance);
-        transmittance = b.behind;
-        surfels[i] = ids[j], pixels[i] = pixel;
-        weights[i] = b.weight;
-        us[i] = plain(f.u), vs[i] = plain(f.v);
-        depths[i] = plain(f.depth);
-        sigmas[i] = plain(f.low_pass) > S(0) ? -sigma : sigma;
-      }
-    }
+      if (!mine) return;
+      // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here,
+      // may find nothing, and the gradient would divide by it.
+      const S sigma = max_(plain(f.sigma), S(kAlphaMin));
+      const Blend<S> b = blend(sigma, transmittance);
+      transmittance = b.behind;
+      surfels[i] = ids[j], pixels[i] = pixel;
+      weights[i] = b.weight;
+      us[i] = plain(f.u), vs[i] = plain(f.v);
+      depths[i] = plain(f.depth);
+      sigmas[i] = plain(f.low_pass) > S(0) ? -sigma : sigma;
+    });
     __syncthreads();
-    // from a multiple of 32 on, so that warps write whole sectors
-    BT_UNROLL_BY(1)
-    for (int i = int(threadIdx.x) - int(base % kWarp); i < count; i += kTileThreads) {
-      if (i < 0) continue;
-      const int64_t at = base + i;
+    part.each_fragment([&](int i, int64_t at) {
       out.surfel[at] = surfels[i], out.pixel[at] = pixels[i];
       out.weight[at] = weights[i];
       out.uv[at] = us[i], out.uv[out.total + at] = vs[i];
       out.depth[at] = depths[i];
       out.sigma[at] = sigmas[i];
-    }
+    });
   }
 }
 

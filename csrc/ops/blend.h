@@ -7,12 +7,12 @@
 namespace bt {
 
 // Surfels with texels, or without any (sizes 0, 0), as a view shows them.
-template <class S>
+template <class S, class Layout>
 struct BlendedSurfels {
   bool maps;
   const S* geom;  // [n, kGeom]
   int width, height;
-  Fragments<S, TileStarts> fragments;
+  Fragments<S, Layout> fragments;
   S bound;
   TexelTiles<S> table;
 
@@ -30,9 +30,9 @@ struct BlendedSurfels {
 };
 
 // image [height, width, channels]: the sums of core/blend.h, with the colours of TexelColorsForward. Written.
-template <class S>
+template <class S, class Layout>
 struct BlendForward {
-  BlendedSurfels<S> of;
+  BlendedSurfels<S, Layout> of;
   S* image;
 
   template <class R>
@@ -42,15 +42,21 @@ struct BlendForward {
   }
 };
 
+// What a pair of surfel and tile adds to its surfel: beta and the colour, with maps also the normal and one unused.
+constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
+
 // dweight [F], ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and
 // what is given of duv [2, F] and dtexels [texels, 3]. `moved`, `share` and `rate` are those of TexelColorsBackward.
-template <class S>
+// partial [pairs, blend_sums] and work are working memory.
+template <class S, class Layout>
 struct BlendBackward {
-  BlendedSurfels<S> of;
+  BlendedSurfels<S, Layout> of;
   const S *dimage, *share;
   S rate;
-  S *dweight, *duv, *ddepth, *dgeom, *dbase, *dtexels, *moved;
+  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dtexels, *moved;
+  TexelWork<S> work;
 
+  bool sums_texels() const { return dtexels || moved; }
   template <class R>
   void fields(R& r) {
     of.fields(r);
@@ -65,6 +71,8 @@ struct BlendBackward {
     r.maybe("moved", moved, 3 * of.table.texels);
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
+    r.work("partial", partial, of.fragments.layout.pairs * blend_sums(of.maps));
+    work.fields(r, sums_texels() ? of.table.texels : 0, 0);
     check_moved(r, of.table, moved, share, dtexels);
   }
 };

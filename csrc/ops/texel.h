@@ -53,7 +53,10 @@ struct TexelPatch {
   BT_HD Vec3<S> color(const TexelCorners<S>& at) const { return shaded(view, texel_fetch(tile, at)); }
   // adds the gradient with respect to u and v
   BT_HD void uv_vjp(const TexelCorners<S>& at, Vec3<S> g, S& du, S& dv) const {
-    texel_fetch_uv_vjp(tile, at, size, extent, g, du, dv);
+    Vec3<S> t[4];
+    load_corners(tile, at, t);
+    const TexelSlopes<S> slopes = texel_slopes(t, at, size, extent);
+    du += dot(g, slopes.u), dv += dot(g, slopes.v);
   }
 };
 template <class S>

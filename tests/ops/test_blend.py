@@ -19,20 +19,27 @@ BOUND = 0.03
 class View:
     """A view of a random scene, with everything that learns as leaves."""
 
-    def __init__(self, case: SceneCase, dtype: torch.dtype, textured: bool, learns: bool = True) -> None:
+    def __init__(
+        self,
+        case: SceneCase,
+        dtype: torch.dtype,
+        textured: bool,
+        learns: bool = True,
+        device: torch.device | None = None,
+    ) -> None:
         n = len(case.params["means"])
         g = torch.Generator().manual_seed(n)
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(dtype)
+            return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(device, dtype)
 
         self.camera = camera_of(case, dtype)
-        self.leaves = [case.params[key].to(dtype).clone().requires_grad_() for key in SURFEL_KEYS]
+        self.leaves = [case.params[key].to(device, dtype).clone().requires_grad_() for key in SURFEL_KEYS]
         self.base = uniform(-0.9, 0.5, n, 3).requires_grad_()
         self.leaves.append(self.base)
         self.given: dict[str, Tensor | ops.TexelTiles] = {}
         if textured:
-            size = torch.tensor(SIZES, dtype=torch.int32).repeat(n // len(SIZES) + 1, 1)[:n]
+            size = torch.tensor(SIZES, dtype=torch.int32, device=device).repeat(n // len(SIZES) + 1, 1)[:n]
             tiles = ops.TexelTiles.of_sizes(size, uniform(1.0, 3.0, n))
             texels = uniform(-0.6, 0.6, tiles.count, 3).requires_grad_(learns)
             self.given = {"texels": texels, "tiles": tiles}

@@ -1,0 +1,229 @@
+// Shading and blending of surfels with or without texels, and its backward pass: colours and their gradients never
+// leave the multiprocessor.
+//
+// Forward a block takes its tile's list stretch by stretch through shared memory: first every thread works out colours,
+// one fragment after the other, then every lane adds up those of its pixel. So all lanes are busy with the look-ups,
+// and the sums need no atomics.
+//
+// Backward kRunLanes lanes take a pair's fragments in turns, with the tile's part of dimage in shared memory. What a
+// pair adds to its surfel goes to its slot, so that only the sums of texels are added in any order.
+//
+// Bytes per fragment of surfels alone; with texels, which are 4 of 12 bytes more; and what shading and compositing one
+// after the other move of the lists of fragments, colours and gradients:
+//             alone   with texels   one after the other
+//   forward     8         16              36, 44
+//   backward   12         24              68, 84
+#include "core/blend.h"
+#include "cuda/kernels.h"
+#include "cuda/texel_sums.h"
+
+namespace bt::cuda {
+
+namespace {
+template <class S, bool kMaps>
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
+                                                : kMaps        ? 4
+                                                               : 5)
+    forward_kernel(BlendedSurfels<S, Pairs> of, S* __restrict__ image) {
+  constexpr int kHeld = 4096 / sizeof(S), kChannels = kMaps ? kMapChannels : kImageChannels;
+  __shared__ int bits[kTileWarps][kWarp];
+  __shared__ S weights[kHeld], colors[3][kHeld], depths[kMaps ? kHeld : 1];
+  const Pairs& p = of.fragments.layout;
+  const FragmentArrays<S>& f = of.fragments.f;
+  const TileThread s = tile_thread(p.width);
+  const int64_t end = p.tile_pairs[blockIdx.x + 1];
+  S sum[kChannels];
+  for (int c = 0; c < kChannels; ++c) sum[c] = S(0);
+  int taken_pairs = 0;
+  for (int64_t first = p.tile_pairs[blockIdx.x]; first < end; first += taken_pairs) {
+    const Stretch<kHeld> part(p, s, first, end, bits);
+    taken_pairs = part.pairs;
+    if (!taken_pairs) break;
+    // beta and the normal, one lane per pair
+    const bool some = s.lane < taken_pairs;
+    const S* g = of.geom + (some ? int64_t(p.surfel[first + s.lane]) * kGeom : 0);
+    const S beta = some ? g[kBeta] : S(0), nx = kMaps && some ? g[kNx] : S(0), ny = kMaps && some ? g[kNy] : S(0),
+            nz = kMaps && some ? g[kNz] : S(0);
+    __syncthreads();  // what was held is added up
+    part.each_fragment([&](int i, int64_t at) {
+      const bool textured = of.table.texels > 0;
+      const int32_t id = f.surfel[at];
+      const S w = f.weight[at], u = textured ? f.uv[at] : S(0), v = textured ? f.uv[f.total + at] : S(0);
+      const TexelPatch<S> patch(of.table, id);
+      Vec3<S> c = patch.view;
+      if (w >= of.bound && patch.textured()) c = patch.color(patch.corners(u, v));
+      weights[i] = w, colors[0][i] = c.x, colors[1][i] = c.y, colors[2][i] = c.z;
+      if constexpr (kMaps) depths[i] = f.depth[at];
+    });
+    __syncthreads();
+    part.each_pair(s, [&](int j, int i, bool mine) {
+      const S b = __shfl_sync(kFullMask, beta, j);
+      S normal[3] = {S(0), S(0), S(0)};
+      if constexpr (kMaps) {
+        normal[0] = __shfl_sync(kFullMask, nx, j), normal[1] = __shfl_sync(kFullMask, ny, j);
+        normal[2] = __shfl_sync(kFullMask, nz, j);
+      }
+      if (!mine) return;
+      const S color[3] = {colors[0][i], colors[1][i], colors[2][i]};
+      add_blended<kMaps>(weights[i], color, b, depths[kMaps ? i : 0], normal, sum);
+    });
+  }
+  if (s.x >= p.width || s.y >= p.height) return;
+  S* to = image + (int64_t(s.y) * p.width + s.x) * kChannels;
+  for (int c = 0; c < kChannels; ++c) to[c] = sum[c];
+}
+
+// Where the backward kernel writes; null is what is not asked for.
+template <class S>
+struct Gradients {
+  S *weight, *uv, *depth, *partial;
+  S* texels;  // sums, where they are not exact
+  bool sums_texels;
+};
+
+// Blocks at a time on a multiprocessor, as many as there are registers for: the look-up of texels and the sums of its
+// gradients take 80 in single precision.
+template <class S, bool kMaps, bool kTexels>
+constexpr int resident() {
+  if (sizeof(S) == 8) return 1;
+  return kTexels ? (kMaps ? 2 : 3) : (kMaps ? 4 : 5);
+}
+
+// A run is read and written from a multiple of 8 fragments on: memory takes whole sectors of 32 bytes faster than
+// parts. kTexels: there are any.
+template <class S, bool kMaps, bool kTexels, bool kExact>
+__global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
+    backward_kernel(BlendedSurfels<S, Pairs> of, const S* __restrict__ dimage, Gradients<S> out, ExactSums exact) {
+  constexpr int kChannels = kMaps ? kMapChannels : kImageChannels, kSums = blend_sums(kMaps);
+  constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
+  __shared__ S gradient[kTileThreads * kChannels];
+  const Pairs& p = of.fragments.layout;
+  const FragmentArrays<S>& f = of.fragments.f;
+  // Pairs behind those of the tiles have no fragments, but slots: they are left to the last block.
+  const int64_t first = p.tile_pairs[blockIdx.x];
+  const int64_t end = blockIdx.x + 1 < gridDim.x ? p.tile_pairs[blockIdx.x + 1] : p.pairs;
+  if (first == end) return;
+  const TilePart tile(p);
+  tile.load<kChannels>(dimage, gradient);
+  __syncthreads();
+  Adder<S, kExact> texel_sums = {};
+  if constexpr (kTexels) texel_sums = texel_adder<kExact>(out.texels, exact);
+  const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
+  // The runs of a warp take their turns together.
+  for (int64_t k = first + worker; k - worker % 2 < end; k += kWorkers) {
+    const bool some = k < end;
+    const int64_t begin = some ? p.offsets[k] : 0;
+    const int skipped = int(begin % kWhole), count = some ? int(p.offsets[k + 1] - begin) : 0;
+    const int64_t id = some ? p.surfel[k] : 0;
+    const TexelPatch<S> patch(of.table, id);
+    const S* g = of.geom + id * kGeom;
+    const S beta = g[kBeta], normal[3] = {g[kNx], g[kNy], g[kNz]};
+    S sums[kSums];  // beta, colour, normal
+    BT_UNROLL
+    for (int c = 0; c < kSums; ++c) sums[c] = S(0);
+    const int own = count ? skipped + count : 0, stop = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
+    for (int turn = 0; turn < stop; turn += kRunLanes) {
+      const int at = turn - skipped + lane;  // in the run
+      const int64_t i = begin + at;
+      const bool mine = at >= 0 && at < count;
+      S w = S(0), u = S(0), v = S(0), depth = S(0);
+      int pixel = 0;
+      if (mine) {
+        pixel = f.pixel[i], w = f.weight[i];
+        if (kTexels && patch.textured()) u = f.uv[i], v = f.uv[f.total + i];
+        if constexpr (kMaps) depth = f.depth[i];
+      }
+      __syncwarp();  // no load is put off until its number is used: one wait is for all
+      const bool textured = kTexels && mine && w >= of.bound && patch.textured();
+      TexelCorners<S> corners = {};
+      TexelSlopes<S> slopes = {};
+      Vec3<S> color = patch.view, dcolor = {S(0), S(0), S(0)};
+      if (textured) {
+        corners = patch.corners(u, v);
+        Vec3<S> t[4];
+        load_corners(patch.tile, corners, t);
+        color = shaded(patch.view, texel_mix(t, corners.weight));
+        if (out.uv) slopes = texel_slopes(t, corners, patch.size, patch.extent);
+      }
+      if (mine) {
+        const S* d = gradient + tile.at(pixel) * kChannels;
+        const S rgb[3] = {color.x, color.y, color.z};
+        out.weight[i] = weight_gradient<kMaps>(d, rgb, beta, depth, normal);
+        dcolor = residual_gradient(color, w * load3(d));
+        sums[0] += w * d[4];
+        sums[1] += dcolor.x, sums[2] += dcolor.y, sums[3] += dcolor.z;
+        if constexpr (kMaps) {
+          out.depth[i] = w * d[5];
+          BT_UNROLL
+          for (int c = 0; c < 3; ++c) sums[4 + c] += w * d[6 + c];
+        }
+        if (out.uv) out.uv[i] = dot(dcolor, slopes.u), out.uv[f.total + i] = dot(dcolor, slopes.v);
+      }
+      if (kTexels && out.sums_texels)
+        add_to_texels(textured ? patch.first + corners.at[0] : int64_t(-1), corners, dcolor, int(threadIdx.x) % kWarp,
+                      texel_sums);
+    }
+    const S sum = sum_over_run(sums, lane);
+    if (some && lane < kSums) out.partial[int64_t(p.slot[k]) * kSums + lane] = sum;
+  }
+}
+
+template <class S>
+struct StoreSurfelGradient {
+  const S* base;
+  S *dgeom, *dbase;
+  __device__ void operator()(int64_t surfel, int column, S sum) const {
+    if (column == 0) dgeom[surfel * kGeom + kBeta] = sum;
+    if (column >= 4 && column < 7) dgeom[surfel * kGeom + kNx + column - 4] = sum;
+    if (column == 0 || column >= 4) return;
+    const int64_t at = 3 * surfel + column - 1;
+    dbase[at] = base_gradient(base[at], sum);
+  }
+};
+
+template <class S, bool kMaps, bool kTexels, bool kExact>
+void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stream stream) {
+  const Pairs& p = a.of.fragments.layout;
+  const Gradients<S> out = {a.dweight, a.duv, a.ddepth, a.partial, a.work.sums, a.sums_texels()};
+  if (p.pairs)
+    BT_LAUNCH((backward_kernel<S, kMaps, kTexels, kExact>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream,
+              a.of, a.dimage, out, exact);
+  fill_zero(a.dgeom, p.surfels * kGeom, stream);
+  sum_slots<blend_sums(kMaps)>(p, static_cast<const S*>(a.partial),
+                               StoreSurfelGradient<S>{a.of.table.base, a.dgeom, a.dbase}, stream);
+  if (a.sums_texels()) finish_texels<kExact>(a, a.of.table.texels, exact, stream);
+}
+}  // namespace
+
+template <class S>
+void blend_forward(const BlendForward<S, Pairs>& a, Stream stream) {
+  const dim3 tiles(unsigned(a.of.fragments.layout.tiles())), threads(kTileThreads);
+  if (a.of.maps)
+    BT_LAUNCH((forward_kernel<S, true>), tiles, threads, 0, stream, a.of, a.image);
+  else
+    BT_LAUNCH((forward_kernel<S, false>), tiles, threads, 0, stream, a.of, a.image);
+}
+
+template <class S>
+void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream) {
+  const int64_t entries = a.sums_texels() ? 4 * a.of.table.texels : 0;
+  const bool maps = a.of.maps;
+  if (a.work.exact && entries) {
+    const ExactSums exact = begin_exact(a.work.exact, entries, static_cast<const FieldArrays<S>*>(nullptr), 0, false,
+                                        a.of.fragments.f.total, a.of.numbers(), a.dimage, stream);
+    maps ? run_backward<S, true, true, true>(a, exact, stream) : run_backward<S, false, true, true>(a, exact, stream);
+  } else if (a.of.table.texels) {
+    fill_zero(a.work.sums, entries, stream);
+    maps ? run_backward<S, true, true, false>(a, {}, stream) : run_backward<S, false, true, false>(a, {}, stream);
+  } else {
+    maps ? run_backward<S, true, false, false>(a, {}, stream) : run_backward<S, false, false, false>(a, {}, stream);
+  }
+}
+
+#define BT_INSTANTIATE(S)                                             \
+  template void blend_forward(const BlendForward<S, Pairs>&, Stream); \
+  template void blend_backward(const BlendBackward<S, Pairs>&, Stream);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt::cuda

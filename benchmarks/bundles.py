@@ -104,17 +104,16 @@ def load(folder: Path, downscale: int) -> Capture:
 
 
 def trained(capture: Capture, seed: int, steps: int) -> dict[str, Any]:
-    """A scene with texels, the background that it is judged over, held-out dB and CPU seconds. Before photographs with
-    alpha the background is random."""
+    """A scene with texels, the background that it is judged over, held-out dB and CPU seconds."""
     bounded = capture.train[0].image.shape[-1] == 4
-    config = TrainConfig(seed=seed, background="random" if bounded else TrainConfig().background)
+    config = TrainConfig(seed=seed)
     cameras = [view.camera for view in capture.train]
     pixels = sum(camera.width * camera.height for camera in cameras)
     config.first_surfels = first_surfels_for(steps, pixels / len(cameras))
     centers, options = torch.stack([camera.center for camera in cameras]), SceneConfig(texture="texels")
     scene, _ = build_scene(capture.points, capture.colours, centers, options, config, bounded, pixels)
     log = fit(scene, capture.train, capture.held_out, config, steps)
-    background = judging_background(config.background, "cpu")
+    background = judging_background(config, "cpu")
     last = log.entries[-1]
     return {
         "scene": scene,

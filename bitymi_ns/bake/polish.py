@@ -27,7 +27,7 @@ from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling
-from bitymi_ns.train.views import View, training_order
+from bitymi_ns.train.views import View, step_background, training_order
 
 
 @dataclass
@@ -75,17 +75,19 @@ class _Polish:
         extent = scene_extent(centers, drawn.surfels["means"])
         self.schedule = Schedule(replace(train, lr=train.lr.times(options.share)), options.steps, extent)
         self.optimizers = surfel_optimizers(self.scene)
-        self.guard, self.factor = train.guard, 1.0
+        self.train, self.factor = train, 1.0
 
-    def shown(self, view: View) -> Tensor:
-        """[H, W, 3] the scene as a view's photograph shows it."""
-        output = self.scene.render(view.camera.to("cpu"), self.background)
-        return view.shown(output.rgb, output.alpha, self.background)
+    def shown(self, view: View, background: Tensor | None) -> Tensor:
+        """[H, W, 3] the scene as a view's photograph shows it, over a colour [3]."""
+        output = self.scene.render(view.camera.to("cpu"), background)
+        return view.shown(output.rgb, output.alpha, background)
 
     @torch.no_grad()
     def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
         """Mean dB over the views of which any pixel counts."""
-        pictures = ((self.shown(view), view.target(self.background, "cpu"), _mask(view)) for view in views)
+        pictures = (
+            (self.shown(view, self.background), view.target(self.background, "cpu"), _mask(view)) for view in views
+        )
         return look(pictures, len(views), progress)
 
     def step(self, number: int, view: View, share: Tensor) -> bool:
@@ -94,11 +96,12 @@ class _Polish:
         for name, optimizer in self.optimizers.items():
             set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
         forget_gradients(self.optimizers.values())
-        mask, target = _mask(view), view.target(self.background, "cpu")
+        background = step_background(self.train, view, number, "cpu")
+        mask, target = _mask(view), view.target(background, "cpu")
         # the loss is a mean, the step wants a sum
         rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
         self.field.descent = TexelDescent(share, rate)
-        loss = photometric(self.shown(view), target, options.ssim_weight, mask)
+        loss = photometric(self.shown(view, background), target, options.ssim_weight, mask)
         if not math.isfinite(float(loss.detach())):
             return False
         if not loss.requires_grad:  # nothing of the scene is in the view
@@ -115,7 +118,7 @@ class _Polish:
         """To an earlier state, with slower steps from here on."""
         self.scene.load_state_dict(state)
         self.optimizers = surfel_optimizers(self.scene)
-        self.factor *= self.guard.rates
+        self.factor *= self.train.guard.rates
 
 
 def polish_scene(
@@ -139,9 +142,10 @@ def polish_scene(
     Args:
         baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
-        background: [3] colour behind the scene.
+        background: [3] colour behind the scene where views are judged.
         options: see `PolishOptions`.
-        train: options of the training, for the learning rates, and for what is done when a step is not finite.
+        train: options of the training, for the learning rates, the colour behind the scene in a step, and for what is
+            done when a step is not finite.
         progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
 
@@ -192,7 +196,7 @@ def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progres
         if not run.step(number, view, share):
             attempts += 1
             run.go_back(looks.best)
-        more = attempts < run.guard.rollbacks
+        more = attempts < run.train.guard.rollbacks
         if not more or looks.due(number + 1):
             more = looks.note(number + 1, run.psnr(held_in), run.state) and more
         progress("polishing", number + 1, options.steps if more else number + 1)

@@ -120,8 +120,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         outputs = self.train_dataparser_outputs
         color = outputs.alpha_color
         self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
-        self.train_dataset.metadata["has_alpha"] = bool(outputs.image_filenames) and file_has_transparency(
-            outputs.image_filenames[0]
+        self.train_dataset.metadata["has_alpha"] = (
+            bool(outputs.image_filenames)
+            and file_has_transparency(outputs.image_filenames[0])
+            and self.train_dataset.get_numpy_image(0).shape[-1] == 4
         )
         self.train_dataset.metadata["declares_box"] = declares_box(config.dataparser)
         cameras = outputs.cameras

@@ -23,7 +23,8 @@ from bitymi_ns.train.views import over_background
 
 
 class BitymiDataset(InputDataset):
-    """nerfstudio's dataset, except that images with alpha stay [H, W, 4]: the model composes them over a background."""
+    """nerfstudio's dataset, except that images with transparent pixels stay [H, W, 4]: the model composes them over a
+    background."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -52,6 +53,8 @@ class BitymiDataset(InputDataset):
         if image.size != declared:
             fail(wrong_size(path, image.size, declared))
         pixels = np.array(image, dtype=np.uint8)
+        if pixels.shape[-1] == 4 and pixels[..., 3].min(initial=255) == 255:
+            pixels = np.ascontiguousarray(pixels[..., :3])  # nothing is transparent
         self._notes[image_idx] = note(pixels)
         return pixels
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -26,7 +26,7 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import View, judging_background
 
 SURFEL_PARAMETERS = (*GEOMETRY, *VIEW_PARAMETERS)
 PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
@@ -50,13 +50,18 @@ class BitymiModelConfig(SurfelModelConfig):
     """Held-out views rendered for a point of that curve, all for the last one; 0 = all."""
 
 
-def train_config_for(config: TrainConfig, alpha_color: Tensor | None) -> TrainConfig:
-    """The training options with the background that the capture states for its transparent images, if any."""
-    if alpha_color is None or config.background == "random":
-        return config
+def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
+    """The training options with the colour that the capture states for its transparent images, if any. Where none is
+    transparent, `background` auto is that colour, too."""
+    color = config.alpha_color if alpha_color is None else _name_of(alpha_color)
+    background = color if config.background == "auto" and not transparent else config.background
+    return dataclasses.replace(config, background=background, alpha_color=color)
+
+
+def _name_of(alpha_color: Tensor) -> Literal["black", "white"]:
     for name, value in (("black", 0.0), ("white", 1.0)):
         if bool((alpha_color == value).all()):
-            return dataclasses.replace(config, background=name)  # type: ignore[arg-type]
+            return name  # type: ignore[return-value]
     fail(f"the capture's alpha colour {alpha_color.tolist()} cannot be trained on; choose black or white")
 
 
@@ -72,7 +77,9 @@ class BitymiModel(SurfelModel):
     def populate_modules(self) -> None:
         super().populate_modules()
         self.metadata: dict[str, Any] = self.kwargs.get("metadata") or {}
-        self.train_config = train_config_for(self.config.train, self.metadata.get("alpha_color"))
+        self.train_config = train_config_for(
+            self.config.train, self.metadata.get("alpha_color"), bool(self.metadata.get("has_alpha"))
+        )
         points = self.kwargs.pop("seed_points", None)
         self.scene = new_scene(
             points, self.scene_box, self.config.scene, self.train_config, self.metadata, self.config.steps
@@ -86,11 +93,9 @@ class BitymiModel(SurfelModel):
 
     @property
     def background(self) -> Tensor:
-        """[3]: the capture's own colour behind its alpha where it states one, else the preset's."""
-        color = self.metadata.get("alpha_color")
-        if color is None:
-            color = torch.ones(3) if self.config.train.background == "white" else torch.zeros(3)
-        return color.to(self.device)
+        """[3]: see `judging_background`."""
+        color = judging_background(self.train_config, self.device)
+        return torch.zeros(3, device=self.device) if color is None else color
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         with torch.no_grad():

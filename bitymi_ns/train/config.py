@@ -9,6 +9,8 @@ REFERENCE_STEPS = 30_000
 """The run length for which every step count below is given."""
 ExposureKind = Literal["auto", "off", "gain", "affine"]
 """Colour corrections of the photographs."""
+Background = Literal["auto", "black", "white", "random"]
+"""Colours behind the scene."""
 
 
 @dataclass
@@ -222,7 +224,11 @@ class TrainConfig:
     exposure: ExposureKind = "off"
     """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
     matrix, off = all photographs are taken as they are, auto = gain where the photographs disagree by gains."""
-    background: Literal["black", "white", "random"] = "black"
-    """Colour behind the scene while training; images with alpha are composed over it."""
+    background: Background = "auto"
+    """Colour behind the scene while training; images with alpha are composed over it. auto = another one in every step,
+    as random does, for images with alpha, so that nothing is learned but what they show; black for others."""
+    alpha_color: Literal["black", "white"] = "black"
+    """Colour behind images with alpha where views are judged and after training, with background auto and random. In
+    ns-train that of the capture, where it states one."""
     seed: int = 0
     """Seed of every random choice in training."""

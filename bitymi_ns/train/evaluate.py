@@ -65,7 +65,7 @@ def held_out_quality(
 def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Quality:
     """`held_out_quality` of a trained scene, over the background on which views are judged."""
     device = scene.surfels["means"].device
-    background = judging_background(config.background, device)
+    background = judging_background(config, device)
     return held_out_quality(
         lambda camera: scene.render(camera, background=background, field_mode="frozen"), views, background, device
     )

@@ -154,7 +154,7 @@ class Guard:
         """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
         losses = []
         device = self.scene.surfels["means"].device
-        background = judging_background(self.config.background, device)
+        background = judging_background(self.config, device)
         for view in (views.at(i, factor) for i in spread(len(views), COMPARED_VIEWS)):
             target = view.target(background, device)
             if blank:

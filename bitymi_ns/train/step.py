@@ -25,7 +25,7 @@ from bitymi_ns.train.resize import ResizeHook
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.texels import LearningTexels
-from bitymi_ns.train.views import ReducedViews, TrainingData, View, background_color
+from bitymi_ns.train.views import ReducedViews, TrainingData, View, step_background
 from bitymi_ns.train.watch import LossWatch
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def view_losses(
         TrainingDiverged: the loss is not finite.
     """
     device = scene.surfels["means"].device
-    background = background_color(config.background, config.seed, step, device)
+    background = step_background(config, view, step, device)
     output = scene.render(
         view.camera,
         background=background,

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.memory import MemoryBudget
 
 REDUCED_BYTES = 1 << 28
@@ -173,10 +174,19 @@ def background_color(
     raise ValueError(f"background must be black, white or random, not {kind!r}")
 
 
-def judging_background(kind: Literal["black", "white", "random"], device: torch.device | str) -> Tensor | None:
-    """[3] the colour behind the scene where views are judged, None = black: that of training, but black where it is
-    random, so that no figure depends on the draw."""
-    return background_color("white" if kind == "white" else "black", 0, 0, device)
+def step_background(config: TrainConfig, view: View, step: int, device: torch.device | str) -> Tensor | None:
+    """[3] the colour behind the scene in a step on a view, `config.background`; None = black."""
+    kind = config.background
+    if kind == "auto":
+        kind = "random" if view.image.shape[-1] == 4 else "black"
+    return background_color(kind, config.seed, step, device)
+
+
+def judging_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
+    """[3] the colour behind the scene where views are judged, None = black: that of training, but `config.alpha_color`
+    where it changes, so that no figure depends on the draw."""
+    kind = config.background if config.background in ("black", "white") else config.alpha_color
+    return background_color(kind, 0, 0, device)
 
 
 def over_background(image: Tensor, background: Tensor | None) -> Tensor:

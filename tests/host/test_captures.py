@@ -50,11 +50,21 @@ def test_a_batch_does_not_share_its_dictionary_with_the_cache(capture: Path) -> 
 
 def test_alpha_is_kept_for_the_model(capture: Path) -> None:
     for path in images_of(capture):
-        Image.open(path).convert("RGBA").save(path.with_suffix(".png"))
+        image = Image.open(path).convert("RGBA")
+        image.putpixel((0, 0), (0, 0, 0, 0))
+        image.save(path.with_suffix(".png"))
     manager = load(capture)
     assert manager.train_dataset.metadata["has_alpha"] is True
     assert manager.cached_train[0]["image"].shape[-1] == 4
     assert manager.train_dataset[0]["image"].shape[-1] == 3  # what viewer and ns-render show
+
+
+def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> None:
+    for path in images_of(capture):
+        Image.open(path).convert("RGBA").save(path.with_suffix(".png"))
+    manager = load(capture)
+    assert manager.train_dataset.metadata["has_alpha"] is False
+    assert manager.cached_train[0]["image"].shape[-1] == 3
 
 
 def test_a_box_counts_only_where_the_capture_declares_one(capture: Path, edit: Any) -> None:

@@ -3,7 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train import views as views_module
+from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import (
     ReducedViews,
     View,
@@ -11,9 +13,11 @@ from bitymi_ns.train.views import (
     at_size,
     background_color,
     covered_share,
+    judging_background,
     over_background,
     reduce_image,
     reduce_mask,
+    step_background,
     training_order,
 )
 
@@ -48,6 +52,21 @@ def test_background():
     assert over_background(image, None)[0, 0].tolist() == [0.25] * 3
     with pytest.raises(ValueError, match="background"):
         background_color("grey", 0, 0)
+
+
+def test_photographs_with_alpha_train_over_another_colour_in_every_step_and_are_judged_over_one():
+    camera = Camera(torch.eye(4), torch.eye(3), 2, 2)
+    opaque, transparent = View(camera, torch.ones(2, 2, 3)), View(camera, torch.ones(2, 2, 4))
+    config = TrainConfig(seed=3)
+    assert step_background(config, opaque, 5, "cpu") is None and judging_background(config, "cpu") is None
+    drawn = step_background(config, transparent, 5, "cpu")
+    assert torch.equal(drawn, background_color("random", 3, 5)) and drawn.unique().numel() == 3
+    white = TrainConfig(alpha_color="white")
+    assert judging_background(white, "cpu").tolist() == [1, 1, 1] and step_background(white, opaque, 5, "cpu") is None
+    for view in (opaque, transparent):
+        assert step_background(TrainConfig(background="white"), view, 5, "cpu").tolist() == [1, 1, 1]
+        assert step_background(TrainConfig(background="black"), view, 5, "cpu") is None
+    assert judging_background(TrainConfig(background="black", alpha_color="white"), "cpu") is None
 
 
 def test_bytes_become_unit_floats():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
+import numpy as np
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -49,15 +49,17 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
     Returns:
         the median over the points in the picture; 1 where there is none.
     """
-    viewmat, K = camera.viewmat.detach().cpu().double(), camera.K.detach().cpu().double()
-    x, y, z = (photographed[:, :3].double() @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
-    depth = z.clamp(min=1e-12)
+    # NumPy: of a few thousand points, torch would take longer to start than to work, in every frame
+    viewmat, K, points = (t.detach().cpu().double().numpy() for t in (camera.viewmat, camera.K, photographed))
+    x, y, z = (points[:, :3] @ viewmat[:3, :3].T + viewmat[:3, 3]).T
+    depth = np.maximum(z, 1e-12)
     column, row = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
     inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    if not bool(inside.any()):
+    sizes = (math.sqrt(K[0, 0] * K[1, 1]) / (depth * points[:, 3]))[inside]
+    if not len(sizes):
         return 1.0
-    sizes = torch.sqrt(K[0, 0] * K[1, 1]) / (depth * photographed[:, 3].double())
-    return float(sizes[inside].median().clamp(*FARTHEST))
+    middle = (len(sizes) - 1) // 2
+    return float(np.clip(np.partition(sizes, middle)[middle], *FARTHEST))
 
 
 def sampling_of(size: float, pixels: int) -> Sampling:

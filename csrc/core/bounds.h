@@ -121,32 +121,36 @@ BT_HD Extent extent(const F* geom, double sharp = 1) {
 }
 
 // The x offsets that the surfel can touch between the lines y = lo and y = hi.
-BT_HD Interval<double> row_interval(const Extent& e, double lo, double hi) {
-  using S = double;
-  Interval<S> r;
-  if (e.whole || (e.thin && e.ellipse)) {
-    const Interval<S> rows = rows_of(e);
-    return hi >= rows.x0 && lo <= rows.x1 ? columns_of(e) : r;
-  }
-  if (e.ellipse && hi >= e.y0 && lo <= e.y1) {
+template <class T>
+BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T hi) {
+  const T zero = T(0.0f);
+  const MaskOf<T> boxed = e.whole | (e.thin & e.ellipse);
+  const MaskOf<T> crossed = e.ellipse & not_(boxed) & (hi >= e.y0) & (e.y1 >= lo);
+  Interval<T> r;
+  if (any_(crossed)) {
     // at a line: qa x^2 + 2 (qb y + qd) x + (qc y^2 + 2 qe y + qf) = 0
+    const T inverse = T(1.0f) / e.qa;
     for (int side = 0; side < 2; ++side) {
-      const S y = side ? hi : lo;
-      const S b = e.qb * y + e.qd, c = e.qc * y * y + S(2) * e.qe * y + e.qf;
-      const S disc = b * b - e.qa * c;
-      if (disc >= S(0)) {
-        const S root = sqrt_(disc) / e.qa, mid = -b / e.qa;
-        const S pad = S(2 * kBoundPad) + S(kBoundSlack) * root;
-        r.add(mid - root - pad, mid + root + pad);
-      }
+      const T y = side ? hi : lo;
+      const T b = e.qb * y + e.qd, c = e.qc * y * y + T(2.0f) * e.qe * y + e.qf;
+      const T disc = b * b - e.qa * c;
+      const T root = sqrt_(max_(disc, zero)) * inverse, mid = -b * inverse;
+      const T pad = T(2 * kBoundPad) + T(kBoundSlack) * root;
+      r.add_where(crossed & (disc >= zero), mid - root - pad, mid + root + pad);
     }
     // no crossing of either: the ellipse lies wholly between them
-    if (r.empty()) r.add(e.x0, e.x1);
-    add_outermost(e, lo, hi, S(2 * kBoundPad) + S(kBoundSlack) * (e.y1 - e.y0), r);
-    r.x0 = max_(r.x0, e.x0), r.x1 = min_(r.x1, e.x1);
-    if (r.empty()) r = {};
+    r.add_where(crossed & r.empty(), e.x0, e.x1);
+    add_outermost(crossed, e, lo, hi, T(2 * kBoundPad) + T(kBoundSlack) * (e.y1 - e.y0), r);
+    const Interval<T> none;
+    const T x0 = max_(r.x0, e.x0), x1 = min_(r.x1, e.x1);
+    const MaskOf<T> some = crossed & (x1 >= x0);
+    r.x0 = select(some, x0, none.x0), r.x1 = select(some, x1, none.x1);
   }
-  add_low_pass(e, lo, hi, r);
+  add_low_pass(not_(boxed), e, lo, hi, r);
+  if (any_(boxed)) {
+    const Interval<T> rows = rows_of(e), columns = columns_of(e);
+    r.add_where(boxed & (hi >= rows.x0) & (rows.x1 >= lo), columns.x0, columns.x1);
+  }
   return r;
 }
 
@@ -154,32 +158,38 @@ BT_HD Interval<double> row_interval(const Extent& e, double lo, double hi) {
 constexpr int kTile = 16;  // pixels along a side
 BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
 
+// Whole numbers; none when first > last.
+template <class T>
 struct TileSpan {
-  int first, last;  // none when first > last
+  T first, last;
 };
+// Those along an axis of `pixels` pixels that the offsets meet from c, the place of a centre; that of pixel i is i.
+template <class T>
+BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pixels) {
+  const T zero = T(0.0f), one = T(1.0f), size = T(double(pixels));
+  const MaskOf<T> none = x.empty() | (zero > c + x.x1) | (c + x.x0 > size - one);
+  const T first = floor_(max_(zero, c + x.x0) * T(1.0 / kTile));
+  const T last = floor_(-floor_(-min_(size, c + x.x1)) * T(1.0 / kTile));  // of the next whole number
+  return {select(none, zero, first), select(none, -one, min_(last, T(double(tiles_across(pixels) - 1))))};
+}
 // The surfel has radii above 0: its box meets the image.
 template <class F>
-BT_HD TileSpan tile_rows(const Extent& e, const F* geom, int height) {
-  const double cy = double(geom[kCy]) - 0.5;  // pixel centre i + 0.5 has the offset i + 0.5 - c
-  const Interval<double> y = rows_of(e);
-  const int last = int(min_(double(height), ceil(cy + y.x1))) / kTile;
-  return {int(max_(0.0, floor_(cy + y.x0))) / kTile, min_(tiles_across(height) - 1, last)};
+BT_HD TileSpan<double> tile_rows(const Extent& e, const F* geom, int height) {
+  return tile_span(rows_of(e), double(geom[kCy]) - 0.5, height);
 }
-template <class F>
-BT_HD TileSpan tile_columns(const Extent& e, const F* geom, int row, int width) {
-  const double cx = double(geom[kCx]) - 0.5, cy = double(geom[kCy]) - 0.5;
-  const Interval<double> x = row_interval(e, row * kTile - cy, row * kTile + kTile - 1 - cy);
-  if (x.empty() || cx + x.x1 < 0 || cx + x.x0 > width - 1) return {0, -1};
-  const int last = int(min_(double(width), ceil(cx + x.x1))) / kTile;
-  return {int(max_(0.0, floor_(cx + x.x0))) / kTile, min_(tiles_across(width) - 1, last)};
+// cx, cy: of the projected centre.
+template <class T>
+BT_HD TileSpan<T> tile_columns(const ExtentOf<T>& e, T cx, T cy, T row, int width) {
+  const T top = row * T(double(kTile)) - (cy - T(0.5));  // pixel centre i + 0.5 has the offset i + 0.5 - c
+  return tile_span(row_interval(e, top, top + T(double(kTile - 1))), cx - T(0.5), width);
 }
 // fn(row, first, last) for every row of tiles in which the surfel can touch those from `first` to `last`.
 template <class F, class Visit>
 BT_HD void for_tile_rows(const Extent& e, const F* geom, int width, int height, Visit&& fn) {
-  const TileSpan rows = tile_rows(e, geom, height);
-  for (int row = rows.first; row <= rows.last; ++row) {
-    const TileSpan columns = tile_columns(e, geom, row, width);
-    if (columns.first <= columns.last) fn(row, columns.first, columns.last);
+  const TileSpan<double> rows = tile_rows(e, geom, height);
+  for (int row = int(rows.first); row <= int(rows.last); ++row) {
+    const TileSpan<double> columns = tile_columns(e, double(geom[kCx]), double(geom[kCy]), double(row), width);
+    if (columns.first <= columns.last) fn(row, int(columns.first), int(columns.last));
   }
 }
 

@@ -32,6 +32,8 @@ BT_HD bool finite_(double x) { return fabs(x) <= 1.7976931348623157e308; }
 // What comparing two reals gives: a bool, or one for each lane of a pack.
 template <class T>
 using MaskOf = decltype(std::declval<T>() < std::declval<T>());
+BT_HD bool not_(bool m) { return !m; }
+BT_HD bool any_(bool m) { return m; }
 
 template <class T>
 BT_HD T select(bool condition, T yes, T no) {

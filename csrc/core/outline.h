@@ -80,14 +80,14 @@ BT_HD Interval<T> rows_of(const Outline<T>& e) {
 }
 // AccuTile: between the lines y = lo and y = hi an ellipse reaches as far as on the lines themselves (the caller's
 // part), or as far as its leftmost and rightmost points where they lie between, which is judged generously.
-template <class S>
-BT_HD void add_outermost(const Outline<S>& e, S lo, S hi, S slack, Interval<S>& r) {
-  if (e.y_left >= lo - slack && e.y_left <= hi + slack) r.add(e.x0, e.x0);
-  if (e.y_right >= lo - slack && e.y_right <= hi + slack) r.add(e.x1, e.x1);
+template <class T>
+BT_HD void add_outermost(MaskOf<T> where, const Outline<T>& e, T lo, T hi, T slack, Interval<T>& r) {
+  r.add_where(where & (e.y_left >= lo - slack) & (hi + slack >= e.y_left), e.x0, e.x0);
+  r.add_where(where & (e.y_right >= lo - slack) & (hi + slack >= e.y_right), e.x1, e.x1);
 }
-template <class S>
-BT_HD void add_low_pass(const Outline<S>& e, S lo, S hi, Interval<S>& r) {
-  if (e.blur > S(0) && hi >= -e.blur && lo <= e.blur) r.add(-e.blur, e.blur);
+template <class T>
+BT_HD void add_low_pass(MaskOf<T> where, const Outline<T>& e, T lo, T hi, Interval<T>& r) {
+  r.add_where(where & (e.blur > T(0.0f)) & (hi >= -e.blur) & (e.blur >= lo), -e.blur, e.blur);
 }
 
 }  // namespace bt

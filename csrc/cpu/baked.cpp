@@ -207,16 +207,10 @@ void baked_forward(const BakedForward<S>& a) {
   const BakedResidual& atlas = a.residual;
   S* image = a.image;
   int32_t* overdraw = a.overdraw;
-  const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
   constexpr int channels = kMaps ? kMapChannels : kBakedChannels;
   const S photo_pixel = a.view.photo_pixel, sharp = Resize<S>(photo_pixel).sharp;
   const std::unique_ptr<DrawnSurfel<S>[]> drawn(new DrawnSurfel<S>[a.view.n]);  // of the visible ones
-  parallel_parts(a.view.n, 1024, [&](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i)
-      if (a.view.radii[2 * i] > S(0)) drawn[i] = drawn_surfel(a, i);
-  });
-#pragma omp parallel for num_threads(num_threads()) schedule(dynamic, 2)
-  for (int64_t tile = 0; tile < tiles; ++tile) {
+  const auto draw = [&](int64_t tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height, S(atlas.transmittance_min));
     P sums[kMapChannels + 1][kPacks];  // rgb, alpha, beta, depth, normal, overdraw
@@ -258,13 +252,22 @@ void baked_forward(const BakedForward<S>& a) {
         for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
         if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][pack][lane]);
       }
-  }
+  };
+  const std::unique_ptr<Binner<S>> lists = binner(a.view, *a.bins);
+  run_together([&](const Member& m) {
+    lists->run(m, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i)
+        if (a.view.radii[2 * i] > S(0)) drawn[i] = drawn_surfel(a, i);
+    });
+    m.each(int64_t(bins.tiles_x) * bins.tiles_y, 4, [&](int64_t begin, int64_t end) {
+      for (int64_t tile = begin; tile < end; ++tile) draw(tile);
+    });
+  });
 }
 }  // namespace
 
 template <class S>
 void baked_forward(const BakedForward<S>& a) {
-  bin(a.view, *a.bins);
   with_kernel(a.view.through_pixel, float(a.view.photo_pixel), [&](auto kernel) {
     using Kernel = decltype(kernel);
     a.maps ? baked_forward<Kernel, true>(a) : baked_forward<Kernel, false>(a);

@@ -54,6 +54,7 @@ class Extents {
  public:
   Extents(const View<S>& view, const Order<S>* order, int64_t begin, int64_t end, float* level)
       : geom_(view.geom),
+        radii_(view.radii),
         near_(view.near),
         sharp_(double(Resize<S>(view.photo_pixel).sharp)),
         order_(order),
@@ -70,6 +71,10 @@ class Extents {
 
   void look(int64_t k) {
     first_ = k, next_ = std::min(k + kLanes, end_);
+    for (int64_t after = next_; after < std::min(next_ + kLanes, end_); ++after) {
+      __builtin_prefetch(geom_ + int64_t(order_[after].second) * kGeom);
+      __builtin_prefetch(radii_ + 2 * int64_t(order_[after].second));
+    }
     if constexpr (std::is_same_v<S, float> && !Kernel::kPixel)
       look_at_pack();
     else
@@ -113,12 +118,67 @@ class Extents {
     to[0] = r2, to[1] = blur * blur;
   }
 
-  const S *geom_, near_;
+  const S *geom_, *radii_, near_;
   double sharp_;
   const Order<S>* order_;
   int64_t first_ = 0, next_, end_;
   float* level_;
   Extent found_[kLanes];
+};
+
+// The tiles of surfels row by row, sixteen rows at a time, of one surfel or of several.
+class TileRows {
+ public:
+  explicit TileRows(int width) : width_(width) {}
+  // The rows of a surfel; put(k, row, first, last) for all of those that fill the pack, in the order of the surfels.
+  template <class S, class Put>
+  void add(int64_t k, const Extent& e, const S* g, int height, Put&& put) {
+    const TileSpan<double> rows = tile_rows(e, g, height);
+    const double column[kColumns] = {double(e.whole),
+                                     double(e.ellipse),
+                                     double(e.thin),
+                                     e.x0,
+                                     e.x1,
+                                     e.y0,
+                                     e.y1,
+                                     e.y_left,
+                                     e.y_right,
+                                     e.blur,
+                                     e.qa,
+                                     e.qb,
+                                     e.qc,
+                                     e.qd,
+                                     e.qe,
+                                     e.qf,
+                                     double(g[kCx]),
+                                     double(g[kCy])};
+    for (int row = int(rows.first); row <= int(rows.last); ++row) {
+      for (int c = 0; c < kColumns; ++c) columns_[c][count_] = column[c];
+      row_[count_] = double(row), k_[count_] = k;
+      if (++count_ == kLanes) finish(put);
+    }
+  }
+  // The rest.
+  template <class Put>
+  void finish(Put&& put) {
+    const auto at = [&](int c) { return load(columns_[c]); };
+    const P zero = P(0.0);
+    ExtentOf<P> e;
+    e.whole = at(0) > zero, e.ellipse = at(1) > zero, e.thin = at(2) > zero;
+    e.x0 = at(3), e.x1 = at(4), e.y0 = at(5), e.y1 = at(6), e.y_left = at(7), e.y_right = at(8), e.blur = at(9);
+    e.qa = at(10), e.qb = at(11), e.qc = at(12), e.qd = at(13), e.qe = at(14), e.qf = at(15);
+    const TileSpan<P> span = tile_columns(e, at(16), at(17), load(row_), width_);
+    for (int lane = 0; lane < count_; ++lane)
+      put(k_[lane], int(row_[lane]), int(span.first[lane]), int(span.last[lane]));
+    count_ = 0;
+  }
+
+ private:
+  using P = Pack<double>;
+  static constexpr int kColumns = 18;
+  double columns_[kColumns][kLanes] = {}, row_[kLanes] = {};
+  int64_t k_[kLanes];
+  int width_, count_ = 0;
 };
 
 // fn(tile) for every tile that a disc may touch which comes near the camera's plane and has no box.
@@ -140,83 +200,142 @@ void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn)
     }
 }
 
+// In phases. Each thread counts and later fills its own run of the order: the lists come out sorted.
 template <class Kernel, class S>
-void bin(const View<S>& view, Bins& bins) {
-  const S *geom = view.geom, *radii = view.radii;
-  const int64_t n = view.n;
-  const int width = view.width, height = view.height;
-  bins.tiles_x = tiles_across(width), bins.tiles_y = tiles_across(height);
-  const int64_t tiles = int64_t(bins.tiles_x) * bins.tiles_y;
-  bins.level.resize(2 * n);
-  // front to back once for all tiles; equal depths keep their order
-  std::vector<Order<S>> order;
-  order.reserve(n);
-  for (int64_t i = 0; i < n; ++i)
-    if (radii[2 * i] > S(0)) order.emplace_back(geom[i * kGeom + kZ], int32_t(i));
-  sort_by_depth(order);
-  // each thread counts and later fills its own run of the order: the lists come out sorted
-  const int64_t visible = int64_t(order.size());
-  const int parts = std::max(1, int(std::min<int64_t>(num_threads(), visible / 512)));
-  std::vector<std::vector<int32_t>> touched(parts);
-  std::vector<std::vector<int64_t>> at(parts, std::vector<int64_t>(tiles, 0));
-#pragma omp parallel for num_threads(parts) schedule(static, 1)
-  for (int t = 0; t < parts; ++t) {
-    std::vector<int32_t>& list = touched[t];
-    list.reserve(8 * (visible / parts + 1));
-    const int64_t end = visible * (t + 1) / parts;
-    Extents<Kernel, S> extents(view, order.data(), visible * t / parts, end, bins.level.data());
-    for (int64_t k = visible * t / parts; k < end; ++k) {
+class KernelBinner final : public Binner<S> {
+ public:
+  KernelBinner(const View<S>& view, Bins& bins) : view_(view), bins_(bins) {
+    bins.tiles_x = tiles_across(view.width), bins.tiles_y = tiles_across(view.height);
+    bins.level.resize(2 * view.n);
+    order_.resize(view.n), visible_.resize((view.n + kChunk - 1) / kChunk);
+  }
+
+  void run(const Member& m, const typename Binner<S>::Aside& aside) override {
+    m.each(view_.n, kChunk, [&](int64_t begin, int64_t end) { gather(begin, end); });
+    m.meet();
+    if (m.index == 0) sort(m.size);
+    if (aside) m.each(view_.n, kChunk, aside);
+    m.meet();
+    count(m.index);
+    m.meet();
+    if (m.index == 0) place();
+    m.meet();
+    fill(m.index);
+    m.meet();
+  }
+
+ private:
+  static constexpr int64_t kChunk = 1024;
+  // Neighbouring tiles that surfel k of the order may touch.
+  struct Span {
+    int32_t k, tile, count;
+  };
+  struct Touched {
+    std::vector<Span> alone, others;  // of surfels of one tile, and of the others, each in order
+  };
+
+  void gather(int64_t begin, int64_t end) {
+    Order<S>* to = order_.data() + begin;
+    for (int64_t i = begin; i < end; ++i)
+      if (view_.radii[2 * i] > S(0)) *to++ = {view_.geom[i * kGeom + kZ], int32_t(i)};
+    visible_[begin / kChunk] = to - (order_.data() + begin);
+  }
+
+  // Front to back once for all tiles; equal depths keep their order.
+  void sort(int parts) {
+    auto end = order_.begin();
+    for (size_t c = 0; c < visible_.size(); ++c) {
+      const auto from = order_.begin() + int64_t(c) * kChunk;
+      end = std::move(from, from + visible_[c], end);
+    }
+    order_.erase(end, order_.end());
+    sort_by_depth(order_);
+    touched_.resize(parts);
+    at_.resize(parts);
+  }
+
+  int64_t run_begin(int part) const { return int64_t(order_.size()) * part / int64_t(at_.size()); }
+  int64_t tiles() const { return int64_t(bins_.tiles_x) * bins_.tiles_y; }
+
+  void count(int part) {
+    const int64_t begin = run_begin(part), end = run_begin(part + 1);
+    Touched& to = touched_[part];
+    std::vector<int64_t>& at = at_[part];
+    at.assign(tiles(), 0);
+    to.alone.reserve(end - begin), to.others.reserve(4 * (end - begin));
+    Extents<Kernel, S> extents(view_, order_.data(), begin, end, bins_.level.data());
+    TileRows rows(view_.width);
+    const auto add = [&](std::vector<Span>& list, int64_t k, int tile, int count) {
+      list.push_back({int32_t(k), tile, count});
+      for (int i = 0; i < count; ++i) ++at[tile + i];
+    };
+    const auto add_row = [&](int64_t k, int row, int first, int last) {
+      if (first <= last) add(to.others, k, row * bins_.tiles_x + first, last - first + 1);
+    };
+    for (int64_t k = begin; k < end; ++k) {
       const Extent& e = extents.of(k);
-      const size_t head = list.size();
-      list.push_back(0);
-      const int only = only_tile(geom + int64_t(order[k].second) * kGeom, radii + 2 * int64_t(order[k].second), bins);
-      if (only >= 0) {
-        list.push_back(only), list[head] = 1;
-        ++at[t][only];
-        continue;
+      const int64_t id = order_[k].second;
+      const S* g = view_.geom + id * kGeom;
+      if (const int only = only_tile(g, view_.radii + 2 * id, bins_); only >= 0) {
+        add(to.alone, k, only, 1);
+      } else if (e.whole && !filtered<Kernel>(g)) {
+        rows.finish(add_row);  // those before it
+        for_reached_tiles(g, bins_.level.data() + 2 * id, bins_, [&](int tile) { add(to.others, k, tile, 1); });
+      } else {
+        rows.add(k, e, g, view_.height, add_row);
       }
-      const auto touch = [&](int tile) {
-        list.push_back(tile);
-        ++at[t][tile];
-      };
-      const int64_t id = order[k].second;
-      if (e.whole && !filtered<Kernel>(geom + id * kGeom))
-        for_reached_tiles(geom + id * kGeom, bins.level.data() + 2 * id, bins, touch);
-      else
-        for_tile_rows(e, geom + id * kGeom, width, height, [&](int row, int first, int last) {
-          for (int tile = row * bins.tiles_x + first; tile <= row * bins.tiles_x + last; ++tile) touch(tile);
-        });
-      list[head] = int32_t(list.size() - head - 1);
     }
+    rows.finish(add_row);
   }
-  bins.start.assign(tiles + 1, 0);
-  for (int64_t tile = 0; tile < tiles; ++tile) {
-    int64_t next = bins.start[tile];
-    for (int t = 0; t < parts; ++t) {
-      const int64_t count = at[t][tile];
-      at[t][tile] = next;
-      next += count;
+
+  // From the numbers of a tile's surfels in each run to where these begin.
+  void place() {
+    bins_.start.assign(tiles() + 1, 0);
+    for (int64_t tile = 0; tile < tiles(); ++tile) {
+      int64_t next = bins_.start[tile];
+      for (std::vector<int64_t>& at : at_) {
+        const int64_t count = at[tile];
+        at[tile] = next;
+        next += count;
+      }
+      bins_.start[tile + 1] = next;
     }
-    bins.start[tile + 1] = next;
+    bins_.surfels.resize(bins_.start.back());
   }
-  bins.surfels.resize(bins.start[tiles]);
-#pragma omp parallel for num_threads(parts) schedule(static, 1)
-  for (int t = 0; t < parts; ++t) {
-    const int32_t* p = touched[t].data();
-    for (int64_t k = visible * t / parts; k < visible * (t + 1) / parts; ++k) {
-      const int32_t count = *p++;
-      for (int32_t j = 0; j < count; ++j) bins.surfels[at[t][*p++]++] = order[k].second;
+
+  void fill(int part) {
+    std::vector<int64_t>& at = at_[part];
+    const auto put = [&](const Span& span) {
+      for (int i = 0; i < span.count; ++i) bins_.surfels[at[span.tile + i]++] = order_[span.k].second;
+    };
+    const Touched& from = touched_[part];
+    auto other = from.others.begin();
+    for (const Span& alone : from.alone) {
+      for (; other != from.others.end() && other->k < alone.k; ++other) put(*other);
+      put(alone);
     }
+    std::for_each(other, from.others.end(), put);
   }
-}
+
+  const View<S> view_;
+  Bins& bins_;
+  std::vector<Order<S>> order_;           // of the visible ones, once sorted
+  std::vector<int64_t> visible_;          // in each chunk
+  std::vector<Touched> touched_;          // of each run
+  std::vector<std::vector<int64_t>> at_;  // of each run: for each tile how many, then where the next one goes
+};
 }  // namespace
 
 template <class S>
-void bin(const View<S>& view, Bins& bins) {
-  with_kernel(view.through_pixel, float(view.photo_pixel), [&](auto kernel) { bin<decltype(kernel)>(view, bins); });
+std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins) {
+  std::unique_ptr<Binner<S>> made;
+  with_kernel(view.through_pixel, float(view.photo_pixel),
+              [&](auto kernel) { made = std::make_unique<KernelBinner<decltype(kernel), S>>(view, bins); });
+  return made;
 }
 
-template void bin(const View<float>&, Bins&);
-template void bin(const View<double>&, Bins&);
+#define BT_INSTANTIATE(S) template std::unique_ptr<Binner<S>> binner(const View<S>&, Bins&);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
 
 }  // namespace bt

@@ -3,12 +3,14 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <vector>
 
 #include "core/bounds.h"
 #include "core/texel.h"
 #include "cpu/memory.h"
+#include "cpu/threads.h"
 #include "ops/appearance.h"
 #include "ops/baked.h"
 #include "ops/blend.h"
@@ -36,8 +38,18 @@ struct Bins {
   std::vector<int32_t> surfels;  // [start.back()]
   std::vector<float> level;      // [n, 2], of the visible ones
 };
+// Fills them, by the threads of a team.
 template <class S>
-void bin(const View<S>& view, Bins& bins);
+class Binner {
+ public:
+  using Aside = std::function<void(int64_t begin, int64_t end)>;
+  virtual ~Binner() = default;
+  // All of them call it; the lists are there when it returns. aside(begin, end), if any, for all surfels: what threads
+  // do while one of them sorts.
+  virtual void run(const Member& m, const Aside& aside) = 0;
+};
+template <class S>
+std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
 
 // Fragments as they are found, ordered like FragmentArrays.
 template <class S>

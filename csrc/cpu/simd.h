@@ -101,6 +101,10 @@ template <class S>
 BT_HD typename Pack<S>::M operator>=(Pack<S> a, Pack<S> b) {
   return at_least(a.v, b.v);
 }
+BT_HD LaneTypes<float>::M not_(const LaneTypes<float>::M& m) { return ~m; }
+BT_HD LaneTypes<double>::M not_(const LaneTypes<double>::M& m) { return ~m; }
+BT_HD bool any_(const LaneTypes<float>::M& m) { return bits(m) != 0; }
+BT_HD bool any_(const LaneTypes<double>::M& m) { return bits(m) != 0; }
 template <class S>
 BT_HD Pack<S> select(typename Pack<S>::M m, Pack<S> yes, Pack<S> no) {
   return choose(m, yes.v, no.v);

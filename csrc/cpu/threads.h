@@ -2,7 +2,9 @@
 #pragma once
 
 #include <algorithm>
+#include <atomic>
 #include <cstdint>
+#include <thread>
 #include <vector>
 
 #if defined(_OPENMP)
@@ -45,6 +47,63 @@ int parallel_tiles(const int64_t* tile_start, int64_t tiles, int most, F&& fn) {
 #pragma omp parallel for num_threads(parts) schedule(static, 1)
   for (int t = 0; t < parts; ++t) fn(t, cut[t], cut[t + 1]);
   return parts;
+}
+
+// Threads that go through the phases of one piece of work together. OpenMP's threads sleep between its regions
+// (threads.cpp), and to wake them takes a tenth of a millisecond, as long as a small phase: in a team they wait awake.
+class Team {
+ public:
+  // Waits until all `size` of them are here, or gives its processor to others.
+  void meet(int size) {
+    const uint32_t turn = turn_.load(std::memory_order_acquire);
+    if (arrived_.fetch_add(1, std::memory_order_acq_rel) == size - 1) {
+      arrived_.store(0, std::memory_order_relaxed), taken_.store(0, std::memory_order_relaxed);
+      turn_.fetch_add(1, std::memory_order_release);
+      return;
+    }
+    for (int looks = 0; turn_.load(std::memory_order_acquire) == turn; ++looks)
+      if (looks < kLooks)
+        pause();
+      else
+        std::this_thread::yield();
+  }
+  // Where the next `count` of the phase's items begin.
+  int64_t take(int64_t count) { return taken_.fetch_add(count, std::memory_order_relaxed); }
+
+ private:
+  static constexpr int kLooks = 2000;  // some tens of microseconds
+  static void pause() {
+#if defined(__x86_64__) || defined(__i386__)
+    __builtin_ia32_pause();
+#endif
+  }
+  std::atomic<uint32_t> turn_{0};  // how often all have met
+  std::atomic<int> arrived_{0};
+  std::atomic<int64_t> taken_{0};
+};
+// One thread of a team.
+struct Member {
+  Team& team;
+  int index, size;
+
+  // The end of a phase: what the others wrote in it is there.
+  void meet() const { team.meet(size); }
+  // fn(begin, end) over n items, `step` at a time, by whoever comes first. Once in a phase.
+  template <class F>
+  void each(int64_t n, int64_t step, F&& fn) const {
+    for (int64_t begin; (begin = team.take(step)) < n;) fn(begin, std::min(begin + step, n));
+  }
+};
+// fn(member) by every thread.
+template <class F>
+void run_together(F&& fn) {
+  Team team;
+#if defined(_OPENMP)
+#pragma omp parallel num_threads(num_threads())
+  fn(Member{team, omp_get_thread_num(), omp_get_num_threads()});
+#else
+  fn(Member{team, 0, 1});
+#endif
 }
 
 }  // namespace bt

@@ -90,7 +90,8 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
 
 template <class S>
 void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
-  bin(a.view, to.bins);
+  const auto lists = binner(a.view, to.bins);
+  run_together([&](const Member& m) { lists->run(m, nullptr); });
   with_kernel(a.view.through_pixel, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.most, to); });
 }
 

@@ -127,10 +127,10 @@ BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
       add_crossings(e, hi, lower);
       x.add(min_(upper.x0, lower.x0), max_(upper.x1, lower.x1));
       upper = lower;
-      add_outermost(e, lo, hi, f.pad + float(kBoundSlack) * (e.y1 - e.y0), x);
+      add_outermost(true, e, lo, hi, f.pad + float(kBoundSlack) * (e.y1 - e.y0), x);
       x.x0 -= f.pad, x.x1 += f.pad;
     }
-    if (!e.whole) add_low_pass(e, lo, hi, x);
+    add_low_pass(!e.whole, e, lo, hi, x);
     r.from[band] = x.empty() ? width : pixel_from(f.cx + x.x0, width);
     r.to[band] = x.empty() ? -1 : pixel_to(f.cx + x.x1, width);
     if (r.from[band] <= r.to[band]) from = min_(from, r.from[band]), to = max_(to, r.to[band]);

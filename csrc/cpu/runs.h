@@ -36,20 +36,24 @@ void for_surfels(const Runs& runs, F&& fn) {
   });
 }
 
-// The runs of a fragment list of n surfels.
+// The runs of a fragment list of n surfels, these in the order in which the list first has them. So they are neighbours
+// on the screen that follow each other, whose runs lie near each other in the list, as their pixels do in the picture.
 struct FoundRuns {
   std::vector<int64_t> start, order;
 
   FoundRuns(const int32_t* surfel, int64_t fragments, int64_t n) : start{0} {
-    std::vector<int64_t> next(n + 1, 0);  // first the number of runs, then the place of a surfel's next one
+    std::vector<int32_t> rank(n, -1);
+    std::vector<int64_t> next{0};  // first the number of runs of each rank, then the place of its next one
     for (int64_t i = 0; i < fragments; ++i) {
       if (i + 1 < fragments && surfel[i + 1] == surfel[i]) continue;
       start.push_back(i + 1);
-      ++next[surfel[i] + 1];
+      int32_t& r = rank[surfel[i]];
+      if (r < 0) r = int32_t(next.size()) - 1, next.push_back(0);
+      ++next[r + 1];
     }
     std::partial_sum(next.begin(), next.end(), next.begin());
     order.resize(start.size() - 1);
-    for (size_t r = 0; r < order.size(); ++r) order[next[surfel[start[r]]]++] = int64_t(r);
+    for (size_t r = 0; r < order.size(); ++r) order[next[rank[surfel[start[r]]]]++] = int64_t(r);
   }
 };
 

@@ -34,8 +34,10 @@ from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import View, training_order
+from bitymi_ns.train.views import View, spread, training_order
 
+LOOKED_AT = 8
+"""Photographs of which it is looked whether any pixel is transparent."""
 FEW_VIEWS = 10
 """Number of training views below which the multi-view scores rest on little."""
 
@@ -120,10 +122,12 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         outputs = self.train_dataparser_outputs
         color = outputs.alpha_color
         self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
-        self.train_dataset.metadata["has_alpha"] = (
-            bool(outputs.image_filenames)
-            and file_has_transparency(outputs.image_filenames[0])
-            and self.train_dataset.get_numpy_image(0).shape[-1] == 4
+        files = outputs.image_filenames
+        self.train_dataset.metadata["has_alpha"] = bool(files) and file_has_transparency(files[0])
+        # what decides how a run trains; without one there may be no photographs to read
+        self.train_dataset.metadata["transparent"] = test_mode != "inference" and any(
+            file_has_transparency(files[i]) and self.train_dataset.get_numpy_image(i).shape[-1] == 4
+            for i in spread(len(files), LOOKED_AT)
         )
         self.train_dataset.metadata["declares_box"] = declares_box(config.dataparser)
         cameras = outputs.cameras

@@ -51,10 +51,11 @@ class BitymiModelConfig(SurfelModelConfig):
 
 
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
-    """The training options with the colour that the capture states for its transparent images, if any. Where none is
-    transparent, `background` auto is that colour, too."""
+    """The training options with the colour that the capture states for its transparent images, if any: it is their
+    `alpha_color`, and stands for a `background` of one colour. Where none is transparent, also for auto."""
     color = config.alpha_color if alpha_color is None else _name_of(alpha_color)
-    background = color if config.background == "auto" and not transparent else config.background
+    one = config.background in ("black", "white") and alpha_color is not None
+    background = color if one or (config.background == "auto" and not transparent) else config.background
     return dataclasses.replace(config, background=background, alpha_color=color)
 
 
@@ -78,7 +79,7 @@ class BitymiModel(SurfelModel):
         super().populate_modules()
         self.metadata: dict[str, Any] = self.kwargs.get("metadata") or {}
         self.train_config = train_config_for(
-            self.config.train, self.metadata.get("alpha_color"), bool(self.metadata.get("has_alpha"))
+            self.config.train, self.metadata.get("alpha_color"), bool(self.metadata.get("transparent"))
         )
         points = self.kwargs.pop("seed_points", None)
         self.scene = new_scene(

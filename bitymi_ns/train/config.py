@@ -226,7 +226,7 @@ class TrainConfig:
     matrix, off = all photographs are taken as they are, auto = gain where the photographs disagree by gains."""
     background: Background = "auto"
     """Colour behind the scene while training; images with alpha are composed over it. auto = another one in every step,
-    as random does, for images with alpha, so that nothing is learned but what they show; black for others."""
+    as random does, for images with alpha, so that nothing is learned but what they show; alpha_color for others."""
     alpha_color: Literal["black", "white"] = "black"
     """Colour behind images with alpha where views are judged and after training, with background auto and random. In
     ns-train that of the capture, where it states one."""

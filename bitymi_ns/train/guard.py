@@ -37,7 +37,7 @@ from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import ReducedViews, judging_background, spread
+from bitymi_ns.train.views import ReducedViews, spread, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -154,8 +154,10 @@ class Guard:
         """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
         losses = []
         device = self.scene.surfels["means"].device
-        background = judging_background(self.config, device)
-        for view in (views.at(i, factor) for i in spread(len(views), COMPARED_VIEWS)):
+        for i in spread(len(views), COMPARED_VIEWS):
+            view = views.at(i, factor)
+            # as in the steps with which this is compared; where their colours change, always the same ones
+            background = step_background(self.config, view, i, device)
             target = view.target(background, device)
             if blank:
                 drawn = target.mean((0, 1)).expand_as(target).contiguous()

@@ -178,7 +178,7 @@ def step_background(config: TrainConfig, view: View, step: int, device: torch.de
     """[3] the colour behind the scene in a step on a view, `config.background`; None = black."""
     kind = config.background
     if kind == "auto":
-        kind = "random" if view.image.shape[-1] == 4 else "black"
+        kind = "random" if view.image.shape[-1] == 4 else config.alpha_color
     return background_color(kind, config.seed, step, device)
 
 

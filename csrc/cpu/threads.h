@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <thread>
 #include <vector>
@@ -53,7 +54,8 @@ int parallel_tiles(const int64_t* tile_start, int64_t tiles, int most, F&& fn) {
 // (threads.cpp), and to wake them takes a tenth of a millisecond, as long as a small phase: in a team they wait awake.
 class Team {
  public:
-  // Waits until all `size` of them are here, or gives its processor to others.
+  // Waits until all `size` of them are here: awake, then giving its processor to others, after some milliseconds
+  // asleep.
   void meet(int size) {
     const uint32_t turn = turn_.load(std::memory_order_acquire);
     if (arrived_.fetch_add(1, std::memory_order_acq_rel) == size - 1) {
@@ -64,8 +66,10 @@ class Team {
     for (int looks = 0; turn_.load(std::memory_order_acquire) == turn; ++looks)
       if (looks < kLooks)
         pause();
-      else
+      else if (looks < 2 * kLooks)
         std::this_thread::yield();
+      else
+        std::this_thread::sleep_for(std::chrono::microseconds(20));
   }
   // Where the next `count` of the phase's items begin.
   int64_t take(int64_t count) { return taken_.fetch_add(count, std::memory_order_relaxed); }

@@ -36,7 +36,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
   for (int c = 0; c < kChannels; ++c) sum[c] = S(0);
   int taken_pairs = 0;
   for (int64_t first = p.tile_pairs[blockIdx.x]; first < end; first += taken_pairs) {
-    const Stretch<kHeld> part(p, s, first, end, bits);
+    Stretch<kHeld> part(p, s, first, end, bits);
     taken_pairs = part.pairs;
     if (!taken_pairs) break;
     // beta and the normal, one lane per pair
@@ -45,6 +45,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
     const S beta = some ? g[kBeta] : S(0), nx = kMaps && some ? g[kNx] : S(0), ny = kMaps && some ? g[kNy] : S(0),
             nz = kMaps && some ? g[kNz] : S(0);
     __syncthreads();  // what was held is added up
+    part.find_own(s);
     part.each_fragment([&](int i, int64_t at) {
       const bool textured = of.table.texels > 0;
       const int32_t id = f.surfel[at];

@@ -149,7 +149,8 @@ class Stretch {
   int pairs, count;  // from `first` on; of their fragments
   int64_t base;      // the first of these in the list
 
-  // All threads of the block, and a barrier between this and `each_pair`.
+  // All threads of the block. Then a barrier, `find_own`, and another barrier before the next stretch: its warps write
+  // to `bits` at once.
   __device__ Stretch(const Pairs& p, const TileThread& s, int64_t first, int64_t end, int (&bits)[kTileWarps][kWarp])
       : base(p.offsets[first]), bits_(bits) {
     const int64_t own = first + s.lane;  // one lane per pair
@@ -162,20 +163,22 @@ class Stretch {
     if (s.lane >= pairs) mark_ = 0;
     bits[s.warp][s.lane] = __popc(mark_);
   }
-  // use(j, i, mine) for the pairs first + j that have a fragment in the calling warp, front to back: fragment base + i
-  // is that of the lane's pixel, if it is `mine`.
+  // Where the warp's own fragments of each pair begin.
+  __device__ void find_own(const TileThread& s) {
+    BT_UNROLL
+    for (int w = 0; w < kTileWarps - 1; ++w) from_ += w < s.warp ? bits_[w][s.lane] : 0;
+  }
+  // After it: use(j, i, mine) for the pairs first + j that have a fragment in the calling warp, front to back: fragment
+  // base + i is that of the lane's pixel, if it is `mine`.
   template <class Use>
   __device__ void each_pair(const TileThread& s, Use&& use) const {
     const unsigned below = (1u << s.lane) - 1;
-    int from = from_;
-    BT_UNROLL
-    for (int w = 0; w < kTileWarps - 1; ++w) from += w < s.warp ? bits_[w][s.lane] : 0;
     unsigned todo = __ballot_sync(kFullMask, mark_ != 0);
     while (todo) {
       const int j = __ffs(int(todo)) - 1;
       todo &= todo - 1;
       const unsigned taken = __shfl_sync(kFullMask, mark_, j);
-      use(j, __shfl_sync(kFullMask, from, j) + __popc(taken & below), bool(taken >> s.lane & 1u));
+      use(j, __shfl_sync(kFullMask, from_, j) + __popc(taken & below), bool(taken >> s.lane & 1u));
     }
   }
   // each(i, base + i) by all threads; a warp begins at a multiple of 32 of the list, so that it reads and writes whole
@@ -190,7 +193,7 @@ class Stretch {
  private:
   int (&bits_)[kTileWarps][kWarp];  // fragments of a warp and a pair
   uint32_t mark_;                   // of the lane's pair: the warp's pixels that blend it
-  int from_;                        // where the pair begins
+  int from_;                        // where the pair begins, then the warp's fragments of it
 };
 
 // The row of a pixel of an image. A division of integers takes 25 instructions; the product with the reciprocal is off

@@ -117,7 +117,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
   S transmittance = S(1);
   int taken_pairs = 0;
   for (int64_t first = p.tile_pairs[blockIdx.x]; first < end; first += taken_pairs) {
-    const Stretch<kHeld> part(p, s, first, end, bits);
+    Stretch<kHeld> part(p, s, first, end, bits);
     taken_pairs = part.pairs;
     if (!taken_pairs) return;
     const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
@@ -128,6 +128,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
       for (int c = 0; c < kGeom; c += kLoaders) rows[row].g[c + column] = geom[int64_t(id) * kGeom + c + column];
     }
     __syncthreads();  // the rows are there, and what was held is written
+    part.find_own(s);
     part.each_pair(s, [&](int j, int i, bool mine) {
       S g[kGeom];
       load_shape(rows[j].g, g);

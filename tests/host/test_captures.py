@@ -13,6 +13,8 @@ import torch
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from PIL import Image
 
+from bitymi_ns.host.model import train_config_for
+from bitymi_ns.train.config import TrainConfig
 from tests.host.captures import expect, images_of, load, load_with
 
 
@@ -55,6 +57,7 @@ def test_alpha_is_kept_for_the_model(capture: Path) -> None:
         image.save(path.with_suffix(".png"))
     manager = load(capture)
     assert manager.train_dataset.metadata["has_alpha"] is True
+    assert manager.train_dataset.metadata["transparent"] is True
     assert manager.cached_train[0]["image"].shape[-1] == 4
     assert manager.train_dataset[0]["image"].shape[-1] == 3  # what viewer and ns-render show
 
@@ -63,8 +66,27 @@ def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> 
     for path in images_of(capture):
         Image.open(path).convert("RGBA").save(path.with_suffix(".png"))
     manager = load(capture)
-    assert manager.train_dataset.metadata["has_alpha"] is False
+    assert manager.train_dataset.metadata["transparent"] is False
     assert manager.cached_train[0]["image"].shape[-1] == 3
+    opaque = images_of(capture)[0]
+    for path in images_of(capture)[1:]:
+        image = Image.open(path).convert("RGBA")
+        image.putpixel((0, 0), (0, 0, 0, 0))
+        image.save(path.with_suffix(".png"))
+    assert opaque.exists() and load(capture).train_dataset.metadata["transparent"] is True
+
+
+def test_the_colour_behind_transparent_photographs() -> None:
+    """What the capture states stands for any one colour, as in runs before there was another choice."""
+    white = torch.ones(3)
+    for given, transparent, wanted in (
+        ("auto", True, "auto"), ("auto", False, "white"), ("random", True, "random"), ("black", True, "white")
+    ):  # fmt: skip
+        made = train_config_for(TrainConfig(background=given), white, transparent)  # type: ignore[arg-type]
+        assert (made.background, made.alpha_color) == (wanted, "white")
+    assert train_config_for(TrainConfig(background="white"), None, True).background == "white"
+    assert train_config_for(TrainConfig(), None, True).background == "auto"
+    assert train_config_for(TrainConfig(), None, False).background == "black"
 
 
 def test_a_box_counts_only_where_the_capture_declares_one(capture: Path, edit: Any) -> None:

@@ -27,7 +27,7 @@ from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling
-from bitymi_ns.train.views import View, step_background, training_order
+from bitymi_ns.train.views import View, background_changes, step_background, training_order
 
 
 @dataclass
@@ -96,7 +96,9 @@ class _Polish:
         for name, optimizer in self.optimizers.items():
             set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
         forget_gradients(self.optimizers.values())
-        background = step_background(self.train, view, number, "cpu")
+        background = self.background
+        if background_changes(self.train, view):
+            background = step_background(self.train, view, number, "cpu")
         mask, target = _mask(view), view.target(background, "cpu")
         # the loss is a mean, the step wants a sum
         rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
@@ -142,10 +144,10 @@ def polish_scene(
     Args:
         baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
-        background: [3] colour behind the scene where views are judged.
+        background: [3] colour behind the scene, but for steps on views behind which it changes (`train.background`).
         options: see `PolishOptions`.
-        train: options of the training, for the learning rates, the colour behind the scene in a step, and for what is
-            done when a step is not finite.
+        train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
+            a step is not finite.
         progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
 

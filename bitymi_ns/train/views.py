@@ -174,12 +174,16 @@ def background_color(
     raise ValueError(f"background must be black, white or random, not {kind!r}")
 
 
+def background_changes(config: TrainConfig, view: View) -> bool:
+    """Whether each step on a view has another colour behind the scene."""
+    return config.background == "random" or (config.background == "auto" and view.image.shape[-1] == 4)
+
+
 def step_background(config: TrainConfig, view: View, step: int, device: torch.device | str) -> Tensor | None:
     """[3] the colour behind the scene in a step on a view, `config.background`; None = black."""
-    kind = config.background
-    if kind == "auto":
-        kind = "random" if view.image.shape[-1] == 4 else config.alpha_color
-    return background_color(kind, config.seed, step, device)
+    if background_changes(config, view):
+        return background_color("random", config.seed, step, device)
+    return judging_background(config, device)
 
 
 def judging_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:

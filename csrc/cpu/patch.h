@@ -135,7 +135,7 @@ class PatchFragments {
     const int offset[4] = {0, 4 * next_.right, 4 * next_.down, 4 * (next_.down + next_.right)};
     for (int k = 0; k < 4; ++k) (Four<S>::load(at + offset[k]) + q.weight[k] * g).store(at + offset[k]);
   }
-  // Of its coordinates; see texel_fetch_uv_vjp.
+  // Of its coordinates; see texel_slopes.
   BT_HD S gradient_u(int j, const TexelFours<S>& q, Four<S> g) const {
     return inside_u_[j / kLanes] >> j % kLanes & 1 ? per_u_ * dot(g, texel_slope_u(q.t, fy_[j])) : S(0);
   }

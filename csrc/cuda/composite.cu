@@ -50,9 +50,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
   constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
   __shared__ S gradient[kTileThreads * kChannels];
   __shared__ S out[kWorkers][3 * kRunLanes];
-  // Pairs behind those of the tiles have no fragments, but slots: they are left to the last block.
-  const int64_t first = p.tile_pairs[blockIdx.x];
-  const int64_t end = blockIdx.x + 1 < gridDim.x ? p.tile_pairs[blockIdx.x + 1] : p.pairs;
+  const auto [first, end] = block_pairs(p);
   if (first == end) return;
   const TilePart tile(p);
   tile.load<kChannels>(dimage, gradient);

@@ -211,6 +211,15 @@ class RowOf {
   float inverse_;
 };
 
+// The pairs that a tile's block goes through. Those behind all tiles' have no fragments, but slots: they are left to
+// the last block.
+struct PairRange {
+  int64_t first, end;
+};
+__device__ inline PairRange block_pairs(const Pairs& p) {
+  return {p.tile_pairs[blockIdx.x], blockIdx.x + 1 < gridDim.x ? p.tile_pairs[blockIdx.x + 1] : p.pairs};
+}
+
 // A tile's part of an image, in shared memory. Counts of channels are odd, so that lanes hit different banks.
 class TilePart {
  public:

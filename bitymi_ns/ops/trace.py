@@ -40,8 +40,8 @@ class Fragments:
         sigma: [F] effective opacity, negative in the low-pass branch.
         tile_start: [tiles + 1] int64, where each tile's fragments begin.
         width, height: of the image, pixels.
-        layout: how kernels find their way in the list: tile_start for those of the CPU, for those of CUDA a handle
-            on the pairs of surfel and tile (csrc/cuda/pairs.h).
+        layout: how kernels find their way in the list: a handle on what packs of 4 x 4 pixels have of each surfel for
+            those of the CPU (csrc/cpu/packs.h), on the pairs of surfel and tile for those of CUDA (csrc/cuda/pairs.h).
         surfels: number N of rows of the projection that they belong to.
     """
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import kernel_class, require
+from .backend import kernel_class, module, require
 from .fragment_list import empty_list, too_many
 from .pool import Pool
 from .project import Projection
@@ -27,7 +27,7 @@ def tracers(like: Tensor) -> Pool[Any]:
 
 def find_fragments(
     geom: Tensor, projection: Projection, most: int | None = None
-) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+) -> tuple[Any, Tensor, dict[str, Tensor]]:
     """The fragments of a view.
 
     Args:
@@ -36,7 +36,7 @@ def find_fragments(
         most: fragments that there may be; 0 = `MOST`, None = any number.
 
     Returns:
-        layout (tile_start), tile_start, and the arrays of `Fragments` by name.
+        layout, tile_start, and the arrays of `Fragments` by name.
 
     Raises:
         TooManyFragments: there are more than `most`.
@@ -49,9 +49,10 @@ def find_fragments(
         if most and n > most:
             raise too_many(geom, projection, n, most)
         found = empty_list(geom, n)
-        tile_start = torch.empty(tracer.tiles + 1, dtype=torch.int64)
-        tracer.copy(**found, tile_start=tile_start)
-    return tile_start, tile_start, found
+        starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
+        packs = torch.empty(tracer.packs, 2, dtype=torch.int32)
+        tracer.copy(**found, **starts, packs=packs)
+    return module(geom.device).TilePacks(**starts, packs=packs), starts["tile_start"], found
 
 
 def count(projection: Projection) -> int:

@@ -90,6 +90,7 @@ void bind_tracer(nb::module_& m) {
            })
       .def_prop_ro("tiles", [](const Trace<S>& t) { return int64_t(t.bins.tiles_x) * t.bins.tiles_y; })
       .def_prop_ro("pairs", [](const Trace<S>& t) { return int64_t(t.bins.surfels.size()); })
+      .def_prop_ro("packs", [](const Trace<S>& t) { return t.list.packs; })
       .def("copy", [](Trace<S>& t, const nb::kwargs& given) {
         Reader r("Trace.copy", given, kHost);
         const TraceCopy<S> a = read<TraceCopy<S>>(r);
@@ -128,6 +129,7 @@ NB_MODULE(BITYMI_MODULE, m) {
         const auto [layers, height, width] = p.shape;
         gather_patches(layers, height, width, p.bytes, p.floats, p.n, p.tiles, *self);
       });
+  bind_class<TilePacks>(m, "TilePacks", kHost, "The tiles and packs of a fragment list.");
   bind_operations<float>(m);
   bind_operations<double>(m);
   bind_operation(m, "masked_counts", &masked_counts);

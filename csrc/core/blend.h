@@ -62,18 +62,4 @@ BT_HD S weight_gradient(const S* d, const S* color, const S& beta, const S& dept
   return gradient;
 }
 
-// Both with vectors of four: colour and 1, and with maps depth and normal.
-template <bool kMaps, class S, class F>
-BT_HD void add_blended(S weight, F color, S beta, F depth_normal, S* sums) {
-  (F::load(sums) + weight * color).store(sums);
-  sums[4] += weight * beta;
-  if constexpr (kMaps) (F::load(sums + 5) + weight * depth_normal).store(sums + 5);
-}
-template <bool kMaps, class S, class F>
-BT_HD S weight_gradient(const S* d, F color, S beta, F depth_normal) {
-  S gradient = dot(F::load(d), color) + d[4] * beta;
-  if constexpr (kMaps) gradient += dot(F::load(d + 5), depth_normal);
-  return gradient;
-}
-
 }  // namespace bt

@@ -127,27 +127,22 @@ template <class T>
 BT_HD T listed_sigma(const Fragment<T>& f) {
   return select(f.low_pass > T(0.0f), -f.sigma, f.sigma);
 }
-template <class S>
-BT_HD S low_pass_of(S listed) {
-  return listed < S(0) ? S(1) : S(0);
-}
 
-// Gradients towards a row of geom, added to d[kGeom]; ddx, ddy is the gradient with respect to the pixel's offset.
-// `rim` bounds 1 - x from below in the kernel's derivative, which diverges at the rim for beta < 1.
+// Gradients towards a row of geom, added to d[kGeom], from those of a fragment with sigma `listed`; ddx, ddy is the
+// gradient with respect to the pixel's offset. `rim` bounds 1 - x from below in the kernel's derivative, which diverges
+// at the rim for beta < 1.
 template <class Kernel, class S, class T>
-BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T low_pass, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
+BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T listed, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
                         T& ddy) {
   if (filtered<Kernel>(g)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
   const T zero = T(S(0)), two = T(S(2));
   const Hit<T> h = hit(g, near, dx, dy);
   const T u = h.u, v = h.v, inv = h.inv, rest = h.rest, q = T(g[kW0] * g[kZ]);
-  const auto low = low_pass > zero;
-  const T log_rest = log_(max_(rest, T(S(1e-30))));
-  const T kernel = select(low, exp_(-(dx * dx + dy * dy)), exp_(T(g[kBeta]) * log_rest));
-  const auto open = T(g[kOpacity]) * kernel < T(S(kAlphaMax));  // the clamp passes no gradient
-  const T gs = select(open, dsigma, zero);
-  d[kOpacity] += gs * kernel;
-  const T gk = gs * T(g[kOpacity]) * kernel;  // d sigma / d log kernel
+  const auto low = listed < zero;
+  const T sigma = abs_(listed), log_rest = log_(max_(rest, T(S(1e-30))));
+  const T gs = select(sigma < T(S(kAlphaMax)), dsigma, zero);  // the clamp passes no gradient
+  const T gk = gs * sigma;                                     // d sigma / d log kernel, sigma being o times the kernel
+  d[kOpacity] += gk * T(S(1) / g[kOpacity]);
   const T gk3 = select(low, zero, gk);
   d[kBeta] += gk3 * log_rest;
   const T drho = -gk3 * T(g[kBeta]) / max_(rest, T(rim)) * T(S(1.0 / kSupport2));

@@ -1,8 +1,11 @@
 // Shading and blending of surfels with or without texels in one pass over the fragments, and its backward pass: colours
-// and their gradients are never listed.
+// and their gradients are never listed. A pack at a time; texels fragment by fragment.
 #include "ops/blend.h"
 
+#include <optional>
+
 #include "cpu/kernels.h"
+#include "cpu/packs.h"
 #include "cpu/patch.h"
 #include "cpu/runs.h"
 
@@ -11,166 +14,245 @@ namespace bt {
 namespace {
 // A view as the kernels of the CPU take it.
 template <class S>
-using Blended = BlendedSurfels<S, TileStarts>;
+using Blended = BlendedSurfels<S, TilePacks>;
 template <class S>
-using Forward = BlendForward<S, TileStarts>;
+using Forward = BlendForward<S, TilePacks>;
 template <class S>
-using Backward = BlendBackward<S, TileStarts>;
+using Backward = BlendBackward<S, TilePacks>;
 
+template <bool kMaps>
+constexpr int kChannels = kMaps ? kMapChannels : kImageChannels;
+
+// The fragments of a surfel in a tile, ready to be blended.
 template <class S>
-BT_HD Four<S> depth_normal(S depth, const S* g) {
-  return {Quad<S>{depth, g[kNx], g[kNx + 1], g[kNx + 2]}};
+class SurfelRun {
+ public:
+  using P = Pack<S>;
+  const PackRun run;
+  const TexelPatch<S> patch;
+  const P beta, normal[3];
+
+  SurfelRun(const Blended<S>& of, const PackRun& run) : SurfelRun(of, run, of.geom + int64_t(run.surfel) * kGeom) {}
+  SurfelRun(const SurfelRun&) = delete;
+
+  const PatchFragments<S>& few() const { return few_; }
+  // Those of pack k's fragments that show texels, by lane.
+  BT_HD uint32_t textured(const PackPart& part, P weight) const {
+    return patch.textured() ? part.lanes & bits(weight >= P(bound_)) : 0;
+  }
+  // fn(lane, fragment of `few`) for some of pack k.
+  template <class F>
+  BT_HD void each_of(uint32_t lanes, int64_t k, F&& fn) const {
+    for (; lanes; lanes &= lanes - 1) {
+      const int lane = __builtin_ctz(lanes);
+      fn(lane, int(k - run.first) * kLanes + lane);
+    }
+  }
+  // The colours of pack k's fragments.
+  BT_HD void colors(uint32_t textured, int64_t k, P* to) const {
+    const Four<S> view(patch.view, S(1));
+    P r(view.v[0]), g(view.v[1]), b(view.v[2]);
+    each_of(textured, k, [&](int lane, int j) {
+      const Four<S> color = shaded(view, few_.residual(j));
+      const auto here = mask_of<S>(1u << lane);  // through memory the vector would wait for its lanes
+      r = select(here, P(color.v[0]), r), g = select(here, P(color.v[1]), g), b = select(here, P(color.v[2]), b);
+    });
+    to[0] = r, to[1] = g, to[2] = b;
+  }
+
+ private:
+  SurfelRun(const Blended<S>& of, const PackRun& run, const S* g)
+      : run(run),
+        patch(of.table, run.surfel),
+        beta(g[kBeta]),
+        normal{P(g[kNx]), P(g[kNx + 1]), P(g[kNx + 2])},
+        bound_(of.bound),
+        few_(patch) {
+    if (!patch.textured()) return;
+    const FragmentArrays<S>& f = of.fragments.f;
+    each_pack(of.fragments.layout, run, [&](int64_t k, int64_t at, const PackPart& part) {
+      const uint32_t lanes = textured(part, expand(f.weight + at, part.lanes));
+      if (!lanes) return;
+      few_.look(int(k - run.first) * kLanes, expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
+      each_of(lanes, k, [&](int, int j) { few_.ask(j); });
+    });
+  }
+
+  const S bound_;
+  PatchFragments<S> few_;
+};
+// Asks for what a SurfelRun reads of its surfel.
+template <class S>
+BT_HD void ask_for_surfel(const Blended<S>& of, int64_t id) {
+  const TexelTiles<S>& t = of.table;
+  __builtin_prefetch(of.geom + id * kGeom), __builtin_prefetch(t.base + 3 * id), __builtin_prefetch(t.first + id);
+  __builtin_prefetch(t.size + 2 * id), __builtin_prefetch(t.extent + id);
 }
 
-// Behind the last fragment from i on that is of the same surfel.
-inline int64_t run_end(const int32_t* surfel, int64_t i, int64_t end) {
-  const int32_t id = surfel[i];
-  while (++i < end && surfel[i] == id) {
+// fn(SurfelRun) for runs one after the other; each is looked up before the one in front of it is through, so that its
+// texels are on their way.
+template <class S, class F>
+BT_HD void each_surfel_run(const Blended<S>& of, const std::vector<PackRun>& runs, F&& fn) {
+  const int64_t n = int64_t(runs.size());
+  std::optional<SurfelRun<S>> two[2];
+  for (int64_t r = 0; r <= n; ++r) {
+    if (r + 4 < n) ask_for_surfel(of, runs[r + 4].surfel);
+    if (r < n) two[r & 1].emplace(of, runs[r]);
+    if (r > 0) fn(*two[(r - 1) & 1]);
   }
-  return i;
-}
-
-// constant(i) for those fragments of a surfel from i on that show no texel, and textured(i, few, j) for the others:
-// few's fragment j.
-template <class S, class Constant, class WithTexel>
-BT_HD void each_fragment(const Blended<S>& of, const TexelPatch<S>& patch, int64_t i, int64_t end, Constant&& constant,
-                         WithTexel&& textured) {
-  if (!patch.textured()) {
-    for (; i < end; ++i) constant(i);
-    return;
-  }
-  const FragmentArrays<S>& f = of.fragments.f;
-  PatchFragments<S> few(patch);
-  for (int64_t next; i < end; i = next) {
-    next = std::min<int64_t>(end, i + kFew);
-    const Textured here(f.weight + i, int(next - i), of.bound);
-    few.look(f.uv + i, f.uv + f.total + i, int(next - i));
-    for (int k = 0; k < here.others; ++k) constant(i + here.other[k]);
-    for (int k = 0; k < here.count; ++k) textured(i + here.at[k], few, here.at[k]);
-  }
-}
-
-template <bool kMaps, class S>
-BT_HD void blend_into(const Forward<S>& a, int64_t i, Four<S> color, const S* g) {
-  constexpr int channels = kMaps ? kMapChannels : kImageChannels;
-  const FragmentArrays<S>& f = a.of.fragments.f;
-  S* to = a.image + int64_t(f.pixel[i]) * channels;
-  add_blended<kMaps>(f.weight[i], color, g[kBeta], depth_normal(f.depth[i], g), to);
 }
 
 template <bool kMaps, class S>
 void forward(const Forward<S>& a) {
+  using P = Pack<S>;
+  constexpr int channels = kChannels<kMaps>;
   const FragmentArrays<S>& f = a.of.fragments.f;
-  const int64_t *tile_start = a.of.fragments.layout.start, tiles = a.of.fragments.layout.tiles;
-  std::fill(a.image, a.image + a.of.numbers(), S(0));
-  parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
-    for (int64_t i = tile_start[first], end; i < tile_start[last]; i = end) {
-      end = run_end(f.surfel, i, tile_start[last]);
-      const TexelPatch<S> patch(a.of.table, f.surfel[i]);
-      const S* g = a.of.geom + int64_t(f.surfel[i]) * kGeom;
-      const Four<S> view(patch.view, S(1));
-      each_fragment(
-          a.of, patch, i, end, [&](int64_t at) { blend_into<kMaps>(a, at, view, g); },
-          [&](int64_t at, const PatchFragments<S>& few, int j) {
-            blend_into<kMaps>(a, at, shaded(view, few.texels(j).mix()), g);
-          });
+  const TilePacks& layout = a.of.fragments.layout;
+  parallel_tiles(layout.start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
+    std::vector<PackRun> runs;
+    for (int64_t tile = first; tile < last; ++tile) {
+      P sums[kPacks][channels];
+      for (auto& pack : sums) std::fill(pack, pack + channels, P(S(0)));
+      runs.clear();
+      each_run(layout, tile, [&](const PackRun& run) { runs.push_back(run); });
+      each_surfel_run(a.of, runs, [&](const SurfelRun<S>& surfel) {
+        each_pack(layout, surfel.run, [&](int64_t k, int64_t at, const PackPart& part) {
+          const P weight = expand(f.weight + at, part.lanes);
+          P colors[3];
+          surfel.colors(surfel.textured(part, weight), k, colors);
+          const P depth = kMaps ? expand(f.depth + at, part.lanes) : P(S(0));
+          add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.pack]);
+        });
+      });
+      each_pixel(tile, a.of.width, a.of.height, [&](int64_t pixel, int pack, int lane) {
+        for (int c = 0; c < channels; ++c) a.image[pixel * channels + c] = sums[pack][c][lane];
+      });
     }
   });
 }
 
-// What the fragments of a surfel add to its gradients: view colour, beta, and the normal with maps.
+// What the fragments of a surfel add to its gradients: view colour and beta, and the normal with maps.
 template <class S>
 struct Sums {
-  Four<S> view = Four<S>(S(0)), normal = Four<S>(S(0));  // beside them nothing, and nothing before the normal
-  S beta = S(0);
+  Pack<S> view[3], beta, normal[3];
+  Sums() : beta(S(0)) { std::fill(view, view + 3, beta), std::fill(normal, normal + 3, beta); }
 };
 
-// The gradients of one fragment but those of u and v; returns that of its colour.
+// The gradients of the fragments of a run. `rows`: gradients of the surfel's texels, rows of four; null: there are
+// none.
 template <bool kMaps, class S>
-BT_HD Four<S> fragment_backward(const Backward<S>& a, int64_t i, Four<S> color, const S* g, Sums<S>& sums) {
-  constexpr int channels = kMaps ? kMapChannels : kImageChannels;
+void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage, const SurfelRun<S>& surfel,
+                  S* rows, Sums<S>& sums) {
+  using P = Pack<S>;
+  constexpr int channels = kChannels<kMaps>;
   const FragmentArrays<S>& f = a.of.fragments.f;
-  const S w = f.weight[i];
-  const S* row = a.dimage + int64_t(f.pixel[i]) * channels;
-  a.dweight[i] = weight_gradient<kMaps>(row, color, g[kBeta], depth_normal(f.depth[i], g));
-  sums.beta += w * row[4];
-  if constexpr (kMaps) {
-    const Four<S> dmaps = Four<S>::load(row + 5);
-    a.ddepth[i] = w * dmaps.v[0];
-    sums.normal = sums.normal + w * dmaps;
-  }
-  const Four<S> dcolor = without_last(residual_gradient(color, w * Four<S>::load(row)));
-  sums.view = sums.view + dcolor;
-  return dcolor;
-}
-
-// Those of fragments of one surfel from i on. `rows`: gradients of its texels, rows of four; null: there are none.
-template <bool kMaps, class S>
-void run_backward(const Backward<S>& a, int64_t i, int64_t end, const TexelPatch<S>& patch, S* rows, Sums<S>& sums) {
-  const int64_t total = a.of.fragments.f.total;
-  const S* g = a.of.geom + int64_t(a.of.fragments.f.surfel[i]) * kGeom;
-  const Four<S> view(patch.view, S(1));
-  each_fragment(
-      a.of, patch, i, end,
-      [&](int64_t at) {
-        fragment_backward<kMaps>(a, at, view, g, sums);
-        if (a.duv) a.duv[at] = a.duv[total + at] = S(0);
-      },
-      [&](int64_t at, const PatchFragments<S>& few, int j) {
-        const TexelFours<S> texels = few.texels(j);
-        const Four<S> dcolor = fragment_backward<kMaps>(a, at, shaded(view, texels.mix()), g, sums);
-        if (rows) few.add_gradient(j, texels, dcolor, rows);
+  const P zero = P(S(0));
+  each_pack(a.of.fragments.layout, surfel.run, [&](int64_t pack, int64_t at, const PackPart& part) {
+    const auto there = mask_of<S>(part.lanes);
+    const P weight = expand(f.weight + at, part.lanes);
+    P d[channels], colors[3], dcolors[3];
+    for (int c = 0; c < channels; ++c)
+      d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.pack) + c * kLanes), zero);
+    const uint32_t textured = surfel.textured(part, weight);
+    surfel.colors(textured, pack, colors);
+    const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
+    compress_only(a.dweight + at, weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
+    for (int k = 0; k < 3; ++k) {
+      dcolors[k] = residual_gradient(colors[k], weight * d[k]);
+      sums.view[k] += dcolors[k];
+    }
+    sums.beta += weight * d[4];
+    if constexpr (kMaps) {
+      compress_only(a.ddepth + at, weight * d[5], part.lanes);
+      for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
+    }
+    S du[kLanes] = {}, dv[kLanes] = {};
+    if (textured) {
+      S rgb[3][kLanes];
+      for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
+      surfel.each_of(textured, pack, [&](int lane, int j) {
+        const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, S(0));
+        if (rows) surfel.few().add_gradient(j, dcolor, rows);
         if (!a.duv) return;
-        a.duv[at] = few.gradient_u(j, texels, dcolor);
-        a.duv[total + at] = few.gradient_v(j, texels, dcolor);
+        Four<S> texels[4];
+        surfel.few().texels(j, texels);
+        du[lane] = surfel.few().gradient_u(j, texels, dcolor);
+        dv[lane] = surfel.few().gradient_v(j, texels, dcolor);
       });
+    }
+    if (!a.duv) return;
+    compress_only(a.duv + at, load(du), part.lanes);
+    compress_only(a.duv + f.total + at, load(dv), part.lanes);
+  });
 }
 
 // Writes the gradients of a surfel.
 template <class S>
 void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
-  store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), sums.view.three()));
+  const Vec3<S> view = {sum(sums.view[0]), sum(sums.view[1]), sum(sums.view[2])};
+  store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), view));
   S* dgeom = a.dgeom + id * kGeom;
-  dgeom[kBeta] = sums.beta;
-  for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sums.normal.v[k + 1];
+  dgeom[kBeta] = sum(sums.beta);
+  for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sum(sums.normal[k]);
 }
 
-// Asks for what the runs after run k of `runs` read: they lie all over the list, and waiting for them would take most
-// of the time. First for where they begin, then for their fragments, then for the pixels of these. Always inlined: GCC
-// drops calls of a function that does nothing else.
+// All runs of a list, in its order.
+struct ListedRuns {
+  std::vector<PackRun> run;
+
+  explicit ListedRuns(const TilePacks& layout) {
+    for (int64_t tile = 0; tile < layout.tiles; ++tile)
+      each_run(layout, tile, [&](const PackRun& r) { run.push_back(r); });
+  }
+  int64_t count() const { return int64_t(run.size()); }
+  int32_t surfel(int64_t r) const { return run[r].surfel; }
+  int64_t length(int64_t r) const { return run[r].end - run[r].begin; }
+};
+
+// Asks for what the runs after run k of `order` read: they lie all over the list, and waiting for them would take most
+// of the time. First for what they are, then for their fragments and pixels. Always inlined: GCC drops calls of a
+// function that does nothing else.
 template <int channels, class S>
-BT_HD void ask_for_next(const Backward<S>& a, const Runs& runs, int64_t k) {
+BT_HD void ask_for_next(const Backward<S>& a, const PackedPicture<S, channels>& dimage, const ListedRuns& listed,
+                        const std::vector<int64_t>& order, int64_t k) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   constexpr int64_t line = 64 / sizeof(S);
-  const auto run = [&](int64_t ahead) { return runs.start + runs.order[std::min(k + ahead, runs.count - 1)]; };
-  __builtin_prefetch(run(8));
-  const int64_t* next = run(3);
-  for (int64_t i = next[0]; i < next[1]; i += line) {
-    __builtin_prefetch(f.weight + i), __builtin_prefetch(f.pixel + i);
-    __builtin_prefetch(f.uv + i), __builtin_prefetch(f.uv + f.total + i);
+  const auto run = [&](int64_t ahead) -> const PackRun& {
+    return listed.run[order[std::min(k + ahead, int64_t(order.size()) - 1)]];
+  };
+  __builtin_prefetch(&run(8));
+  const PackRun& next = run(3);
+  __builtin_prefetch(a.of.fragments.layout.packs + 2 * next.first);
+  for (int64_t i = next.begin; i < next.end; i += line) {
+    __builtin_prefetch(f.weight + i), __builtin_prefetch(f.uv + i), __builtin_prefetch(f.uv + f.total + i);
   }
-  next = run(1);
-  for (int64_t i = next[0]; i < next[1]; ++i) __builtin_prefetch(a.dimage + int64_t(f.pixel[i]) * channels);
+  const PackRun& soon = run(1);
+  for (int64_t p = soon.first; p < soon.last; ++p) {
+    const S* numbers = dimage.numbers(soon.tile, PackPart(a.of.fragments.layout, p).pack);
+    for (int64_t i = 0; i < channels * kLanes; i += line) __builtin_prefetch(numbers + i);
+  }
 }
 
-// Surfel after surfel: a thread adds to the tiles of its own. Also where they do not learn, so that the gradients of
-// the surfels are the same.
+// Surfel after surfel: a thread adds to what surfels of its own have.
 template <bool kMaps, class S>
-void backward_by_surfel(const Backward<S>& a) {
-  const FragmentArrays<S>& f = a.of.fragments.f;
-  const FoundRuns found(f.surfel, f.total, a.of.table.n);
-  const Runs runs{f.surfel, found.start.data(), found.order.data(), int64_t(found.order.size())};
-  for_surfels(runs, [&](int64_t first, int64_t last) {
-    const int64_t id = runs.id(first);
-    const TexelPatch<S> patch(a.of.table, id);
+void backward(const Backward<S>& a) {
+  const TexelTiles<S>& table = a.of.table;
+  std::fill(a.dgeom, a.dgeom + table.n * kGeom, S(0));
+  std::fill(a.dbase, a.dbase + 3 * table.n, S(0));
+  if (a.dtexels) std::fill(a.dtexels, a.dtexels + 3 * table.texels, S(0));
+  const PackedPicture<S, kChannels<kMaps>> dimage(a.dimage, a.of.width, a.of.height);
+  const ListedRuns listed(a.of.fragments.layout);
+  const std::vector<int64_t> order = by_surfel(listed, table.n);
+  for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
+    const int64_t id = listed.surfel(order[first]);
+    const TexelPatch<S> patch(table, id);
     thread_local std::vector<S> own;  // gradients of the texels, rows of four
-    const int64_t area = a.moved || a.dtexels ? int64_t(patch.size[0]) * patch.size[1] : 0;
+    const int64_t area = a.sums_texels() ? int64_t(patch.size[0]) * patch.size[1] : 0;
     own.assign(4 * area, S(0));
     Sums<S> sums;
     for (int64_t r = first; r < last; ++r) {
-      ask_for_next<kMaps ? kMapChannels : kImageChannels>(a, runs, r);
-      const int64_t* start = runs.start + runs.order[r];
-      run_backward<kMaps>(a, start[0], start[1], patch, area ? own.data() : nullptr, sums);
+      ask_for_next(a, dimage, listed, order, r);
+      run_backward<kMaps>(a, dimage, SurfelRun<S>(a.of, listed.run[order[r]]), area ? own.data() : nullptr, sums);
     }
     surfel_backward(a, id, sums);
     if (a.dtexels)
@@ -178,56 +260,20 @@ void backward_by_surfel(const Backward<S>& a) {
     if (a.moved) move_texels(a.moved + 3 * patch.first, own.data(), 4, a.rate, a.share + patch.first, area);
   });
 }
-
-// In the order of the list, which is faster where there are no tiles.
-template <bool kMaps, class S>
-void backward_by_list(const Backward<S>& a) {
-  const FragmentArrays<S>& f = a.of.fragments.f;
-  const int64_t *tile_start = a.of.fragments.layout.start, tiles = a.of.fragments.layout.tiles, n = a.of.table.n;
-  std::vector<std::vector<Sums<S>>> partial(std::max(num_threads(), 1));
-  const int parts = parallel_tiles(tile_start, tiles, 64, [&](int part, int64_t first, int64_t last) {
-    std::vector<Sums<S>>& own = partial[part];
-    own.assign(n, {});
-    for (int64_t i = tile_start[first], end; i < tile_start[last]; i = end) {
-      end = run_end(f.surfel, i, tile_start[last]);
-      const TexelPatch<S> patch(a.of.table, f.surfel[i]);
-      run_backward<kMaps, S>(a, i, end, patch, nullptr, own[f.surfel[i]]);
-    }
-  });
-  parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
-    for (int64_t id = begin; id < end; ++id) {
-      Sums<S> sums = partial[0][id];
-      for (int p = 1; p < parts; ++p) {
-        sums.view = sums.view + partial[p][id].view, sums.normal = sums.normal + partial[p][id].normal;
-        sums.beta += partial[p][id].beta;
-      }
-      surfel_backward(a, id, sums);
-    }
-  });
-}
-
-template <bool kMaps, class S>
-void backward(const Backward<S>& a) {
-  const TexelTiles<S>& table = a.of.table;
-  std::fill(a.dgeom, a.dgeom + table.n * kGeom, S(0));
-  std::fill(a.dbase, a.dbase + 3 * table.n, S(0));
-  if (a.dtexels) std::fill(a.dtexels, a.dtexels + 3 * table.texels, S(0));
-  table.texels ? backward_by_surfel<kMaps>(a) : backward_by_list<kMaps>(a);
-}
 }  // namespace
 
 template <class S>
-void blend_forward(const BlendForward<S, TileStarts>& a) {
+void blend_forward(const BlendForward<S, TilePacks>& a) {
   a.of.maps ? forward<true>(a) : forward<false>(a);
 }
 template <class S>
-void blend_backward(const BlendBackward<S, TileStarts>& a) {
+void blend_backward(const BlendBackward<S, TilePacks>& a) {
   a.of.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                                          \
-  template void blend_forward(const BlendForward<S, TileStarts>&); \
-  template void blend_backward(const BlendBackward<S, TileStarts>&);
+#define BT_INSTANTIATE(S)                                         \
+  template void blend_forward(const BlendForward<S, TilePacks>&); \
+  template void blend_backward(const BlendBackward<S, TilePacks>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

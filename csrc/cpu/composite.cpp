@@ -6,7 +6,7 @@ namespace bt {
 
 namespace {
 template <bool kMaps, class S>
-void forward(const CompositeForward<S, TileStarts>& a) {
+void forward(const CompositeForward<S, TilePacks>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const S *geom = a.geom, *colors = a.colors;
   const int64_t *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
@@ -23,7 +23,7 @@ void forward(const CompositeForward<S, TileStarts>& a) {
 }
 
 template <bool kMaps, class S>
-void backward(const CompositeBackward<S, TileStarts>& a) {
+void backward(const CompositeBackward<S, TilePacks>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const S *geom = a.geom, *colors = a.colors, *dimage = a.dimage;
   const int64_t n = a.n, *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
@@ -59,17 +59,17 @@ void backward(const CompositeBackward<S, TileStarts>& a) {
 }  // namespace
 
 template <class S>
-void composite_forward(const CompositeForward<S, TileStarts>& a) {
+void composite_forward(const CompositeForward<S, TilePacks>& a) {
   a.maps ? forward<true>(a) : forward<false>(a);
 }
 template <class S>
-void composite_backward(const CompositeBackward<S, TileStarts>& a) {
+void composite_backward(const CompositeBackward<S, TilePacks>& a) {
   a.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                                                  \
-  template void composite_forward(const CompositeForward<S, TileStarts>&); \
-  template void composite_backward(const CompositeBackward<S, TileStarts>&);
+#define BT_INSTANTIATE(S)                                                 \
+  template void composite_forward(const CompositeForward<S, TilePacks>&); \
+  template void composite_backward(const CompositeBackward<S, TilePacks>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

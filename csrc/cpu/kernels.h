@@ -51,27 +51,27 @@ class Binner {
 template <class S>
 std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
 
-// Fragments as they are found, ordered like FragmentArrays.
+// Fragments as they are found, ordered like FragmentArrays; whose they are and where, their packs say.
 template <class S>
 struct FoundFragments {
-  std::vector<int64_t> tile_start;  // [tiles + 1], in fragments
-  int64_t total = 0;
+  std::vector<int64_t> tile_start, pack_start;  // [tiles + 1]
+  int64_t total = 0, packs = 0;
+  int width = 0;  // of the image
   // Filled by trace, read out by copy. Blocks are large, so that what is not written to takes no memory and what is
   // freed goes back to the operating system. A tile's fragments lie in one block.
   struct Block {
     static constexpr int64_t kSize = int64_t(1) << 21;
     explicit Block(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}
     Memory memory;  // small views, which use a part of the first block, do without large pages
-    int32_t* surfel = reinterpret_cast<int32_t*>(memory.get());
-    int32_t* pixel = surfel + kSize;
-    S *weight = reinterpret_cast<S*>(pixel + kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,
+    int32_t* packs = reinterpret_cast<int32_t*>(memory.get());
+    S *weight = reinterpret_cast<S*>(packs + 2 * kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,
       *sigma = depth + kSize;
-    int64_t used = 0;
+    int64_t used = 0, used_packs = 0;
   };
   std::vector<std::vector<Block>> blocks;  // per thread
   struct Piece {
     int thread, block;
-    int64_t from, count;
+    int64_t from, count, from_pack, packs;
   };
   std::vector<Piece> pieces;  // [tiles]
 };
@@ -97,16 +97,19 @@ struct TraceForward {
 };
 template <class S>
 void trace_forward(const TraceForward<S>& a, Trace<S>& to);
-// Written: tile_start [tiles + 1] and the list.
+// Written: the list, and the arrays of its TilePacks.
 template <class S>
 struct TraceCopy {
-  int64_t starts;
-  int64_t* tile_start;
+  int64_t starts, packs_listed;
+  int64_t *tile_start, *pack_start;
+  int32_t* packs;
   FragmentArrays<S> out;
 
   template <class R>
   void fields(R& r) {
     r.rows("tile_start", tile_start, starts, 1);
+    r.array("pack_start", pack_start, starts);
+    r.rows("packs", packs, packs_listed, 2);
     out.fields(r);
   }
 };
@@ -115,12 +118,12 @@ template <class S>
 void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
 
 template <class S>
-void trace_backward(const TraceBackward<S, TileStarts>& a);
+void trace_backward(const TraceBackward<S, TilePacks>& a);
 template <class S>
-void composite_forward(const CompositeForward<S, TileStarts>& a);
+void composite_forward(const CompositeForward<S, TilePacks>& a);
 template <class S>
-void composite_backward(const CompositeBackward<S, TileStarts>& a);
-void masked_counts(const MaskedCounts<TileStarts>& a);
+void composite_backward(const CompositeBackward<S, TilePacks>& a);
+void masked_counts(const MaskedCounts<TilePacks>& a);
 
 template <class S>
 void view_color_forward(const ViewColorForward<S>& a);
@@ -148,9 +151,9 @@ void texel_colors_forward(const TexelColorsForward<S>& a);
 template <class S>
 void texel_colors_backward(const TexelColorsBackward<S>& a);
 template <class S>
-void blend_forward(const BlendForward<S, TileStarts>& a);
+void blend_forward(const BlendForward<S, TilePacks>& a);
 template <class S>
-void blend_backward(const BlendBackward<S, TileStarts>& a);
+void blend_backward(const BlendBackward<S, TilePacks>& a);
 template <class S>
 void ssim(const Ssim<S>& a);
 

@@ -2,9 +2,7 @@
 // four.
 #pragma once
 
-#include <algorithm>
-
-#include "cpu/simd.h"
+#include "cpu/packs.h"
 #include "ops/texel.h"
 
 namespace bt {
@@ -70,33 +68,24 @@ BT_HD Four<S> without_last(Four<S> a) {
   a.v[3] = S(0);
   return a;
 }
-// Up to so many fragments of a surfel that follow each other in the list.
-constexpr int kFew = 64;
+// Up to so many fragments: those of a surfel in the packs of a tile.
+constexpr int kFew = kPacks * kLanes;
 
-// Which of them show a texel, and which do not.
-struct Textured {
-  int count = 0, others = 0;
-  uint8_t at[kFew], other[kFew];
-
-  template <class S>
-  Textured(const S* weight, int fragments, S bound) {
-    for (int j = 0; j < fragments; ++j) {
-      const bool shows = weight[j] >= bound;  // without a branch, which would be guessed wrongly
-      at[count] = other[others] = uint8_t(j);
-      count += shows, others += !shows;
-    }
-  }
-};
-
-// The texels of one of them, each beside a 0, and their weights.
+// Two texels side by side: their six numbers, or one's, and 0.
 template <class S>
-struct TexelFours {
-  Four<S> t[4];
-  S weight[4];
-  BT_HD Four<S> mix() const { return texel_mix(t, weight); }
-};
+BT_HD Oct<S> load_two(const S* p, bool both) {
+#if defined(__AVX2__)
+  if constexpr (std::is_same_v<S, float>) {
+    const int right = both ? -1 : 0;
+    return (Oct<S>)_mm256_maskload_ps(p, _mm256_setr_epi32(-1, -1, -1, right, right, right, 0, 0));
+  }
+#endif
+  Oct<S> r = {};
+  std::memcpy(&r, p, (both ? 6 : 3) * sizeof(S));
+  return r;
+}
 
-// Up to kFew fragments of a surfel that has a tile.
+// Up to kFew fragments of a surfel that has texels.
 template <class S>
 class PatchFragments {
  public:
@@ -106,50 +95,54 @@ class PatchFragments {
         per_u_(texel_density(of.size[0], of.extent)),
         per_v_(texel_density(of.size[1], of.extent)) {}
 
-  // Looks where fragments at u [count], v [count] lie.
-  BT_HD void look(const S* u, const S* v, int count) {
-    static_assert(kFew % kLanes == 0);
-    for (int j = 0; j < count; j += kLanes) {
-      const int n = std::min(count - j, kLanes);
-      const TexelAxis<Pack<S>> x = texel_axis(some(u + j, n), of_.size[0], of_.extent);
-      const TexelAxis<Pack<S>> y = texel_axis(some(v + j, n), of_.size[1], of_.extent);
-      store_integers(first_ + j, y.first * Pack<S>(S(of_.size[0])) + x.first);
-      store(fx_ + j, x.fraction), store(fy_ + j, y.fraction);
-      inside_u_[j / kLanes] = bits(x.inside), inside_v_[j / kLanes] = bits(y.inside);
-    }
+  // Looks where the fragments of a pack lie, which are numbered from j on by lane.
+  BT_HD void look(int j, Pack<S> u, Pack<S> v) {
+    const TexelAxis<Pack<S>> x = texel_axis(u, of_.size[0], of_.extent), y = texel_axis(v, of_.size[1], of_.extent);
+    store_integers(first_ + j, y.first * Pack<S>(S(of_.size[0])) + x.first);
+    store(fx_ + j, x.fraction), store(fy_ + j, y.fraction);
+    inside_u_[j / kLanes] = bits(x.inside), inside_v_[j / kLanes] = bits(y.inside);
+  }
+  // Asks for the texels of fragment j.
+  BT_HD void ask(int j) const {
+    const S* t = of_.tile + 3 * int64_t(first_[j]);
+    __builtin_prefetch(t), __builtin_prefetch(t + 3 * next_.down);
   }
 
-  // The texels of fragment j.
-  BT_HD TexelFours<S> texels(int j) const {
-    TexelFours<S> q;
+  // The residual of fragment j: texel_mix, of two texels at a time.
+  BT_HD Four<S> residual(int j) const {
+    const S *t = of_.tile + 3 * int64_t(first_[j]), fy = fy_[j];
+    const bool both = next_.right;
+    const Oct<S> row = (S(1) - fy) * load_two(t, both) + fy * load_two(t + 3 * next_.down, both);
+    constexpr Oct<S> left = {1, 1, 1}, to_right = {-1, -1, -1, 1, 1, 1};
+    const Oct<S> r = row * (left + fx_[j] * to_right);
+    return half<0, Quad<S>>(r) + from_third<S>(r);
+  }
+  // Adds the gradients of its texels to rows of four, g that of its colour. Four at a time: a load of eight would wait
+  // for the stores of the fragment before, of which it has a part.
+  BT_HD void add_gradient(int j, Four<S> g, S* rows) const {
+    const Four<S> below = fy_[j] * g, above = g - below, below_right = fx_[j] * below, right = fx_[j] * above;
+    S* at = rows + 4 * int64_t(first_[j]);
+    const int across = 4 * next_.right, down = 4 * next_.down;
+    add(above - right, at), add(right, at + across);
+    add(below - below_right, at + down), add(below_right, at + down + across);
+  }
+  // Its texels, each beside a 0.
+  BT_HD void texels(int j, Four<S>* to) const {
     const S* t = of_.tile + 3 * int64_t(first_[j]);
     const int right = 3 * next_.right, down = 3 * next_.down;
-    q.t[0] = Four<S>::load_three(t), q.t[1] = Four<S>::load_three(t + right);
-    q.t[2] = Four<S>::load_three(t + down), q.t[3] = Four<S>::load_three(t + down + right);
-    texel_weights(fx_[j], fy_[j], q.weight);
-    return q;
+    to[0] = Four<S>::load_three(t), to[1] = Four<S>::load_three(t + right);
+    to[2] = Four<S>::load_three(t + down), to[3] = Four<S>::load_three(t + down + right);
   }
-  // Adds the gradients of its texels to rows of four, g that of its colour.
-  BT_HD void add_gradient(int j, const TexelFours<S>& q, Four<S> g, S* rows) const {
-    S* at = rows + 4 * int64_t(first_[j]);
-    const int offset[4] = {0, 4 * next_.right, 4 * next_.down, 4 * (next_.down + next_.right)};
-    for (int k = 0; k < 4; ++k) (Four<S>::load(at + offset[k]) + q.weight[k] * g).store(at + offset[k]);
+  // The gradients of its coordinates; see texel_slopes.
+  BT_HD S gradient_u(int j, const Four<S>* texels, Four<S> g) const {
+    return inside_u_[j / kLanes] >> j % kLanes & 1 ? per_u_ * dot(g, texel_slope_u(texels, fy_[j])) : S(0);
   }
-  // Of its coordinates; see texel_slopes.
-  BT_HD S gradient_u(int j, const TexelFours<S>& q, Four<S> g) const {
-    return inside_u_[j / kLanes] >> j % kLanes & 1 ? per_u_ * dot(g, texel_slope_u(q.t, fy_[j])) : S(0);
-  }
-  BT_HD S gradient_v(int j, const TexelFours<S>& q, Four<S> g) const {
-    return inside_v_[j / kLanes] >> j % kLanes & 1 ? per_v_ * dot(g, texel_slope_v(q.t, fx_[j])) : S(0);
+  BT_HD S gradient_v(int j, const Four<S>* texels, Four<S> g) const {
+    return inside_v_[j / kLanes] >> j % kLanes & 1 ? per_v_ * dot(g, texel_slope_v(texels, fx_[j])) : S(0);
   }
 
  private:
-  BT_HD static Pack<S> some(const S* p, int n) {
-    if (n == kLanes) return load(p);
-    S all[kLanes] = {};
-    std::memcpy(all, p, n * sizeof(S));
-    return load(all);
-  }
+  BT_HD static void add(Four<S> a, S* to) { (Four<S>::load(to) + a).store(to); }
 
   const TexelPatch<S>& of_;
   TexelSteps next_;

@@ -7,6 +7,7 @@
 
 #include "core/common.h"
 #include "core/field.h"
+#include "cpu/lanes.h"
 #include "cpu/wide.h"
 
 namespace bt {
@@ -220,10 +221,25 @@ BT_HD typename Pack<S>::M finite_(Pack<S> a) {
   return abs_(a) < Pack<S>(std::numeric_limits<S>::infinity());  // not for NaN
 }
 
-// The lanes named by `keep`, next to each other; `to` has room for a whole pack.
+// Some lanes: their mask, and to and from memory, next to each other (cpu/lanes.h).
 template <class S>
-BT_HD void compress(S* to, Pack<S> a, uint32_t keep) {
-  compress_lanes(to, a.v, keep);
+BT_HD typename Pack<S>::M mask_of(uint32_t lanes) {
+  return mask_of_lanes<typename Pack<S>::M>(lanes);
+}
+template <class S>
+BT_HD void compress(S* to, Pack<S> a, uint32_t lanes) {
+  compress_lanes(to, a.v, lanes);
+}
+template <class S>
+BT_HD void compress_only(S* to, Pack<S> a, uint32_t lanes) {
+  compress_lanes_only(to, a.v, lanes);
+}
+BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes_only(to, a, lanes); }
+template <class S>
+BT_HD Pack<S> expand(const S* from, uint32_t lanes) {
+  Pack<S> r;
+  expand_lanes(from, r.v, lanes);
+  return r;
 }
 
 template <class S>
@@ -276,6 +292,15 @@ BT_HD Half half(V v) {
   Half r;
   std::memcpy(&r, reinterpret_cast<const char*>(&v) + which * sizeof r, sizeof r);
   return r;
+#endif
+}
+// Lanes 3 to 6 of eight.
+template <class S>
+BT_HD Quad<S> from_third(Oct<S> v) {
+#if __has_builtin(__builtin_shufflevector)
+  return __builtin_shufflevector(v, v, 3, 4, 5, 6);
+#else
+  return Quad<S>{v[3], v[4], v[5], v[6]};
 #endif
 }
 // The lanes added to four: halves to halves.

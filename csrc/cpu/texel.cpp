@@ -35,16 +35,16 @@ template <class S>
 void texel_image_backward(const TexelBackward<S>& a) {
   const TexelFragments<S>& f = a.f;
   const TexelTiles<S>& table = a.table;
-  const Runs runs{f.surfel, a.runs.start, a.order, a.runs.tiles};
+  const FragmentRuns runs{f.surfel, a.runs.start, a.runs.tiles};
   const S *base = table.base, *dimage = a.dimage, bound = a.bound;
   S *dtexels = a.dtexels, *dbase = a.dbase;
   if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
-  for_surfels(runs, [&](int64_t first, int64_t last) {
-    const int64_t id = runs.id(first);
+  for_surfels(runs, a.order, [&](int64_t first, int64_t last) {
+    const int64_t id = runs.surfel(a.order[first]);
     const TexelPatch<S> patch(table, id);
     for (int64_t r = first; r < last; ++r) {
       Vec3<S> sum = {S(0), S(0), S(0)};
-      for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
+      for (int64_t i = runs.start[a.order[r]]; i < runs.start[a.order[r] + 1]; ++i) {
         Vec3<S> g = f.weight[i] * load3(dimage + 3 * int64_t(f.pixel[i]));
         if (patch.textured() && f.weight[i] >= bound) {
           const auto corners = patch.corners(f.uv[i], f.uv[f.count + i]);
@@ -83,10 +83,11 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
   if (dbase) std::fill(dbase, dbase + 3 * table.n, S(0));
   if (dtexels) std::fill(dtexels, dtexels + 3 * table.texels, S(0));
   if (duv) std::fill(duv, duv + 2 * f.total, S(0));
-  const FoundRuns found(f.surfel, f.total, table.n);
-  const Runs runs{f.surfel, found.start.data(), found.order.data(), int64_t(found.order.size())};
-  for_surfels(runs, [&](int64_t first, int64_t last) {
-    const int64_t id = runs.id(first);
+  const std::vector<int64_t> start = run_starts(f.surfel, f.total);
+  const FragmentRuns runs{f.surfel, start.data(), int64_t(start.size()) - 1};
+  const std::vector<int64_t> order = by_surfel(runs, table.n);
+  for_surfels(runs, order.data(), [&](int64_t first, int64_t last) {
+    const int64_t id = runs.surfel(order[first]);
     const TexelPatch<S> patch(table, id);
     thread_local std::vector<S> own;  // the tile's gradient, where it is not kept
     const int64_t area = int64_t(patch.size[0]) * patch.size[1];
@@ -94,7 +95,7 @@ void texel_colors_backward(const TexelColorsBackward<S>& a) {
     S* dtile = moved ? own.data() : dtexels ? dtexels + 3 * patch.first : nullptr;
     Vec3<S> sum = {S(0), S(0), S(0)};
     for (int64_t r = first; r < last; ++r)
-      for (int64_t i = runs.start[runs.order[r]]; i < runs.start[runs.order[r] + 1]; ++i) {
+      for (int64_t i = start[order[r]]; i < start[order[r] + 1]; ++i) {
         const Vec3<S> g = residual_gradient(load3(a.colors + 3 * i), load3(a.dcolors + 3 * i));
         sum = sum + g;
         if (!patch.textured() || f.weight[i] < a.of.bound) continue;

@@ -1,28 +1,11 @@
-// Walking a tile's surfels: a tile is 16 packs of 4 x 4 pixels.
+// Walking a tile's surfels.
 #pragma once
 
 #include "core/kernel.h"
 #include "cpu/kernels.h"
-#include "cpu/simd.h"
+#include "cpu/packs.h"
 
 namespace bt {
-
-constexpr int kPackSide = 4, kPacksAcross = kTile / kPackSide, kPacks = kPacksAcross * kPacksAcross;
-static_assert(kPacks == kLanes && kPacksAcross == 4, "a bit and a lane for each pack of a tile");
-
-// A pack's first pixel in its tile.
-constexpr int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
-constexpr int pack_row(int pack) { return pack / kPacksAcross * kPackSide; }
-// The same as reals, which would else be converted for every pack that is drawn.
-template <class S>
-struct PackOffsets {
-  S column[kPacks] = {}, row[kPacks] = {};
-  constexpr PackOffsets() {
-    for (int p = 0; p < kPacks; ++p) column[p] = S(pack_column(p)), row[p] = S(pack_row(p));
-  }
-};
-template <class S>
-inline constexpr PackOffsets<S> kPackOffsets;
 
 // Of 16 cells of an image those with a pixel in the kernel's level set, and in the low pass's.
 struct Reached {

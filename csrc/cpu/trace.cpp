@@ -31,8 +31,9 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
   const int threads = num_threads();
   if (int(list.blocks.size()) < threads) list.blocks.resize(threads);
   for (auto& own : list.blocks)
-    for (auto& block : own) block.used = 0;
+    for (auto& block : own) block.used = block.used_packs = 0;
   list.pieces.assign(tiles, {});
+  list.width = width;
   std::vector<int> current(threads, 0);
   std::atomic<int64_t> found{0};
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
@@ -48,42 +49,40 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
     if (at_block < int(own.size()) && own[at_block].used + kTileMost > Block::kSize) ++at_block;
     if (at_block == int(own.size())) own.emplace_back(own.empty());
     Block& a = own[at_block];
-    const int64_t from = a.used;
-    int64_t count = 0;
+    const int64_t from = a.used, from_pack = a.used_packs;
+    int64_t count = 0, packs = 0;
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height);
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
-      state.template blend<Kernel, true>(
-          view, bins, id, [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
-            const uint32_t lanes = bits(taken);
-            if (!keep) {
-              count += __builtin_popcount(lanes);
-              return;
-            }
-            const int64_t at = from + count;
-            const int32_t corner = (ty * kTile + pack_row(pack)) * width + tx * kTile + pack_column(pack);
-            int n = 0;
-            for (uint32_t rest = lanes; rest; rest &= rest - 1, ++n) {
-              const int lane = __builtin_ctz(rest);
-              a.pixel[at + n] = corner + lane / kPackSide * width + lane % kPackSide;
-              a.surfel[at + n] = id;
-            }
-            compress(&a.weight[at], weight, lanes);
-            compress(&a.u[at], f.u, lanes);
-            compress(&a.v[at], f.v, lanes);
-            compress(&a.depth[at], f.depth, lanes);
-            compress(&a.sigma[at], listed_sigma(f), lanes);
-            count += n;
-          });
+      state.template blend<Kernel, true>(view, bins, id,
+                                         [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
+                                           const uint32_t lanes = bits(taken);
+                                           if (!keep) {
+                                             count += __builtin_popcount(lanes);
+                                             return;
+                                           }
+                                           const int64_t at = from + count;
+                                           const PackPart part(lanes, pack, id);
+                                           part.write(a.packs + 2 * (from_pack + packs++));
+                                           compress(&a.weight[at], weight, lanes);
+                                           compress(&a.u[at], f.u, lanes);
+                                           compress(&a.v[at], f.v, lanes);
+                                           compress(&a.depth[at], f.depth, lanes);
+                                           compress(&a.sigma[at], listed_sigma(f), lanes);
+                                           count += part.count();
+                                         });
     }
-    if (keep) a.used += count;
+    if (keep) a.used += count, a.used_packs += packs;
     found.fetch_add(count, std::memory_order_relaxed);
-    list.pieces[tile] = {thread, at_block, from, count};
+    list.pieces[tile] = {thread, at_block, from, count, from_pack, packs};
   }
-  list.tile_start.assign(tiles + 1, 0);
-  for (int64_t t = 0; t < tiles; ++t) list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
-  list.total = list.tile_start[tiles];
+  list.tile_start.assign(tiles + 1, 0), list.pack_start.assign(tiles + 1, 0);
+  for (int64_t t = 0; t < tiles; ++t) {
+    list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
+    list.pack_start[t + 1] = list.pack_start[t] + list.pieces[t].packs;
+  }
+  list.total = list.tile_start[tiles], list.packs = list.pack_start[tiles];
   if (most && list.total > most) list.blocks.clear();  // nothing will be copied
 }
 }  // namespace
@@ -95,15 +94,34 @@ void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
   with_kernel(a.view.through_pixel, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.most, to); });
 }
 
+namespace {
+// Whose the fragments of a tile are and where, by its packs; they begin at `surfel` and `pixel`.
+void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, int32_t* surfel, int32_t* pixel) {
+  using Whole = Wide<int32_t>;
+  Whole in_pack;  // the pixels, from the first one on
+  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane / kPackSide * width + lane % kPackSide);
+  const int32_t corner = int32_t(tile / tiles_across(width) * kTile * width + tile % tiles_across(width) * kTile);
+  for (int64_t k = 0; k < count; ++k) {
+    const PackPart part(packs + 2 * k);
+    const int32_t first = corner + pack_row(part.pack) * width + pack_column(part.pack);
+    compress_only(pixel, in_pack + first, part.lanes);
+    std::fill_n(surfel, part.count(), part.surfel);
+    surfel += part.count(), pixel += part.count();
+  }
+}
+}  // namespace
+
 template <class S>
 void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
   FoundFragments<S>& list = from.list;
   const FragmentArrays<S>& out = a.out;
   if (list.total && list.blocks.empty()) throw std::logic_error("the fragments were counted only, or copied before");
-  if (out.total != list.total || a.starts != int64_t(list.tile_start.size()))
+  if (out.total != list.total || a.packs_listed != list.packs || a.starts != int64_t(list.tile_start.size()))
     throw std::invalid_argument("the list has " + std::to_string(list.total) + " fragments in " +
-                                std::to_string(list.tile_start.size() - 1) + " tiles");
+                                std::to_string(list.packs) + " packs of " + std::to_string(list.tile_start.size() - 1) +
+                                " tiles");
   std::copy(list.tile_start.begin(), list.tile_start.end(), a.tile_start);
+  std::copy(list.pack_start.begin(), list.pack_start.end(), a.pack_start);
   std::vector<std::vector<int64_t>> tiles;  // of the k-th blocks of all threads
   for (size_t t = 0; t < list.pieces.size(); ++t) {
     const auto& p = list.pieces[t];
@@ -118,13 +136,13 @@ void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
       const auto& p = list.pieces[tiles[k][i]];
       const auto& block = list.blocks[p.thread][k];
       const int64_t to = list.tile_start[tiles[k][i]];
-      std::copy_n(block.surfel + p.from, p.count, out.surfel + to);
-      std::copy_n(block.pixel + p.from, p.count, out.pixel + to);
+      list_packs(block.packs + 2 * p.from_pack, p.packs, tiles[k][i], list.width, out.surfel + to, out.pixel + to);
       std::copy_n(block.weight + p.from, p.count, out.weight + to);
       std::copy_n(block.u + p.from, p.count, out.uv + to);
       std::copy_n(block.v + p.from, p.count, out.uv + list.total + to);
       std::copy_n(block.depth + p.from, p.count, out.depth + to);
       std::copy_n(block.sigma + p.from, p.count, out.sigma + to);
+      std::copy_n(block.packs + 2 * p.from_pack, 2 * p.packs, a.packs + 2 * list.pack_start[tiles[k][i]]);
     }
     if (!large) continue;
     for (auto& own : list.blocks)
@@ -135,67 +153,57 @@ void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
 
 namespace {
 template <class Kernel, class S>
-void trace_backward(const TraceBackward<S, TileStarts>& a) {
+void trace_backward(const TraceBackward<S, TilePacks>& a) {
   using P = Pack<S>;
   const S *geom = a.view.geom, *dweight = a.dweight, *duv = a.duv, *ddepth = a.ddepth;
   const S near = a.view.near, rim = a.rim;
   const FragmentArrays<S>& f = a.fragments.f;
-  const int64_t *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
+  const TilePacks& layout = a.fragments.layout;
   const int64_t n = a.view.n, total = f.total;
-  const int width = a.view.width;
   S *dgeom = a.dgeom, *absgrad = a.absgrad;
-  const int tiles_x = tiles_across(width);
+  const int tiles_x = tiles_across(a.view.width);
   const int most =
       int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max<int64_t>(n, 1) / kGeom)));
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
+  P lane_x, lane_y;  // pixel centres of a pack
+  for (int i = 0; i < kLanes; ++i)
+    lane_x.set(i, pixel_centre<S>(i % kPackSide)), lane_y.set(i, pixel_centre<S>(i / kPackSide));
+  const P zero = P(S(0));
   // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
-  const int parts = parallel_tiles(tile_start, tiles, most, [&](int part, int64_t first_tile, int64_t last_tile) {
+  const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
-    S behind[kTile * kTile];  // per pixel: sum of w dL/dw over the fragments behind
-    S dsigma[kTile * kTile + kLanes], du[kTile * kTile + kLanes], dv[kTile * kTile + kLanes];
-    S dz[kTile * kTile + kLanes], dx[kTile * kTile + kLanes], dy[kTile * kTile + kLanes];
-    S low[kTile * kTile + kLanes];
-    for (int64_t tile = first_tile; tile < last_tile; ++tile) {
-      const int x0 = int(tile % tiles_x) * kTile, y0 = int(tile / tiles_x) * kTile;
-      std::fill(behind, behind + kTile * kTile, S(0));
-      int64_t end = tile_start[tile + 1];
-      while (end > tile_start[tile]) {
-        const int32_t id = f.surfel[end - 1];
-        const S* g = geom + int64_t(id) * kGeom;
-        int64_t begin = end;
-        int m = 0;
-        while (begin > tile_start[tile] && f.surfel[begin - 1] == id) {
-          const int64_t i = --begin;
-          const int y = f.pixel[i] / width, x = f.pixel[i] - y * width;
-          S& rest = behind[(y - y0) * kTile + x - x0];
-          const S gw = dweight ? dweight[i] : S(0);
-          dsigma[m] = blend_vjp(f.weight[i], abs_(f.sigma[i]), gw, rest);
-          du[m] = duv ? duv[i] : S(0), dv[m] = duv ? duv[total + i] : S(0);
-          dz[m] = ddepth ? ddepth[i] : S(0);
-          low[m] = low_pass_of(f.sigma[i]);
-          dx[m] = pixel_centre<S>(x) - g[kCx], dy[m] = pixel_centre<S>(y) - g[kCy];
-          ++m;
-        }
-        end = begin;
-        for (int k = m; k % kLanes; ++k) dsigma[k] = du[k] = dv[k] = dz[k] = dx[k] = dy[k] = S(0), low[k] = S(1);
-        P d[kGeom], ax = P(S(0)), ay = P(S(0));
-        for (int k = 0; k < kColumns; ++k) d[k] = P(S(0));
-        d[kArea] = P(S(0));
-        for (int k = 0; k < m; k += kLanes) {
+    for (int64_t tile = first; tile < last; ++tile) {
+      const S x0 = S(tile % tiles_x * kTile), y0 = S(tile / tiles_x * kTile);
+      P behind[kPacks];  // per pixel: sum of w dL/dw over the fragments behind
+      std::fill(behind, behind + kPacks, zero);
+      each_run_back(layout, tile, [&](const PackRun& run) {
+        const int64_t id = run.surfel;
+        const S* g = geom + id * kGeom;
+        const P left = lane_x + P(x0 - g[kCx]), up = lane_y + P(y0 - g[kCy]);
+        P d[kGeom], ax = zero, ay = zero;
+        for (int k = 0; k < kColumns; ++k) d[k] = zero;
+        d[kArea] = zero;
+        each_pack(layout, run, [&](int64_t, int64_t at, const PackPart& of) {
+          const auto there = mask_of<S>(of.lanes);
+          const auto given = [&](const S* p) { return p ? expand(p + at, of.lanes) : zero; };
+          const P listed = expand(f.sigma + at, of.lanes), sigma = abs_(listed);
+          const P dsigma = blend_vjp(expand(f.weight + at, of.lanes), sigma, given(dweight), behind[of.pack]);
+          const P dx = left + P(kPackOffsets<S>.column[of.pack]), dy = up + P(kPackOffsets<S>.row[of.pack]);
           P ddx, ddy;
-          fragment_vjp<Kernel, S, P>(g, near, rim, load(dx + k), load(dy + k), load(low + k), load(dsigma + k),
-                                     load(du + k), load(dv + k), load(dz + k), d, ddx, ddy);
+          fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
+                                     select(there, dsigma, zero), given(duv), given(duv ? duv + total : nullptr),
+                                     given(ddepth), d, ddx, ddy);
           ax += abs_(ddx), ay += abs_(ddy);
-        }
-        S* to = sums.data() + int64_t(id) * kSums;
+        });
+        S* to = sums.data() + id * kSums;
         for (int k = 0; k < kColumns; ++k) to[k] += sum(d[k]);
         to[kColumns] += sum(ax), to[kColumns + 1] += sum(ay);
         to[kColumns + 2] += sum(d[kArea]);
-      }
+      });
     }
   });
   parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
@@ -212,18 +220,18 @@ void trace_backward(const TraceBackward<S, TileStarts>& a) {
 }  // namespace
 
 template <class S>
-void trace_backward(const TraceBackward<S, TileStarts>& a) {
+void trace_backward(const TraceBackward<S, TilePacks>& a) {
   with_kernel(a.view.through_pixel, [&](auto kernel) { trace_backward<decltype(kernel)>(a); });
 }
 
-void masked_counts(const MaskedCounts<TileStarts>& a) {
+void masked_counts(const MaskedCounts<TilePacks>& a) {
   for (int64_t i = 0; i < a.fragments; ++i) a.counts[a.surfel[i]] += a.mask[a.pixel[i]] != 0;
 }
 
 #define BT_INSTANTIATE(S)                                         \
   template void trace_forward(const TraceForward<S>&, Trace<S>&); \
   template void trace_copy(const TraceCopy<S>&, Trace<S>&);       \
-  template void trace_backward(const TraceBackward<S, TileStarts>&);
+  template void trace_backward(const TraceBackward<S, TilePacks>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -2,7 +2,6 @@
 // The compiler takes a vector that is wider than a register apart lane by lane where it compares and selects.
 #pragma once
 
-#include <array>
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
@@ -341,39 +340,6 @@ BT_HD Vector<double> square_root(const Vector<double>& a) {
 template <class H>
 BT_HD Two<H> square_root(const Two<H>& a) {
   return {square_root(a.low), square_root(a.high)};
-}
-
-// The lanes named by `keep`, next to each other; `to` has room for all lanes of `a`.
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t keep) {
-  _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(keep), (__m512)a));
-}
-#elif defined(__AVX2__)
-// For every set of eight lanes their numbers in order, a byte each.
-constexpr std::array<uint64_t, 256> lanes_in_order() {
-  std::array<uint64_t, 256> order{};
-  for (int set = 0; set < 256; ++set)
-    for (int lane = 0, n = 0; lane < 8; ++lane)
-      if (set >> lane & 1) order[set] |= uint64_t(lane) << 8 * n++;
-  return order;
-}
-inline constexpr std::array<uint64_t, 256> kLanesInOrder = lanes_in_order();
-BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t keep) {
-  const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(int64_t(kLanesInOrder[keep])));
-  _mm256_storeu_ps(to, _mm256_permutevar8x32_ps((__m256)a, order));
-}
-#endif
-template <class T, class V>
-BT_HD void compress_lanes(T* to, const V& a, uint32_t keep) {
-  if constexpr (is_two<V>) {
-    constexpr int n = sizeof(a.low) / sizeof(T);
-    const uint32_t low = keep & ((1u << n) - 1u);
-    compress_lanes(to, a.low, low);
-    compress_lanes(to + __builtin_popcount(low), a.high, keep >> n);
-  } else {
-    int n = 0;
-    for (uint32_t k = keep; k; k &= k - 1) to[n++] = a[__builtin_ctz(k)];
-  }
 }
 
 }  // namespace bt

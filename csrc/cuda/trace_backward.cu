@@ -65,7 +65,7 @@ __global__ void __launch_bounds__(kRunThreads)
       const int32_t y = row_of(pixel), x = pixel - y * p.width;
       T ddx, ddy;
       fragment_vjp<Kernel, S, T>(g, near, rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]),
-                                 T(low_pass_of(listed)), T(gs), T(gu), T(gv), T(gz), d, ddx, ddy);
+                                 T(listed), T(gs), T(gu), T(gv), T(gz), d, ddx, ddy);
       ax += abs_(ddx), ay += abs_(ddy);
     }
   }

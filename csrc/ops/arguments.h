@@ -50,18 +50,43 @@ struct FragmentArrays {
 
 inline int64_t tiles_of(int width, int height) { return int64_t(tiles_across(width)) * tiles_across(height); }
 
-// How kernels of the CPU find their way in a fragment list: where each tile's begin. CUDA's have `Pairs`.
+// Where the parts of a list begin.
 struct TileStarts {
   const int64_t* start;  // [tiles + 1]
   int64_t tiles, fragments;
-  static constexpr int64_t pairs = 0;  // of surfel and tile: not kept
-  bool fits(int64_t, int width, int height) const { return tiles == tiles_of(width, height); }
 };
 template <class R>
 void take(R& r, const char* name, TileStarts& to) {
   r.rows(name, to.start, to.tiles, 1);
   if (--to.tiles < 0 || to.start[0] != 0) r.refuse("the tiles' starts begin with 0");
   to.fragments = to.start[to.tiles];
+}
+
+// How kernels of the CPU find their way in a fragment list. In a tile fragments are ordered front to back by surfel,
+// and those of a surfel by packs of 4 x 4 pixels (cpu/packs.h). CUDA's have `Pairs`.
+struct TilePacks {
+  const int64_t* start;       // [tiles + 1] where each tile's fragments begin
+  const int64_t* pack_start;  // [tiles + 1] and where its packs do
+  const int32_t* packs;       // [count, 2] what a pack has of a surfel, see PackPart
+  int64_t tiles, count, fragments;
+  static constexpr int64_t pairs = 0;  // of surfel and tile: not kept
+  bool fits(int64_t, int width, int height) const { return tiles == tiles_of(width, height); }
+
+  template <class R>
+  void fields(R& r) {
+    TileStarts of = {};
+    take(r, "tile_start", of);
+    start = of.start, tiles = of.tiles, fragments = of.fragments;
+    r.array("pack_start", pack_start, tiles + 1);
+    r.rows("packs", packs, count, 2);
+    if (pack_start[0] != 0 || pack_start[tiles] != count) r.refuse("the packs do not belong to these tiles");
+  }
+};
+template <class R>
+void take(R& r, const char* name, TilePacks& to) {
+  const TilePacks* given = nullptr;
+  r.object(name, given);
+  to = *given;
 }
 
 // A fragment list with what finds its way in it.

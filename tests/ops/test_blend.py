@@ -137,8 +137,7 @@ def test_the_golden_image_and_the_gradients_of_its_texels() -> None:
 
 
 @pytest.mark.parametrize("textured", [False, True], ids=["surfels", "texels"])
-def test_threads_change_no_more_than_the_order_of_sums(textured: bool) -> None:
-    """Not even that where there are texels."""
+def test_threads_do_not_change_the_sums(textured: bool) -> None:
     view = View(random_scene(300, 3, width=150, height=90), torch.float32, textured)
     with torch.no_grad():
         fragments, projection = view.fragments()
@@ -151,10 +150,7 @@ def test_threads_change_no_more_than_the_order_of_sums(textured: bool) -> None:
         results.append([image, *torch.autograd.grad(image.square().sum(), leaves)])
     backend.module(torch.device("cpu")).set_num_threads(0)
     for other in results[1:]:
-        assert torch.equal(other[0], results[0][0])
-        for a, b in zip(other, results[0], strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
-            assert not textured or torch.equal(a, b)
+        assert all(torch.equal(a, b) for a, b in zip(other, results[0], strict=True))
 
 
 @pytest.mark.parametrize("textured", [False, True], ids=["surfels", "texels"])

@@ -1,0 +1,75 @@
+"""What a list of the CPU kernels says of packs of 4 x 4 pixels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bitymi_ns import ops
+from bitymi_ns.ops.backend import kernel_class, module
+from bitymi_ns.ops.constants import TILE
+from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
+
+
+def packs_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
+    """The list of a view and the arrays of its layout, by name."""
+    geom = projection.geom
+    tracer = kernel_class("Trace", geom)()
+    n = tracer.run(**projection.view(geom), most=0)
+    new, ints = geom.new_empty, torch.int32
+    found = {"surfel": torch.empty(n, dtype=ints), "pixel": torch.empty(n, dtype=ints), "uv": new(2, n)}
+    found |= {name: new(n) for name in ("weight", "depth", "sigma")}
+    starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
+    packs = torch.empty(tracer.packs, 2, dtype=ints)
+    tracer.copy(**found, **starts, packs=packs)
+    return {**found, **starts, "packs": packs}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("width", "height", "surfels", "seed"), [(64, 48, 80, 1), (83, 37, 200, 2), (5, 3, 9, 3)])
+def test_packs_say_whose_fragments_are_and_where(
+    width: int, height: int, surfels: int, seed: int, dtype: torch.dtype
+) -> None:
+    case = random_scene(surfels, seed, width=width, height=height)
+    camera = camera_of(case, dtype)
+    case.params["log_scales"][::3, 0] -= 3  # needles
+    projection = ops.project(*(case.params[key].to(dtype) for key in SURFEL_KEYS), camera)
+    found = packs_of(projection)
+    across = -(-width // TILE)
+    surfel, pixel, packs_before = [], [], set()
+    for tile, (first, last) in enumerate(zip(found["pack_start"][:-1], found["pack_start"][1:], strict=True)):
+        assert len(surfel) == found["tile_start"][tile]
+        packs_before.clear()
+        for code, owner in found["packs"][first:last].tolist():
+            lanes, pack = code & 0xFFFF, code >> 16
+            assert lanes and 0 <= pack < 16 and (owner, pack) not in packs_before
+            packs_before.add((owner, pack))
+            for lane in range(16):
+                if not lanes >> lane & 1:
+                    continue
+                x = tile % across * TILE + pack % 4 * 4 + lane % 4
+                y = tile // across * TILE + pack // 4 * 4 + lane // 4
+                assert x < width and y < height
+                surfel.append(owner)
+                pixel.append(y * width + x)
+        owners = [owner for _, owner in found["packs"][first:last].tolist()]
+        runs = [owner for k, owner in enumerate(owners) if k == 0 or owners[k - 1] != owner]
+        assert len(runs) == len(set(runs))
+    assert len(surfel) == found["tile_start"][-1] > 0
+    assert surfel == found["surfel"].tolist() and pixel == found["pixel"].tolist()
+    fragments = ops.trace(projection)
+    for name in ("surfel", "pixel", "weight", "uv", "depth", "sigma", "tile_start"):
+        assert torch.equal(getattr(fragments, name), found[name])
+
+
+def test_a_layout_that_does_not_fit_is_refused() -> None:
+    make = module(torch.device("cpu")).TilePacks
+    starts, packs = torch.tensor([0, 3, 4]), torch.tensor([[0b111, 0], [1, 1]], dtype=torch.int32)
+    pack_starts = torch.tensor([0, 1, 2])
+    make(tile_start=starts, pack_start=pack_starts, packs=packs)
+    with pytest.raises(ValueError, match="begin with 0"):
+        make(tile_start=starts + 1, pack_start=pack_starts, packs=packs)
+    with pytest.raises(ValueError, match="do not belong"):
+        make(tile_start=starts, pack_start=pack_starts, packs=packs[:1])
+    with pytest.raises(ValueError, match="pack_start has 2 elements"):
+        make(tile_start=starts, pack_start=pack_starts[:2], packs=packs)

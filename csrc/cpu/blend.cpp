@@ -32,7 +32,9 @@ class SurfelRun {
   const TexelPatch<S> patch;
   const P beta, normal[3];
 
-  SurfelRun(const Blended<S>& of, const PackRun& run) : SurfelRun(of, run, of.geom + int64_t(run.surfel) * kGeom) {}
+  // `ask`: for its texels at once, some time before they are wanted.
+  SurfelRun(const Blended<S>& of, const PackRun& run, bool ask)
+      : SurfelRun(of, run, ask, of.geom + int64_t(run.surfel) * kGeom) {}
   SurfelRun(const SurfelRun&) = delete;
 
   const PatchFragments<S>& few() const { return few_; }
@@ -61,7 +63,7 @@ class SurfelRun {
   }
 
  private:
-  SurfelRun(const Blended<S>& of, const PackRun& run, const S* g)
+  SurfelRun(const Blended<S>& of, const PackRun& run, bool ask, const S* g)
       : run(run),
         patch(of.table, run.surfel),
         beta(g[kBeta]),
@@ -74,7 +76,7 @@ class SurfelRun {
       const uint32_t lanes = textured(part, expand(f.weight + at, part.lanes));
       if (!lanes) return;
       few_.look(int(k - run.first) * kLanes, expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
-      each_of(lanes, k, [&](int, int j) { few_.ask(j); });
+      if (ask) each_of(lanes, k, [&](int, int j) { few_.ask(j); });
     });
   }
 
@@ -97,7 +99,7 @@ BT_HD void each_surfel_run(const Blended<S>& of, const std::vector<PackRun>& run
   std::optional<SurfelRun<S>> two[2];
   for (int64_t r = 0; r <= n; ++r) {
     if (r + 4 < n) ask_for_surfel(of, runs[r + 4].surfel);
-    if (r < n) two[r & 1].emplace(of, runs[r]);
+    if (r < n) two[r & 1].emplace(of, runs[r], true);
     if (r > 0) fn(*two[(r - 1) & 1]);
   }
 }
@@ -252,7 +254,8 @@ void backward(const Backward<S>& a) {
     Sums<S> sums;
     for (int64_t r = first; r < last; ++r) {
       ask_for_next(a, dimage, listed, order, r);
-      run_backward<kMaps>(a, dimage, SurfelRun<S>(a.of, listed.run[order[r]]), area ? own.data() : nullptr, sums);
+      run_backward<kMaps>(a, dimage, SurfelRun<S>(a.of, listed.run[order[r]], false), area ? own.data() : nullptr,
+                          sums);
     }
     surfel_backward(a, id, sums);
     if (a.dtexels)

@@ -105,7 +105,7 @@ void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, in
     const PackPart part(packs + 2 * k);
     const int32_t first = corner + pack_row(part.pack) * width + pack_column(part.pack);
     compress_only(pixel, in_pack + first, part.lanes);
-    std::fill_n(surfel, part.count(), part.surfel);
+    compress_only(surfel, all_lanes<Whole>(part.surfel), part.lanes);
     surfel += part.count(), pixel += part.count();
   }
 }

@@ -40,13 +40,11 @@ from gpu_common import (
 from bitymi_ns.bake.packing import pack
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.baked_cuda import Stage
-from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
-EARLY = 2e-3
-"""Transmittance at which a pixel that is drawn for speed takes no more light."""
 TIMED = ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")
 """What `measured` times, in the order of the columns from "prepare ms" on."""
 HEADER = (
@@ -136,7 +134,7 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
     sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
-    ending = replace(scene, transmittance_min=EARLY)
+    ending = replace(scene, transmittance_min=FAST)
     for camera in cameras:
         sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
         frame = BakedRenderer(scene, width, height)

@@ -17,7 +17,7 @@ from bitymi_ns.host.device import kernel_device
 from bitymi_ns.host.errors import fail
 from bitymi_ns.host.surfel_model import SurfelModel
 from bitymi_ns.ops import webgpu
-from bitymi_ns.scene.baked import BakedOutput
+from bitymi_ns.scene.baked import FAST, BakedOutput
 from bitymi_ns.scene.camera import Camera
 
 RENDERER = "BITYMI_RENDERER"
@@ -34,8 +34,9 @@ class BakedModelConfig(ModelConfig):
     """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the scene."""
-    renderer: Literal["kernels", "webgpu"] = "kernels"
-    """kernels: on CUDA or the CPU; webgpu: on graphics of any maker, which needs the package wgpu."""
+    renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
+    """kernels: on CUDA or the CPU; fast: the same, and a pixel ends where less than half of an 8-bit step of light is
+    left; webgpu: on graphics of any maker, which needs the package wgpu."""
 
 
 class BakedModel(SurfelModel):
@@ -45,7 +46,8 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder, through_webgpu = Path(self.config.bundle), self._asks_for_webgpu()
+        folder, renderer = Path(self.config.bundle), self._renderer()
+        through_webgpu = renderer == "webgpu"
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
             bundle = read_bundle(folder, decode=not on_card)
@@ -56,19 +58,21 @@ class BakedModel(SurfelModel):
         self._bundle_bytes = download_bytes(folder, bundle.info)
         self._scene = bundle.scene
         self._scene.through_webgpu = through_webgpu
+        if renderer == "fast":
+            self._scene.transmittance_min = FAST
         self._count = len(bundle)
 
-    def _asks_for_webgpu(self) -> bool:
-        """Whether WebGPU is asked for; stops where it is not there."""
+    def _renderer(self) -> str:
+        """The renderer that is asked for; stops where there is none of that name, or no WebGPU."""
         asked = os.environ.get(RENDERER) or self.config.renderer
-        if asked not in ("kernels", "webgpu"):
-            fail(f"{RENDERER} must be kernels or webgpu, not {asked!r}")
+        if asked not in ("kernels", "fast", "webgpu"):
+            fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
         if asked == "webgpu":
             try:
                 webgpu.require()
             except webgpu.WebGpuUnavailable as error:
                 fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
-        return asked == "webgpu"
+        return asked
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)

@@ -42,6 +42,7 @@ class Fragments:
         width, height: of the image, pixels.
         layout: how kernels find their way in the list: a handle on what packs of 4 x 4 pixels have of each surfel for
             those of the CPU (csrc/cpu/packs.h), on the pairs of surfel and tile for those of CUDA (csrc/cuda/pairs.h).
+            It says anew whose the fragments are and where: `surfel` and `pixel` are not to be replaced.
         surfels: number N of rows of the projection that they belong to.
     """
 

@@ -16,6 +16,9 @@ from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 from .camera import Camera
 from .sampling import Sampling, averaged, sampling_of, size_of
 
+FAST = 1 / 512
+"""Transmittance at which a pixel ends that is drawn for speed: half of an 8-bit step of light is left."""
+
 
 @dataclass
 class BakedOutput:
@@ -48,8 +51,9 @@ class BakedScene:
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
         prefilter: low_pass or pixel, as in `SceneConfig`.
-        transmittance_min: a surfel that would leave a pixel less transmittance is not blended and ends the pixel, as in
-            training; 0 = every surfel is blended.
+        transmittance_min: a surfel that would leave a pixel less transmittance ends the pixel; 0 = every surfel is
+            blended. As in training 1e-4, where that surfel is not blended itself. `FAST` for speed: what is then left
+            out cannot change a pixel by more than half an 8-bit step. WebGPU always ends pixels at 1e-4.
         photographed: [P, 4] float32 on the CPU, points of the scene, and with how many pixels per unit of length they
             were photographed: by these a view is drawn for its size (`sampling.py`); None = every view is drawn as one
             of the photographs' size.

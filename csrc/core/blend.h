@@ -19,8 +19,8 @@ BT_HD Blend<T> blend(T sigma, T transmittance) {
   return {weight, transmittance - weight};
 }
 
-// Which of the open pixels take the fragment. One that would leave a pixel less than `stop` is not blended and ends the
-// pixel: it takes no more light.
+// Which of the open pixels take the fragment, and which it ends, as it would leave them less than `stop`: they take no
+// more light. One that would leave less than kTransmittanceMin is not blended itself, unless `stop` is below that.
 template <class T>
 struct BlendTest {
   MaskOf<T> takes, ends;
@@ -29,7 +29,7 @@ template <class T>
 BT_HD BlendTest<T> blend_test(MaskOf<T> open, T sigma, T behind, T stop) {
   const MaskOf<T> covers = open & (sigma >= T(kAlphaMin));
   BlendTest<T> v;
-  v.takes = covers & (behind >= stop);
+  v.takes = covers & (behind >= min_(stop, T(kTransmittanceMin)));
   v.ends = covers & (behind < stop);
   return v;
 }

@@ -242,16 +242,11 @@ void baked_forward(const BakedForward<S>& a) {
           },
           sharp);
     }
-    for (int pack = 0; pack < kPacks; ++pack)
-      for (int lane = 0; lane < kLanes; ++lane) {
-        const int x = tx * kTile + pack_column(pack) + lane % kPackSide;
-        const int y = ty * kTile + pack_row(pack) + lane / kPackSide;
-        if (x >= width || y >= height) continue;
-        const int64_t pixel = int64_t(y) * width + x;
-        S* to = image + pixel * channels;
-        for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
-        if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][pack][lane]);
-      }
+    each_pixel(tile, width, height, [&](int64_t pixel, int pack, int lane) {
+      S* to = image + pixel * channels;
+      for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
+      if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][pack][lane]);
+    });
   };
   const std::unique_ptr<Binner<S>> lists = binner(a.view, *a.bins);
   run_together([&](const Member& m) {

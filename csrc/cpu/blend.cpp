@@ -2,6 +2,7 @@
 // and their gradients are never listed. A pack at a time; texels fragment by fragment.
 #include "ops/blend.h"
 
+#include <numeric>
 #include <optional>
 
 #include "cpu/kernels.h"
@@ -50,8 +51,8 @@ class SurfelRun {
       fn(lane, int(k - run.first) * kLanes + lane);
     }
   }
-  // The colours of pack k's fragments.
-  BT_HD void colors(uint32_t textured, int64_t k, P* to) const {
+  // The colours of pack k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
+  BT_HD void colors(const PackPart& part, uint32_t textured, int64_t k, P* to) const {
     const Four<S> view(patch.view, S(1));
     P r(view.v[0]), g(view.v[1]), b(view.v[2]);
     each_of(textured, k, [&](int lane, int j) {
@@ -59,7 +60,9 @@ class SurfelRun {
       const auto here = mask_of<S>(1u << lane);  // through memory the vector would wait for its lanes
       r = select(here, P(color.v[0]), r), g = select(here, P(color.v[1]), g), b = select(here, P(color.v[2]), b);
     });
-    to[0] = r, to[1] = g, to[2] = b;
+    const auto there = mask_of<S>(part.lanes);
+    const P none = P(S(0));
+    to[0] = select(there, r, none), to[1] = select(there, g, none), to[2] = select(there, b, none);
   }
 
  private:
@@ -121,7 +124,7 @@ void forward(const Forward<S>& a) {
         each_pack(layout, surfel.run, [&](int64_t k, int64_t at, const PackPart& part) {
           const P weight = expand(f.weight + at, part.lanes);
           P colors[3];
-          surfel.colors(surfel.textured(part, weight), k, colors);
+          surfel.colors(part, surfel.textured(part, weight), k, colors);
           const P depth = kMaps ? expand(f.depth + at, part.lanes) : P(S(0));
           add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.pack]);
         });
@@ -133,18 +136,18 @@ void forward(const Forward<S>& a) {
   });
 }
 
-// What the fragments of a surfel add to its gradients: view colour and beta, and the normal with maps.
-template <class S>
+// What fragments of a surfel add to its gradients: view colour and beta, and the normal with maps.
+template <class T>
 struct Sums {
-  Pack<S> view[3], beta, normal[3];
-  Sums() : beta(S(0)) { std::fill(view, view + 3, beta), std::fill(normal, normal + 3, beta); }
+  T view[3], beta, normal[3];
+  Sums() : beta(T(0.0f)) { std::fill(view, view + 3, beta), std::fill(normal, normal + 3, beta); }
 };
 
 // The gradients of the fragments of a run. `rows`: gradients of the surfel's texels, rows of four; null: there are
 // none.
 template <bool kMaps, class S>
 void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage, const SurfelRun<S>& surfel,
-                  S* rows, Sums<S>& sums) {
+                  S* rows, Sums<Pack<S>>& sums) {
   using P = Pack<S>;
   constexpr int channels = kChannels<kMaps>;
   const FragmentArrays<S>& f = a.of.fragments.f;
@@ -156,7 +159,7 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
     for (int c = 0; c < channels; ++c)
       d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.pack) + c * kLanes), zero);
     const uint32_t textured = surfel.textured(part, weight);
-    surfel.colors(textured, pack, colors);
+    surfel.colors(part, textured, pack, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
     compress_only(a.dweight + at, weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
     for (int k = 0; k < 3; ++k) {
@@ -188,27 +191,65 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
   });
 }
 
+// The lanes added up.
+template <bool kMaps, class S>
+Sums<S> total(const Sums<Pack<S>>& of) {
+  Sums<S> all;
+  for (int k = 0; k < 3; ++k) {
+    all.view[k] = sum(of.view[k]);
+    if constexpr (kMaps) all.normal[k] = sum(of.normal[k]);
+  }
+  all.beta = sum(of.beta);
+  return all;
+}
+template <class S>
+void add(const Sums<S>& one, Sums<S>& to) {
+  for (int k = 0; k < 3; ++k) to.view[k] += one.view[k], to.normal[k] += one.normal[k];
+  to.beta += one.beta;
+}
 // Writes the gradients of a surfel.
 template <class S>
 void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
-  const Vec3<S> view = {sum(sums.view[0]), sum(sums.view[1]), sum(sums.view[2])};
-  store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), view));
+  store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), load3(sums.view)));
   S* dgeom = a.dgeom + id * kGeom;
-  dgeom[kBeta] = sum(sums.beta);
-  for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sum(sums.normal[k]);
+  dgeom[kBeta] = sums.beta;
+  for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sums.normal[k];
 }
 
 // All runs of a list, in its order.
-struct ListedRuns {
-  std::vector<PackRun> run;
-
+class ListedRuns {
+ public:
   explicit ListedRuns(const TilePacks& layout) {
-    for (int64_t tile = 0; tile < layout.tiles; ++tile)
-      each_run(layout, tile, [&](const PackRun& r) { run.push_back(r); });
+    std::vector<int64_t> before(layout.tiles + 1, 0);  // runs of earlier tiles
+    const auto each_tile = [&](auto&& fn) {
+      parallel_tiles(layout.pack_start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
+        for (int64_t tile = first; tile < last; ++tile) fn(tile);
+      });
+    };
+    each_tile([&](int64_t tile) { each_run(layout, tile, [&](const PackRun&) { ++before[tile + 1]; }); });
+    std::partial_sum(before.begin(), before.end(), before.begin());
+    starts_.resize(before.back() + 1);
+    each_tile([&](int64_t tile) {
+      Start* to = starts_.data() + before[tile];
+      each_run(layout, tile, [&](const PackRun& run) { *to++ = {run.tile, run.surfel, run.begin, run.first}; });
+    });
+    starts_.back() = {0, 0, layout.fragments, layout.count};
   }
-  int64_t count() const { return int64_t(run.size()); }
-  int32_t surfel(int64_t r) const { return run[r].surfel; }
-  int64_t length(int64_t r) const { return run[r].end - run[r].begin; }
+  int64_t count() const { return int64_t(starts_.size()) - 1; }
+  int32_t surfel(int64_t r) const { return starts_[r].surfel; }
+  int64_t length(int64_t r) const { return starts_[r + 1].begin - starts_[r].begin; }
+  PackRun run(int64_t r) const {
+    const Start *s = &starts_[r], *next = s + 1;
+    return {s->tile, s->surfel, s->begin, next->begin, s->first, next->first};
+  }
+  BT_HD void ask(int64_t r) const { __builtin_prefetch(&starts_[r]); }
+
+ private:
+  struct Start {
+    int32_t tile, surfel;
+    int64_t begin, first;
+  };
+  std::vector<Start> starts_;  // [runs + 1]
 };
 
 // Asks for what the runs after run k of `order` read: they lie all over the list, and waiting for them would take most
@@ -219,23 +260,62 @@ BT_HD void ask_for_next(const Backward<S>& a, const PackedPicture<S, channels>& 
                         const std::vector<int64_t>& order, int64_t k) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   constexpr int64_t line = 64 / sizeof(S);
-  const auto run = [&](int64_t ahead) -> const PackRun& {
-    return listed.run[order[std::min(k + ahead, int64_t(order.size()) - 1)]];
-  };
-  __builtin_prefetch(&run(8));
-  const PackRun& next = run(3);
+  const auto ahead = [&](int64_t by) { return order[std::min(k + by, int64_t(order.size()) - 1)]; };
+  listed.ask(ahead(8));
+  const PackRun next = listed.run(ahead(3));
   __builtin_prefetch(a.of.fragments.layout.packs + 2 * next.first);
   for (int64_t i = next.begin; i < next.end; i += line) {
     __builtin_prefetch(f.weight + i), __builtin_prefetch(f.uv + i), __builtin_prefetch(f.uv + f.total + i);
   }
-  const PackRun& soon = run(1);
+  const PackRun soon = listed.run(ahead(1));
   for (int64_t p = soon.first; p < soon.last; ++p) {
     const S* numbers = dimage.numbers(soon.tile, PackPart(a.of.fragments.layout, p).pack);
     for (int64_t i = 0; i < channels * kLanes; i += line) __builtin_prefetch(numbers + i);
   }
 }
 
-// Surfel after surfel: a thread adds to what surfels of its own have.
+// Surfel after surfel: a thread adds to the texels of its own. Also where they do not learn, so that the gradients of
+// the surfels are the same.
+template <bool kMaps, class S>
+void backward_by_surfel(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage,
+                        const ListedRuns& listed, const std::vector<int64_t>& order) {
+  for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
+    const int64_t id = listed.surfel(order[first]);
+    const TexelPatch<S> patch(a.of.table, id);
+    thread_local std::vector<S> own;  // gradients of the texels, rows of four
+    const int64_t area = a.sums_texels() ? int64_t(patch.size[0]) * patch.size[1] : 0;
+    own.assign(4 * area, S(0));
+    Sums<Pack<S>> sums;
+    for (int64_t k = first; k < last; ++k) {
+      ask_for_next(a, dimage, listed, order, k);
+      const SurfelRun<S> surfel(a.of, listed.run(order[k]), false);
+      run_backward<kMaps>(a, dimage, surfel, area ? own.data() : nullptr, sums);
+    }
+    surfel_backward(a, id, total<kMaps>(sums));
+    if (a.dtexels)
+      for (int64_t t = 0; t < area; ++t) store3(a.dtexels + 3 * (patch.first + t), load3(own.data() + 4 * t));
+    if (a.moved) move_texels(a.moved + 3 * patch.first, own.data(), 4, a.rate, a.share + patch.first, area);
+  });
+}
+// Run after run, which is faster where there are no texels: what a pass reads follows each other.
+template <bool kMaps, class S>
+void backward_by_run(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
+                     const std::vector<int64_t>& order) {
+  std::vector<Sums<S>> of_run(listed.count());
+  parallel_parts(listed.count(), 64, [&](int, int64_t begin, int64_t end) {
+    for (int64_t r = begin; r < end; ++r) {
+      Sums<Pack<S>> sums;
+      run_backward<kMaps, S>(a, dimage, SurfelRun<S>(a.of, listed.run(r), false), nullptr, sums);
+      of_run[r] = total<kMaps>(sums);
+    }
+  });
+  for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
+    Sums<S> sums;
+    for (int64_t k = first; k < last; ++k) add(of_run[order[k]], sums);
+    surfel_backward(a, listed.surfel(order[first]), sums);
+  });
+}
+
 template <bool kMaps, class S>
 void backward(const Backward<S>& a) {
   const TexelTiles<S>& table = a.of.table;
@@ -245,23 +325,7 @@ void backward(const Backward<S>& a) {
   const PackedPicture<S, kChannels<kMaps>> dimage(a.dimage, a.of.width, a.of.height);
   const ListedRuns listed(a.of.fragments.layout);
   const std::vector<int64_t> order = by_surfel(listed, table.n);
-  for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
-    const int64_t id = listed.surfel(order[first]);
-    const TexelPatch<S> patch(table, id);
-    thread_local std::vector<S> own;  // gradients of the texels, rows of four
-    const int64_t area = a.sums_texels() ? int64_t(patch.size[0]) * patch.size[1] : 0;
-    own.assign(4 * area, S(0));
-    Sums<S> sums;
-    for (int64_t r = first; r < last; ++r) {
-      ask_for_next(a, dimage, listed, order, r);
-      run_backward<kMaps>(a, dimage, SurfelRun<S>(a.of, listed.run[order[r]], false), area ? own.data() : nullptr,
-                          sums);
-    }
-    surfel_backward(a, id, sums);
-    if (a.dtexels)
-      for (int64_t t = 0; t < area; ++t) store3(a.dtexels + 3 * (patch.first + t), load3(own.data() + 4 * t));
-    if (a.moved) move_texels(a.moved + 3 * patch.first, own.data(), 4, a.rate, a.share + patch.first, area);
-  });
+  (table.texels ? backward_by_surfel<kMaps, S> : backward_by_run<kMaps, S>)(a, dimage, listed, order);
 }
 }  // namespace
 

@@ -14,7 +14,18 @@ static_assert(kPacks == kLanes && kPacksAcross == 4, "a bit and a lane for each 
 // A pack's first pixel in its tile.
 constexpr int pack_column(int pack) { return pack % kPacksAcross * kPackSide; }
 constexpr int pack_row(int pack) { return pack / kPacksAcross * kPackSide; }
-// The same as reals, which would else be converted for every pack that is drawn.
+// A pixel's place in its pack.
+constexpr int lane_column(int lane) { return lane % kPackSide; }
+constexpr int lane_row(int lane) { return lane / kPackSide; }
+// The centres of a pack's pixels, from its corner on.
+template <class S>
+struct PackCentres {
+  Pack<S> x, y;
+  PackCentres() {
+    for (int i = 0; i < kLanes; ++i) x.set(i, pixel_centre<S>(lane_column(i))), y.set(i, pixel_centre<S>(lane_row(i)));
+  }
+};
+// A pack's first pixel as reals, which would else be converted for every pack that is drawn.
 template <class S>
 struct PackOffsets {
   S column[kPacks] = {}, row[kPacks] = {};
@@ -84,7 +95,7 @@ BT_HD void each_pixel(int64_t tile, int width, int height, F&& fn) {
   const int x0 = int(tile % tiles_across(width)) * kTile, y0 = int(tile / tiles_across(width)) * kTile;
   for (int pack = 0; pack < kPacks; ++pack)
     for (int lane = 0; lane < kLanes; ++lane) {
-      const int x = x0 + pack_column(pack) + lane % kPackSide, y = y0 + pack_row(pack) + lane / kPackSide;
+      const int x = x0 + pack_column(pack) + lane_column(lane), y = y0 + pack_row(pack) + lane_row(lane);
       if (x < width && y < height) fn(int64_t(y) * width + x, pack, lane);
     }
 }

@@ -17,7 +17,6 @@ struct Four {
   template <class F, class = std::enable_if_t<std::is_floating_point_v<F> && !std::is_same_v<F, S>>>
   BT_HD explicit Four(F value) : Four(S(value)) {}
   BT_HD Four(Vec3<S> a, S last) : v{a.x, a.y, a.z, last} {}
-  BT_HD Vec3<S> three() const { return {v[0], v[1], v[2]}; }
   BT_HD static Four load(const S* p) {
     Four r;
     std::memcpy(&r.v, p, sizeof r.v);
@@ -51,10 +50,6 @@ BT_HD auto operator<(Four<S> a, Four<S> b) {
   return a.v < b.v;
 }
 template <class S>
-BT_HD auto operator>(Four<S> a, Four<S> b) {
-  return a.v > b.v;
-}
-template <class S>
 BT_HD Four<S> select(decltype(Quad<S>{} > Quad<S>{}) m, Four<S> yes, Four<S> no) {
   return m ? yes.v : no.v;
 }
@@ -63,11 +58,7 @@ BT_HD S dot(Four<S> a, Four<S> b) {
   const Quad<S> p = a.v * b.v;
   return (p[0] + p[2]) + (p[1] + p[3]);
 }
-template <class S>
-BT_HD Four<S> without_last(Four<S> a) {
-  a.v[3] = S(0);
-  return a;
-}
+
 // Up to so many fragments: those of a surfel in the packs of a tile.
 constexpr int kFew = kPacks * kLanes;
 

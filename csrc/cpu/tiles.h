@@ -45,10 +45,8 @@ struct TileState {
 
   TileState(int tile_x, int tile_y, int width, int height, S stop = S(kTransmittanceMin)) : stop(stop) {
     x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
-    for (int i = 0; i < kLanes; ++i) {
-      lane_x.set(i, pixel_centre<S>(i % kPackSide));
-      lane_y.set(i, pixel_centre<S>(i / kPackSide));
-    }
+    const PackCentres<S> centres;
+    lane_x = centres.x, lane_y = centres.y;
     for (int p = 0; p < kPacks; ++p) {
       transmittance[p] = P(S(1));
       const S column = kPackOffsets<S>.column[p], row = kPackOffsets<S>.row[p];

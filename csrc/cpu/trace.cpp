@@ -83,7 +83,7 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
     list.pack_start[t + 1] = list.pack_start[t] + list.pieces[t].packs;
   }
   list.total = list.tile_start[tiles], list.packs = list.pack_start[tiles];
-  if (most && list.total > most) list.blocks.clear();  // nothing will be copied
+  if (most && list.total > most) list.blocks.clear(), list.packs = 0;  // nothing will be copied
 }
 }  // namespace
 
@@ -99,7 +99,7 @@ namespace {
 void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, int32_t* surfel, int32_t* pixel) {
   using Whole = Wide<int32_t>;
   Whole in_pack;  // the pixels, from the first one on
-  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane / kPackSide * width + lane % kPackSide);
+  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane_row(lane) * width + lane_column(lane));
   const int32_t corner = int32_t(tile / tiles_across(width) * kTile * width + tile % tiles_across(width) * kTile);
   for (int64_t k = 0; k < count; ++k) {
     const PackPart part(packs + 2 * k);
@@ -167,9 +167,7 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
-  P lane_x, lane_y;  // pixel centres of a pack
-  for (int i = 0; i < kLanes; ++i)
-    lane_x.set(i, pixel_centre<S>(i % kPackSide)), lane_y.set(i, pixel_centre<S>(i / kPackSide));
+  const PackCentres<S> centres;
   const P zero = P(S(0));
   // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
@@ -183,7 +181,7 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
       each_run_back(layout, tile, [&](const PackRun& run) {
         const int64_t id = run.surfel;
         const S* g = geom + id * kGeom;
-        const P left = lane_x + P(x0 - g[kCx]), up = lane_y + P(y0 - g[kCy]);
+        const S cx = g[kCx] - x0, cy = g[kCy] - y0;
         P d[kGeom], ax = zero, ay = zero;
         for (int k = 0; k < kColumns; ++k) d[k] = zero;
         d[kArea] = zero;
@@ -192,7 +190,8 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
           const auto given = [&](const S* p) { return p ? expand(p + at, of.lanes) : zero; };
           const P listed = expand(f.sigma + at, of.lanes), sigma = abs_(listed);
           const P dsigma = blend_vjp(expand(f.weight + at, of.lanes), sigma, given(dweight), behind[of.pack]);
-          const P dx = left + P(kPackOffsets<S>.column[of.pack]), dy = up + P(kPackOffsets<S>.row[of.pack]);
+          const P dx = centres.x + P(kPackOffsets<S>.column[of.pack] - cx);
+          const P dy = centres.y + P(kPackOffsets<S>.row[of.pack] - cy);
           P ddx, ddy;
           fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
                                      select(there, dsigma, zero), given(duv), given(duv ? duv + total : nullptr),

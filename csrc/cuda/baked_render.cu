@@ -136,7 +136,8 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
     const float sigma = f[j].sigma.v;
     const Blend<float> b = bt::blend(sigma, p[j].transmittance);
     const BlendTest<float> v = blend_test(taken[j], sigma, b.behind, a.transmittance_min);
-    p[j].transmittance = v.takes ? b.behind : v.ends ? -p[j].transmittance : p[j].transmittance;
+    const float left = v.takes ? b.behind : p[j].transmittance;
+    p[j].transmittance = v.ends ? -left : left;
     weight[j] = v.takes ? b.weight : 0;
     taken[j] = v.takes;
     any |= taken[j];

@@ -30,7 +30,7 @@ struct Workspace {
   }
 };
 
-// The fragments of a view, ordered by tile, then front to back by surfel, then by pixel.
+// The fragments of a view, ordered by tile, then front to back by surfel, then as the layout says.
 template <class S>
 struct FragmentArrays {
   int64_t total;
@@ -62,8 +62,9 @@ void take(R& r, const char* name, TileStarts& to) {
   to.fragments = to.start[to.tiles];
 }
 
-// How kernels of the CPU find their way in a fragment list. In a tile fragments are ordered front to back by surfel,
-// and those of a surfel by packs of 4 x 4 pixels (cpu/packs.h). CUDA's have `Pairs`.
+// How kernels of the CPU find their way in a fragment list: those of a surfel in a tile are ordered by packs of 4 x 4
+// pixels (cpu/packs.h). Made by trace alone: that packs and fragments belong together is not looked at. CUDA's kernels
+// have `Pairs`.
 struct TilePacks {
   const int64_t* start;       // [tiles + 1] where each tile's fragments begin
   const int64_t* pack_start;  // [tiles + 1] and where its packs do

@@ -14,7 +14,7 @@ struct BakedResidual {
   const float* extent;         // [n] half side of the tile, scale units; null: kSupport everywhere
   const float* mean_residual;  // [n, 3], the residual of a surfel without a tile; null: 0
   float weight_bound;          // fragments of smaller weight get no residual
-  float transmittance_min;     // a surfel that would leave a pixel less is not blended and ends it; 0: all are
+  float transmittance_min;     // a surfel that would leave a pixel less ends it, see blend_test; 0: none does
 
   template <class R>
   void fields(R& r, int64_t n) {

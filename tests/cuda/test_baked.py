@@ -23,7 +23,7 @@ from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Stage, draws_blocks
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
-from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
@@ -213,6 +213,15 @@ def test_all_surfels_are_blended_without_a_least_transmittance(device: torch.dev
     check(scene, camera, device, cpu)
     deep = scene.to(device).render(camera, maps=True).overdraw
     assert deep.sum() > 1.5 * scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
+
+
+def test_pixels_that_end_early(device: torch.device, cpu) -> None:
+    case = random_scene(200, 10, width=20, height=16)
+    case.params["opacity_logits"] += 4.0
+    scene, camera = scene_of(case, transmittance_min=FAST), camera_of(case)
+    check(scene, camera, device, cpu)
+    ended = scene.to(device).render(camera, maps=True).overdraw
+    assert ended.sum() < scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
 
 
 def test_packed_image(device: torch.device) -> None:

@@ -18,9 +18,13 @@ from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.host import target
+from bitymi_ns.host.bundle_model import RENDERER
 from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
 from bitymi_ns.host.export import default_export
 from bitymi_ns.host.verify import check_run
+from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
+from bitymi_ns.scene.baked import FAST
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 
@@ -136,6 +140,18 @@ def test_texels_that_learned_in_training_become_the_atlas(
     exact = json.loads((tmp_path / "exact" / "bundle.json").read_text())["statistics"]
     assert exact["texels"]["kept"] == exact["texels"]["learned"] and "view_color" not in exact
     assert exact["held_out"]["psnr_baked_against_neural"] > 40
+
+
+def test_a_bundle_is_drawn_by_the_renderer_that_is_asked_for(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def least() -> float:
+        return eval_setup(copied / "config.yml")[1].model._scene.transmittance_min
+
+    assert least() == TRANSMITTANCE_MIN
+    monkeypatch.setenv(RENDERER, "fast")
+    assert least() == FAST
+    monkeypatch.setenv(RENDERER, "quick")
+    with pytest.raises(InputError, match="must be kernels, fast or webgpu, not 'quick'"):
+        least()
 
 
 def test_verify_compares_a_bundle_with_its_run(trained: BitymiTrainerConfig, copied: Path) -> None:

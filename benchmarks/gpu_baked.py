@@ -11,7 +11,7 @@ without, with n surfels of which v are visible, b pairs of surfel and tile, f fr
 
 On a card 3840 x 2160 is drawn in any case. "frame" is the three stages launched by the host, "graph" the same as a CUDA
 graph, "packed" that with 8 bits per channel instead of floats, "waited for" the time of a program that waits for
-each frame. "ends at 0.002" is the packed graph where a pixel takes no more light at that transmittance instead of 1e-4,
+each frame. "ends at 1/512" is the packed graph where a pixel takes no more light at that transmittance instead of 1e-4,
 which may change it by half an 8-bit step of the brightest colour; "differs" is by how much it does.
 """
 
@@ -59,7 +59,7 @@ HEADER = (
     "graph ms",
     "packed, graph ms",
     "packed, waited for ms",
-    "ends at 0.002, graph ms",
+    "ends at 1/512, graph ms",
     "differs, 8-bit steps",
     "frames/s",
     "G fragments/s",

@@ -40,9 +40,7 @@ class SurfelRun {
 
   const PatchFragments<S>& few() const { return few_; }
   // Those of pack k's fragments that show texels, by lane.
-  BT_HD uint32_t textured(const PackPart& part, P weight) const {
-    return patch.textured() ? part.lanes & bits(weight >= P(bound_)) : 0;
-  }
+  BT_HD uint32_t textured(int64_t k) const { return patch.textured() ? textured_[k - run.first] : 0; }
   // fn(lane, fragment of `few`) for some of pack k.
   template <class F>
   BT_HD void each_of(uint32_t lanes, int64_t k, F&& fn) const {
@@ -52,10 +50,10 @@ class SurfelRun {
     }
   }
   // The colours of pack k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
-  BT_HD void colors(const PackPart& part, uint32_t textured, int64_t k, P* to) const {
+  BT_HD void colors(const PackPart& part, int64_t k, P* to) const {
     const Four<S> view(patch.view, S(1));
     P r(view.v[0]), g(view.v[1]), b(view.v[2]);
-    each_of(textured, k, [&](int lane, int j) {
+    each_of(textured(k), k, [&](int lane, int j) {
       const Four<S> color = shaded(view, few_.residual(j));
       const auto here = mask_of<S>(1u << lane);  // through memory the vector would wait for its lanes
       r = select(here, P(color.v[0]), r), g = select(here, P(color.v[1]), g), b = select(here, P(color.v[2]), b);
@@ -71,19 +69,19 @@ class SurfelRun {
         patch(of.table, run.surfel),
         beta(g[kBeta]),
         normal{P(g[kNx]), P(g[kNx + 1]), P(g[kNx + 2])},
-        bound_(of.bound),
         few_(patch) {
     if (!patch.textured()) return;
     const FragmentArrays<S>& f = of.fragments.f;
     each_pack(of.fragments.layout, run, [&](int64_t k, int64_t at, const PackPart& part) {
-      const uint32_t lanes = textured(part, expand(f.weight + at, part.lanes));
+      const uint32_t lanes = part.lanes & bits(expand(f.weight + at, part.lanes) >= P(of.bound));
+      textured_[k - run.first] = lanes;
       if (!lanes) return;
       few_.look(int(k - run.first) * kLanes, expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
       if (ask) each_of(lanes, k, [&](int, int j) { few_.ask(j); });
     });
   }
 
-  const S bound_;
+  uint32_t textured_[kPacks];  // of each pack of the run; not written where the surfel has no texels
   PatchFragments<S> few_;
 };
 // Asks for what a SurfelRun reads of its surfel.
@@ -124,7 +122,7 @@ void forward(const Forward<S>& a) {
         each_pack(layout, surfel.run, [&](int64_t k, int64_t at, const PackPart& part) {
           const P weight = expand(f.weight + at, part.lanes);
           P colors[3];
-          surfel.colors(part, surfel.textured(part, weight), k, colors);
+          surfel.colors(part, k, colors);
           const P depth = kMaps ? expand(f.depth + at, part.lanes) : P(S(0));
           add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.pack]);
         });
@@ -158,8 +156,7 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
     P d[channels], colors[3], dcolors[3];
     for (int c = 0; c < channels; ++c)
       d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.pack) + c * kLanes), zero);
-    const uint32_t textured = surfel.textured(part, weight);
-    surfel.colors(part, textured, pack, colors);
+    surfel.colors(part, pack, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
     compress_only(a.dweight + at, weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
     for (int k = 0; k < 3; ++k) {
@@ -172,7 +169,7 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
     S du[kLanes] = {}, dv[kLanes] = {};
-    if (textured) {
+    if (const uint32_t textured = surfel.textured(pack)) {
       S rgb[3][kLanes];
       for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
       surfel.each_of(textured, pack, [&](int lane, int j) {

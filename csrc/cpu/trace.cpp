@@ -55,23 +55,20 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
     TileState<S> state(tx, ty, width, height);
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int32_t id = bins.surfels[k];
-      state.template blend<Kernel, true>(view, bins, id,
-                                         [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
-                                           const uint32_t lanes = bits(taken);
-                                           if (!keep) {
-                                             count += __builtin_popcount(lanes);
-                                             return;
-                                           }
-                                           const int64_t at = from + count;
-                                           const PackPart part(lanes, pack, id);
-                                           part.write(a.packs + 2 * (from_pack + packs++));
-                                           compress(&a.weight[at], weight, lanes);
-                                           compress(&a.u[at], f.u, lanes);
-                                           compress(&a.v[at], f.v, lanes);
-                                           compress(&a.depth[at], f.depth, lanes);
-                                           compress(&a.sigma[at], listed_sigma(f), lanes);
-                                           count += part.count();
-                                         });
+      const auto take = [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
+        const PackPart part(bits(taken), pack, id);
+        if (keep) {
+          const int64_t at = from + count;
+          part.write(a.packs + 2 * (from_pack + packs++));
+          compress(&a.weight[at], weight, part.lanes);
+          compress(&a.u[at], f.u, part.lanes);
+          compress(&a.v[at], f.v, part.lanes);
+          compress(&a.depth[at], f.depth, part.lanes);
+          compress(&a.sigma[at], listed_sigma(f), part.lanes);
+        }
+        count += part.count();
+      };
+      state.template blend<Kernel, true>(view, bins, id, take);
     }
     if (keep) a.used += count, a.used_packs += packs;
     found.fetch_add(count, std::memory_order_relaxed);

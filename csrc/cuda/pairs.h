@@ -57,12 +57,6 @@ struct Pairs {
     r.array("slot_start", slot_start, surfels + 1);
   }
 };
-template <class R>
-void take(R& r, const char* name, Pairs& to) {
-  const Pairs* given = nullptr;
-  r.object(name, given);
-  to = *given;
-}
 
 // Where a thread of a tile's block stands.
 struct TileThread {

@@ -83,9 +83,10 @@ struct TilePacks {
     if (pack_start[0] != 0 || pack_start[tiles] != count) r.refuse("the packs do not belong to these tiles");
   }
 };
-template <class R>
-void take(R& r, const char* name, TilePacks& to) {
-  const TilePacks* given = nullptr;
+// A layout that is an object of Python.
+template <class R, class Layout>
+void take(R& r, const char* name, Layout& to) {
+  const Layout* given = nullptr;
   r.object(name, given);
   to = *given;
 }

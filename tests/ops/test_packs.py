@@ -8,6 +8,7 @@ import torch
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import kernel_class, module
 from bitymi_ns.ops.constants import TILE
+from bitymi_ns.ops.fragment_list import empty_list
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
 
 
@@ -16,11 +17,9 @@ def packs_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
     geom = projection.geom
     tracer = kernel_class("Trace", geom)()
     n = tracer.run(**projection.view(geom), most=0)
-    new, ints = geom.new_empty, torch.int32
-    found = {"surfel": torch.empty(n, dtype=ints), "pixel": torch.empty(n, dtype=ints), "uv": new(2, n)}
-    found |= {name: new(n) for name in ("weight", "depth", "sigma")}
+    found = empty_list(geom, n)
     starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
-    packs = torch.empty(tracer.packs, 2, dtype=ints)
+    packs = torch.empty(tracer.packs, 2, dtype=torch.int32)
     tracer.copy(**found, **starts, packs=packs)
     return {**found, **starts, "packs": packs}
 

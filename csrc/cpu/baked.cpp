@@ -182,16 +182,7 @@ inline Texels<S> residual_of(const DrawnSurfel<S>& d, Pack<S> u, Pack<S> v, cons
   return t;
 }
 
-// Asks for what a surfel that comes soon is drawn from: a tile's list names surfels from all over the memory.
-constexpr int kAhead = 3;
-template <class S>
-void prefetch(const BakedForward<S>& a, const DrawnSurfel<S>* drawn, int64_t id) {
-  __builtin_prefetch(a.view.geom + id * kGeom);
-  __builtin_prefetch(a.view.radii + 2 * id);
-  __builtin_prefetch(a.bins->level.data() + 2 * id);
-  __builtin_prefetch(drawn + id);
-}
-// And later for its first texels.
+// Asks for a surfel's first texels.
 template <class S>
 void prefetch_texels(const DrawnSurfel<S>& d) {
   if (!d.level || d.level->bytes.empty()) return;
@@ -217,7 +208,10 @@ void baked_forward(const BakedForward<S>& a) {
     for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
       const int64_t id = bins.surfels[k];
-      if (k + kAhead < bins.start[tile + 1]) prefetch(a, drawn.get(), bins.surfels[k + kAhead]);
+      if (k + kAhead < bins.start[tile + 1]) {
+        prefetch(a.view, bins, bins.surfels[k + kAhead]);
+        __builtin_prefetch(drawn.get() + bins.surfels[k + kAhead]);
+      }
       if (k + 1 < bins.start[tile + 1]) prefetch_texels(drawn[bins.surfels[k + 1]]);
       const DrawnSurfel<S>& d = drawn[id];
       state.template blend<Kernel, kMaps>(

@@ -150,6 +150,7 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
   constexpr int channels = kChannels<kMaps>;
   const FragmentArrays<S>& f = a.of.fragments.f;
   const P zero = P(S(0));
+  const int64_t end = surfel.run.end;
   each_pack(a.of.fragments.layout, surfel.run, [&](int64_t pack, int64_t at, const PackPart& part) {
     const auto there = mask_of<S>(part.lanes);
     const P weight = expand(f.weight + at, part.lanes);
@@ -158,14 +159,15 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
       d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.pack) + c * kLanes), zero);
     surfel.colors(part, pack, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
-    compress_only(a.dweight + at, weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
+    compress_until(a.dweight + end, a.dweight + at,
+                   weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
     for (int k = 0; k < 3; ++k) {
       dcolors[k] = residual_gradient(colors[k], weight * d[k]);
       sums.view[k] += dcolors[k];
     }
     sums.beta += weight * d[4];
     if constexpr (kMaps) {
-      compress_only(a.ddepth + at, weight * d[5], part.lanes);
+      compress_until(a.ddepth + end, a.ddepth + at, weight * d[5], part.lanes);
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
     S du[kLanes] = {}, dv[kLanes] = {};
@@ -183,8 +185,8 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
       });
     }
     if (!a.duv) return;
-    compress_only(a.duv + at, load(du), part.lanes);
-    compress_only(a.duv + f.total + at, load(dv), part.lanes);
+    compress_until(a.duv + end, a.duv + at, load(du), part.lanes);
+    compress_until(a.duv + f.total + end, a.duv + f.total + at, load(dv), part.lanes);
   });
 }
 
@@ -261,8 +263,11 @@ BT_HD void ask_for_next(const Backward<S>& a, const PackedPicture<S, channels>& 
   listed.ask(ahead(8));
   const PackRun next = listed.run(ahead(3));
   __builtin_prefetch(a.of.fragments.layout.packs + 2 * next.first);
-  for (int64_t i = next.begin; i < next.end; i += line) {
-    __builtin_prefetch(f.weight + i), __builtin_prefetch(f.uv + i), __builtin_prefetch(f.uv + f.total + i);
+  for (int64_t i = next.begin; i < next.end + line - 1; i += line) {
+    const int64_t j = std::min(i, next.end - 1);
+    __builtin_prefetch(f.weight + j), __builtin_prefetch(f.uv + j), __builtin_prefetch(f.uv + f.total + j);
+    __builtin_prefetch(a.dweight + j, 1);
+    if (a.duv) __builtin_prefetch(a.duv + j, 1), __builtin_prefetch(a.duv + f.total + j, 1);
   }
   const PackRun soon = listed.run(ahead(1));
   for (int64_t p = soon.first; p < soon.last; ++p) {

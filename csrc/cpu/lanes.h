@@ -31,6 +31,9 @@ BT_HD __mmask16 first_lanes(uint32_t lanes) { return __mmask16((1u << __builtin_
 BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t lanes) {
   _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(lanes), (__m512)a));
 }
+BT_HD void compress_lanes(int32_t* to, const Vector<int32_t>& a, uint32_t lanes) {
+  _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(lanes), (__m512i)a));
+}
 // The same; what lies behind them in memory stays.
 BT_HD void compress_lanes_only(float* to, const Vector<float>& a, uint32_t lanes) {
   _mm512_mask_storeu_ps(to, first_lanes(lanes), _mm512_maskz_compress_ps(__mmask16(lanes), (__m512)a));
@@ -70,6 +73,9 @@ BT_HD __m256i lane_numbers(uint64_t order) { return _mm256_cvtepu8_epi32(_mm_cvt
 BT_HD __m256 permuted(__m256 a, uint64_t order) { return _mm256_permutevar8x32_ps(a, lane_numbers(order)); }
 BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t lanes) {
   _mm256_storeu_ps(to, permuted((__m256)a, kLaneOrder.number[lanes]));
+}
+BT_HD void compress_lanes(int32_t* to, const Vector<int32_t>& a, uint32_t lanes) {
+  compress_lanes((float*)to, (Vector<float>)a, lanes);
 }
 BT_HD void compress_lanes_only(float* to, const Vector<float>& a, uint32_t lanes) {
   _mm256_maskstore_ps(to, first_lanes(lanes), permuted((__m256)a, kLaneOrder.number[lanes]));

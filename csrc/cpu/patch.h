@@ -22,15 +22,6 @@ struct Four {
     std::memcpy(&r.v, p, sizeof r.v);
     return r;
   }
-  // Three numbers and a 0: what lies behind them is not read.
-  BT_HD static Four load_three(const S* p) {
-#if defined(__AVX__)
-    if constexpr (std::is_same_v<S, float>)
-      return {(Quad<S>)_mm_maskload_ps(p, _mm_setr_epi32(-1, -1, -1, 0))};
-    else
-#endif
-      return {load3(p), S(0)};
-  }
   BT_HD void store(S* p) const { std::memcpy(p, &v, sizeof v); }
 };
 template <class S>
@@ -117,12 +108,12 @@ class PatchFragments {
     add(above - right, at), add(right, at + across);
     add(below - below_right, at + down), add(below_right, at + down + across);
   }
-  // Its texels, each beside a 0.
+  // Its texels, each beside a number that counts for nothing; of one column what would be to its right is 0.
   BT_HD void texels(int j, Four<S>* to) const {
     const S* t = of_.tile + 3 * int64_t(first_[j]);
-    const int right = 3 * next_.right, down = 3 * next_.down;
-    to[0] = Four<S>::load_three(t), to[1] = Four<S>::load_three(t + right);
-    to[2] = Four<S>::load_three(t + down), to[3] = Four<S>::load_three(t + down + right);
+    const Oct<S> above = load_two(t, next_.right), below = load_two(t + 3 * next_.down, next_.right);
+    to[0] = half<0, Quad<S>>(above), to[1] = from_third<S>(above);
+    to[2] = half<0, Quad<S>>(below), to[3] = from_third<S>(below);
   }
   // The gradients of its coordinates; see texel_slopes.
   BT_HD S gradient_u(int j, const Four<S>* texels, Four<S> g) const {

@@ -182,19 +182,26 @@ BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) {
   return (V)_mm512_maskz_scalef_ps(kAll, (__m512)(f * p + 1.0f), (__m512)n);
 }
 #else
-BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) {
-  using V = Pack<float>::V;
-  using I = Pack<float>::I;
-  const I shifted = same_bits<I>(x.v) - 0x3f3504f3;
-  const V r = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3) - 1.0f, r2 = r * r;  // m - 1, m in [sqrt(1/2), sqrt(2))
-  const V low = (1.44269478f - 0.721357167f * r) + r2 * (0.480939448f - 0.360087216f * r);
-  const V high = (0.286707461f - 0.250069052f * r) + r2 * (0.23689033f - 0.145744368f * r);
-  const V a = larger(y.v * (convert<V>(shifted >> 23) + r * (low + (r2 * r2) * high)), Pack<float>(-126.0f).v);
-  const V magic = Pack<float>(12582912.0f).v, moved = a + magic;  // as in exp_
-  const V f = a - (moved - magic), f2 = f * f;
-  const V p = (0.693147004f + 0.240222424f * f) + f2 * ((5.55073358e-2f + 9.67151299e-3f * f) + f2 * 1.32647273e-3f);
-  return same_bits<V>(same_bits<I>(f * p + 1.0f) + (same_bits<I>(moved) << 23));
+// Half by half: both at once would not fit the registers.
+template <class V>
+BT_HD V power_of(const V& x, const V& y) {
+  if constexpr (is_two<V>) {
+    return {power_of(x.low, y.low), power_of(x.high, y.high)};
+  } else {
+    using I = Vector<int32_t>;
+    const I shifted = same_bits<I>(x) - 0x3f3504f3;
+    // the mantissa less one, in [sqrt(1/2), sqrt(2)) before
+    const V r = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3) - 1.0f, r2 = r * r;
+    const V low = (1.44269478f - 0.721357167f * r) + r2 * (0.480939448f - 0.360087216f * r);
+    const V high = (0.286707461f - 0.250069052f * r) + r2 * (0.23689033f - 0.145744368f * r);
+    const V a = larger(y * (convert<V>(shifted >> 23) + r * (low + (r2 * r2) * high)), all_lanes<V>(-126.0f));
+    const V magic = all_lanes<V>(12582912.0f), moved = a + magic;  // as in exp_
+    const V f = a - (moved - magic), f2 = f * f;
+    const V p = (0.693147004f + 0.240222424f * f) + f2 * ((5.55073358e-2f + 9.67151299e-3f * f) + f2 * 1.32647273e-3f);
+    return same_bits<V>(same_bits<I>(f * p + 1.0f) + (same_bits<I>(moved) << 23));
+  }
 }
+BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) { return power_of(x.v, y.v); }
 #endif
 BT_HD Pack<double> exp_(Pack<double> x) {
   Pack<double> r;
@@ -230,11 +237,17 @@ template <class S>
 BT_HD void compress(S* to, Pack<S> a, uint32_t lanes) {
   compress_lanes(to, a.v, lanes);
 }
+BT_HD void compress(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes(to, a, lanes); }
 template <class S>
 BT_HD void compress_only(S* to, Pack<S> a, uint32_t lanes) {
   compress_lanes_only(to, a.v, lanes);
 }
 BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes_only(to, a, lanes); }
+// The same where what lies up to `end` is written later: a masked store costs AMD's processors dozens of operations.
+template <class T, class V>
+BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
+  to + kLanes <= end ? compress(to, a, lanes) : compress_only(to, a, lanes);
+}
 template <class S>
 BT_HD Pack<S> expand(const S* from, uint32_t lanes) {
   Pack<S> r;

@@ -7,6 +7,15 @@
 
 namespace bt {
 
+// Asks for what a surfel that comes soon is found by: a tile's list names surfels from all over the memory.
+constexpr int kAhead = 3;
+template <class S>
+BT_HD void prefetch(const View<S>& view, const Bins& bins, int64_t id) {
+  __builtin_prefetch(view.geom + id * kGeom);
+  __builtin_prefetch(view.radii + 2 * id);
+  __builtin_prefetch(bins.level.data() + 2 * id);
+}
+
 // Of 16 cells of an image those with a pixel in the kernel's level set, and in the low pass's.
 struct Reached {
   uint32_t support, centre;

@@ -54,6 +54,7 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height);
     for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
+      if (k + kAhead < bins.start[tile + 1]) prefetch(view, bins, bins.surfels[k + kAhead]);
       const int32_t id = bins.surfels[k];
       const auto take = [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
         const PackPart part(bits(taken), pack, id);
@@ -93,7 +94,9 @@ void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
 
 namespace {
 // Whose the fragments of a tile are and where, by its packs; they begin at `surfel` and `pixel`.
-void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, int32_t* surfel, int32_t* pixel) {
+void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, int64_t fragments, int32_t* surfel,
+                int32_t* pixel) {
+  int32_t *surfels = surfel + fragments, *pixels = pixel + fragments;  // where they end
   using Whole = Wide<int32_t>;
   Whole in_pack;  // the pixels, from the first one on
   for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane_row(lane) * width + lane_column(lane));
@@ -101,8 +104,8 @@ void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, in
   for (int64_t k = 0; k < count; ++k) {
     const PackPart part(packs + 2 * k);
     const int32_t first = corner + pack_row(part.pack) * width + pack_column(part.pack);
-    compress_only(pixel, in_pack + first, part.lanes);
-    compress_only(surfel, all_lanes<Whole>(part.surfel), part.lanes);
+    compress_until(pixels, pixel, in_pack + first, part.lanes);
+    compress_until(surfels, surfel, all_lanes<Whole>(part.surfel), part.lanes);
     surfel += part.count(), pixel += part.count();
   }
 }
@@ -133,7 +136,8 @@ void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
       const auto& p = list.pieces[tiles[k][i]];
       const auto& block = list.blocks[p.thread][k];
       const int64_t to = list.tile_start[tiles[k][i]];
-      list_packs(block.packs + 2 * p.from_pack, p.packs, tiles[k][i], list.width, out.surfel + to, out.pixel + to);
+      list_packs(block.packs + 2 * p.from_pack, p.packs, tiles[k][i], list.width, p.count, out.surfel + to,
+                 out.pixel + to);
       std::copy_n(block.weight + p.from, p.count, out.weight + to);
       std::copy_n(block.u + p.from, p.count, out.uv + to);
       std::copy_n(block.v + p.from, p.count, out.uv + list.total + to);
@@ -166,6 +170,10 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const PackCentres<S> centres;
   const P zero = P(S(0));
+  // What is read, and how far ahead it is asked for: runs are read from the list's end, each from its start, which the
+  // processor does not foresee.
+  const S* columns[] = {f.sigma, f.weight, dweight, duv, duv ? duv + total : nullptr, ddepth};
+  constexpr int64_t kSoon = 256, kPacksSoon = 6;
   // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
   const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
@@ -176,7 +184,8 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
       P behind[kPacks];  // per pixel: sum of w dL/dw over the fragments behind
       std::fill(behind, behind + kPacks, zero);
       each_run_back(layout, tile, [&](const PackRun& run) {
-        const int64_t id = run.surfel;
+        const int64_t id = run.surfel, next = PackPart(layout, std::max<int64_t>(run.first - kPacksSoon, 0)).surfel;
+        __builtin_prefetch(geom + next * kGeom), __builtin_prefetch(sums.data() + next * kSums, 1);
         const S* g = geom + id * kGeom;
         const S cx = g[kCx] - x0, cy = g[kCy] - y0;
         P d[kGeom], ax = zero, ay = zero;
@@ -184,6 +193,9 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
         d[kArea] = zero;
         each_pack(layout, run, [&](int64_t, int64_t at, const PackPart& of) {
           const auto there = mask_of<S>(of.lanes);
+          const int64_t soon = std::max<int64_t>(at - kSoon, 0);
+          for (const S* p : columns)
+            if (p) __builtin_prefetch(p + soon);
           const auto given = [&](const S* p) { return p ? expand(p + at, of.lanes) : zero; };
           const P listed = expand(f.sigma + at, of.lanes), sigma = abs_(listed);
           const P dsigma = blend_vjp(expand(f.weight + at, of.lanes), sigma, given(dweight), behind[of.pack]);

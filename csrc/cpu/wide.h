@@ -59,6 +59,15 @@ using MaskOfDoubles = decltype(Vector<double>{} > Vector<double>{});
 template <class H>
 struct Two {
   H low, high;
+  Two() = default;
+  BT_HD Two(const H& low, const H& high) : low(low), high(high) {}
+  // Written out, so that copies are of whole vectors: the compiler's own go by smaller parts, for which loads of whole
+  // ones then wait.
+  BT_HD Two(const Two& o) : low(o.low), high(o.high) {}
+  BT_HD Two& operator=(const Two& o) {
+    low = o.low, high = o.high;
+    return *this;
+  }
   using Lane = std::remove_const_t<std::remove_reference_t<decltype(std::declval<const H&>()[0])>>;
   BT_HD Lane operator[](int i) const {
     Lane r;
@@ -191,9 +200,13 @@ BT_HD To convert(const V& v) {
 template <class To, class V>
 BT_HD To same_bits(const V& v) {
   static_assert(sizeof(To) == sizeof(V));
-  To r;
-  std::memcpy(&r, &v, sizeof r);
-  return r;
+  if constexpr (is_two<V>) {
+    return {same_bits<decltype(To::low)>(v.low), same_bits<decltype(To::high)>(v.high)};
+  } else {
+    To r;
+    std::memcpy(&r, &v, sizeof r);
+    return r;
+  }
 }
 template <class V, class T>
 BT_HD V all_lanes(T value) {

@@ -18,7 +18,7 @@ bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels
   project backward    350 n; 260 n
   view colour         (17 + 45 K) v; (28 K + 25) v
   view colour backw.  (25 + 75 K) v; (56 K + 40) v
-  trace               65 f + 80 v + v log2 v + 30 b; 84 f (written, then put in order) + 64 b + 16 v + 8 b
+  trace               65 f + 80 v + v log2 v + 30 b; 60 f (written, then put in order) + 64 b + 16 v + 8 b
   trace backward      140 f; 20 f + 176 r (row of geom, 14 sums read and written) + 176 n
   shade               6 f + (32 + 88 L + 512 + 32 L 4 + 128) t; 32 f + (44 + 128 L) t; 8 L t loads
                       88 L: cell, weights and interpolation; the rest: MLP of 4 L x 16 x 16 x 3
@@ -27,15 +27,15 @@ bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels
   shade backward      6 f + (the shading of t again + 96 + 80 + 1024 + 256 L + 64 L) t;
                       68 f + 36 n + (44 + 128 L + 256 L + 128 L + 128) t + T; 16 L t loads (half of them read-modify-
                       write; 128 L are indices and weights written and read again)
-  composite           9 f; 28 f + 40 p
-  composite backward  14 f; 52 f + 20 p + 96 n
-  blend               15 f; 16 f + 40 p
-  blend backward      20 f; 20 f + 20 p + 108 n
-  blend, texels       15 f + 45 t; 16 f + 56 t + 40 p
-  blend backward,     20 f + 110 t; 28 f + 104 t + 20 p + 108 n
+  composite           9 f; 21 f + 40 p (a pack of some ten fragments has 8 bytes, here and below)
+  composite backward  14 f; 45 f + 20 p + 96 n
+  blend               15 f; 5 f + 40 p
+  blend backward      20 f; 9 f + 20 p + 108 n
+  blend, texels       15 f + 45 t; 5 f + 56 t + 40 p
+  blend backward,     20 f + 110 t; 17 f + 104 t + 20 p + 108 n
     texels            (neighbouring texels are gathered from the cache, so loads are not counted)
   ssim                411 values (3 p) forward and backward; 88 bytes a value
-  baked render        project + view colour + trace, of which 65 f without the fragment list (no 84 f), and
+  baked render        project + view colour + trace, of which 65 f without the fragment list (no 60 f), and
                       10 f + 70 t; 16 t bytes of texels, 20 p, 12 b; 4 t loads
 """
 
@@ -112,7 +112,7 @@ class Sizes:
 
     def trace(self, fragment_list: bool = True) -> Work:
         sorting = self.v * math.log2(max(2, self.v))
-        listed = 84 * self.f if fragment_list else 0
+        listed = 60 * self.f if fragment_list else 0
         return Work(65 * self.f + 80 * self.v + sorting + 30 * self.b, listed + 72 * self.b + 16 * self.v)
 
     def trace_backward(self) -> Work:
@@ -136,16 +136,16 @@ class Sizes:
         )
 
     def composite(self) -> Work:
-        return Work(9 * self.f, 28 * self.f + 40 * self.p)
+        return Work(9 * self.f, 21 * self.f + 40 * self.p)
 
     def composite_backward(self) -> Work:
-        return Work(14 * self.f, 52 * self.f + 20 * self.p + 96 * self.n)
+        return Work(14 * self.f, 45 * self.f + 20 * self.p + 96 * self.n)
 
     def blend(self) -> Work:
-        return Work(15 * self.f, 16 * self.f + 40 * self.p)
+        return Work(15 * self.f, 5 * self.f + 40 * self.p)
 
     def blend_backward(self) -> Work:
-        return Work(20 * self.f, 20 * self.f + 20 * self.p + 108 * self.n)
+        return Work(20 * self.f, 9 * self.f + 20 * self.p + 108 * self.n)
 
     def blend_texels(self) -> Work:
         return self.blend() + Work(45 * self.t, 56 * self.t)

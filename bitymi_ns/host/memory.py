@@ -29,10 +29,10 @@ MARGIN = 1.1
 """Factor by which another view may have more fragments than the counted ones."""
 PROGRAM = 800e6
 """Bytes of Python, the libraries, and a capture's cameras and points."""
-PER_FRAGMENT = 44
+PER_FRAGMENT = 36
 """Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
-PER_SHADED_FRAGMENT = 24
-"""Bytes more where a field in space shades: colours, and their gradients."""
+PER_SHADED_FRAGMENT = 32
+"""Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
 PER_PIXEL = 400
 """Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
 PER_SURFEL = 3000

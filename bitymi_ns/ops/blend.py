@@ -12,7 +12,7 @@ from .composite import check_projection
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
 from .texel import TexelDescent, TexelTiles, backward_memory, check_texels
-from .trace import FRAGMENT, Fragments, by_name
+from .trace import Fragments
 
 
 @functools.lru_cache(maxsize=4)
@@ -25,19 +25,19 @@ def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTi
 class _BlendedImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, weight, depth, uv, geom, base, texels, fragments, tiles, bound, maps, descent):
-        g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays
+        g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays_for_layout
         view = {"maps": maps, "width": fragments.width, "height": fragments.height, "layout": fragments.layout}
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
         ctx.given = {**view, **tiles.arrays, "bound": bound}
-        kernel("blend_forward", geom)(**ctx.given, **by_name(arrays), geom=g, base=b, texels=t, image=image)
-        ctx.save_for_backward(g, b, t, *arrays)
-        ctx.descent = descent
+        kernel("blend_forward", geom)(**ctx.given, **arrays, geom=g, base=b, texels=t, image=image)
+        ctx.save_for_backward(g, b, t, *arrays.values())
+        ctx.descent, ctx.names = descent, tuple(arrays)
         return image
 
     @staticmethod
     def backward(ctx, dimage):
         geom, base, texels, *rest = ctx.saved_tensors
-        arrays = by_name(rest[: len(FRAGMENT)])
+        arrays = dict(zip(ctx.names, rest, strict=True))
         _, _, moves, _, _, learns, *_ = ctx.needs_input_grad
         out = {"dweight": torch.empty_like(arrays["weight"]), "dgeom": torch.empty_like(geom)}
         out |= {"dbase": torch.empty_like(base), "dtexels": torch.empty_like(texels) if learns else None}

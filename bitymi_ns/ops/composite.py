@@ -10,24 +10,25 @@ from torch import Tensor
 from .backend import cuda_backend, dense, kernel, on_same_device
 from .constants import BETA_MAX, IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
-from .trace import Fragments, by_name
+from .trace import Fragments
 
 
 class _CompositeImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, weight, depth, geom, colors, fragments, maps):
-        arrays = fragments.arrays
+        arrays = fragments.arrays_for_layout
         g, c = dense(geom, geom), dense(colors, geom)
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
         ctx.view = {"maps": maps, "width": fragments.width, "height": fragments.height, "layout": fragments.layout}
-        kernel("composite_forward", geom)(**ctx.view, **by_name(arrays), geom=g, colors=c, image=image)
-        ctx.save_for_backward(g, c, *arrays)
+        kernel("composite_forward", geom)(**ctx.view, **arrays, geom=g, colors=c, image=image)
+        ctx.save_for_backward(g, c, *arrays.values())
+        ctx.names = tuple(arrays)
         return image
 
     @staticmethod
     def backward(ctx, dimage):
         geom, colors, *rest = ctx.saved_tensors
-        arrays, maps = by_name(rest), ctx.view["maps"]
+        arrays, maps = dict(zip(ctx.names, rest, strict=True)), ctx.view["maps"]
         out = {"dweight": torch.empty_like(arrays["weight"])}
         out |= {"dcolors": torch.empty_like(colors), "dgeom": torch.empty_like(geom)}
         ddepth = torch.empty_like(arrays["depth"]) if maps else None

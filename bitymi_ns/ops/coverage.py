@@ -10,7 +10,7 @@ from torch import Tensor
 from .backend import cuda_backend, dense, kernel
 from .constants import GEOM, IMAGE_CHANNELS
 from .texel import TexelTiles, backward_memory
-from .trace import Fragments, by_name
+from .trace import Fragments
 
 
 def add_texel_coverage(
@@ -54,7 +54,7 @@ def _add(
     which no channel is cut off, as a step of length -1 by a share [T] of 1."""
     base = total.new_zeros(fragments.surfels, 3)
     step = {"base": base, "texels": total, "moved": total, "share": share, "rate": -1.0, "dtexels": None, "duv": None}
-    given = {**by_name(fragments.arrays), **tiles.arrays, **step, "weight": weight, "bound": bound}
+    given = {**fragments.arrays_for_layout, **tiles.arrays, **step, "weight": weight, "bound": bound}
     if cuda_backend(total.device):
         # as colours, too: where they are 0 there is nothing to count
         grey = (weight * counts[fragments.pixel.long()])[:, None].expand(-1, 3).contiguous()

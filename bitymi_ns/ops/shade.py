@@ -8,7 +8,7 @@ from torch import Tensor
 from .backend import dense, kernel, on_same_device
 from .constants import COLOR_BIAS, FRAME
 from .field import FieldGeometry, backward_memory, gradients, kernel_field
-from .trace import FRAGMENT, Fragments, by_name
+from .trace import Fragments
 
 
 class _Shade(torch.autograd.Function):
@@ -18,15 +18,15 @@ class _Shade(torch.autograd.Function):
         colors = base.new_empty(len(fragments), 3)
         handle = kernel_field(geometry, *params) if params else None
         inputs = {"bound": bound, "base": b, "frames": f, "field": handle}
-        kernel("shade_forward", base)(**by_name(arrays), **inputs, colors=colors)
-        ctx.save_for_backward(b, f, colors, *arrays, *params)
-        ctx.field, ctx.bound, ctx.move = handle, bound, move
+        kernel("shade_forward", base)(**arrays, **inputs, colors=colors)
+        ctx.save_for_backward(b, f, colors, *arrays.values(), *params)
+        ctx.field, ctx.bound, ctx.move, ctx.names = handle, bound, move, tuple(arrays)
         return colors
 
     @staticmethod
     def backward(ctx, dcolors):
         base, frames, colors, *rest = ctx.saved_tensors
-        arrays, params = by_name(rest[: len(FRAGMENT)]), rest[len(FRAGMENT) :]
+        arrays, params = dict(zip(ctx.names, rest, strict=False)), rest[len(ctx.names) :]
         learn = bool(params) and any(ctx.needs_input_grad[7:])
         dbase, grads = torch.empty_like(base), gradients(params) if learn else {}
         duv = dframes = None

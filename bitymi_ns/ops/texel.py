@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, module, on_same_device, require
-from .trace import FRAGMENT, Fragments, by_name
+from .trace import Fragments
 
 
 def _on_the_cpu(operation: str, like: Tensor) -> None:
@@ -265,15 +265,15 @@ class _TexelColors(torch.autograd.Function):
         b, t, arrays = dense(base, texels), dense(texels, texels), fragments.arrays
         colors = t.new_empty(len(fragments), 3)
         inputs = {"bound": bound, "base": b, "texels": t, **tiles.arrays}
-        kernel("texel_colors_forward", t)(**by_name(arrays), **inputs, colors=colors)
-        ctx.save_for_backward(b, t, colors, *arrays)
-        ctx.tiles, ctx.bound, ctx.descent = tiles, bound, descent
+        kernel("texel_colors_forward", t)(**arrays, **inputs, colors=colors)
+        ctx.save_for_backward(b, t, colors, *arrays.values())
+        ctx.tiles, ctx.bound, ctx.descent, ctx.names = tiles, bound, descent, tuple(arrays)
         return colors
 
     @staticmethod
     def backward(ctx, dcolors):
         base, texels, colors, *rest = ctx.saved_tensors
-        arrays = by_name(rest[: len(FRAGMENT)])
+        arrays = dict(zip(ctx.names, rest, strict=True))
         wanted = (base, texels, arrays["uv"])
         dbase, dtexels, duv = (
             torch.empty_like(x) if needed else None for x, needed in zip(wanted, ctx.needs_input_grad, strict=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,18 +13,10 @@ from . import trace_cpu, trace_cuda
 from .backend import cuda_backend, dense, function, kernel, on_same_device
 from .constants import GEOM
 from .errors import TooManyFragments
+from .fragment_list import Places
 from .project import Projection
 
 __all__ = ["Fragments", "TooManyFragments", "masked_counts", "trace"]
-
-
-FRAGMENT = ("surfel", "pixel", "weight", "uv", "depth", "sigma")
-"""The kernels' names of the arrays of a fragment list (`FragmentArrays` of csrc/ops/arguments.h)."""
-
-
-def by_name(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
-    """The arrays of a fragment list as the kernels take them."""
-    return dict(zip(FRAGMENT, arrays, strict=True))
 
 
 @dataclass
@@ -35,36 +27,54 @@ class Fragments:
         weight: [F] blending weight w = sigma T, differentiable.
         uv: [2, F] surfel coordinates in scale units, |u|, |v| <= 3, differentiable.
         depth: [F] camera z of the hit (of the centre in the low-pass branch), differentiable.
-        surfel: [F] int32 row of the surfel.
-        pixel: [F] int32, y * width + x.
         sigma: [F] effective opacity, negative in the low-pass branch.
         tile_start: [tiles + 1] int64, where each tile's fragments begin.
         width, height: of the image, pixels.
         layout: how kernels find their way in the list: a handle on what packs of 4 x 4 pixels have of each surfel for
             those of the CPU (csrc/cpu/packs.h), on the pairs of surfel and tile for those of CUDA (csrc/cuda/pairs.h).
-            It says anew whose the fragments are and where: `surfel` and `pixel` are not to be replaced.
         surfels: number N of rows of the projection that they belong to.
+        places: whose the fragments are and where, as the layout says it.
     """
 
     weight: Tensor
     uv: Tensor
     depth: Tensor
-    surfel: Tensor
-    pixel: Tensor
     sigma: Tensor
     tile_start: Tensor
     width: int
     height: int
     layout: Any
     surfels: int
+    places: Places
 
     def __len__(self) -> int:
         return self.weight.shape[0]
 
     @property
-    def arrays(self) -> tuple[Tensor, ...]:
-        """What the kernels take, without the graph, in the order of `FRAGMENT`."""
-        return self.surfel, self.pixel, self.weight.detach(), self.uv.detach(), self.depth.detach(), self.sigma
+    def surfel(self) -> Tensor:
+        """[F] int32 row of the surfel."""
+        return self.places.arrays()["surfel"]
+
+    @property
+    def pixel(self) -> Tensor:
+        """[F] int32, y * width + x."""
+        return self.places.arrays()["pixel"]
+
+    @property
+    def arrays(self) -> dict[str, Tensor]:
+        """The list as kernels take it that do not know its layout, without the graph: by the names of `FragmentArrays`
+        (csrc/ops/arguments.h)."""
+        return {**self._numbers, **self.places.arrays()}
+
+    @property
+    def arrays_for_layout(self) -> dict[str, Tensor]:
+        """The same for kernels that take the layout, from which those of the CPU know the places."""
+        return self.arrays if cuda_backend(self.weight.device) else self._numbers
+
+    @property
+    def _numbers(self) -> dict[str, Tensor]:
+        w, uv, depth = self.weight.detach(), self.uv.detach(), self.depth.detach()
+        return {"weight": w, "uv": uv, "depth": depth, "sigma": self.sigma}
 
     def lists(self) -> Iterator[Fragments]:
         """The view's lists one after the other, from top to bottom: this one."""
@@ -84,13 +94,14 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, projection, rim, most):
         find_fragments = trace_cuda.find_fragments if cuda_backend(geom.device) else trace_cpu.find_fragments
-        layout, tile_start, found = find_fragments(geom.detach(), projection, most)
-        surfel, pixel, weight, uv, depth, sigma = arrays = [found[name] for name in FRAGMENT]
-        ctx.save_for_backward(geom, *arrays)
-        ctx.projection, ctx.rim, ctx.layout = projection, rim, layout
-        ctx.mark_non_differentiable(surfel, pixel, sigma, tile_start)
+        layout, tile_start, found, places = find_fragments(geom.detach(), projection, most)
+        weight, uv, depth, sigma = (found[name] for name in ("weight", "uv", "depth", "sigma"))
+        arrays = found | (places.arrays() if cuda_backend(geom.device) else {})
+        ctx.save_for_backward(geom, *arrays.values())
+        ctx.projection, ctx.rim, ctx.layout, ctx.names = projection, rim, layout, tuple(arrays)
+        ctx.mark_non_differentiable(sigma, tile_start)
         ctx.set_materialize_grads(False)
-        return weight, uv, depth, surfel, pixel, sigma, tile_start, layout
+        return weight, uv, depth, sigma, tile_start, layout, places
 
     @staticmethod
     def backward(ctx, dweight, duv, ddepth, *_):
@@ -102,7 +113,7 @@ class _Trace(torch.autograd.Function):
         work = trace_cuda.backward_memory(geom, ctx.layout) if cuda_backend(geom.device) else {}
         kernel("trace_backward", geom)(
             **projection.view(geom),
-            **by_name(arrays),
+            **dict(zip(ctx.names, arrays, strict=True)),
             **grads,
             **work,
             rim=ctx.rim,
@@ -136,9 +147,9 @@ def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) ->
         raise ValueError("surfels in a view of another size than the photographs are drawn by the baked renderer alone")
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
-    weight, uv, depth, surfel, pixel, sigma, tile_start, layout = _Trace.apply(projection.geom, projection, rim, most)
+    weight, uv, depth, sigma, tile_start, layout, places = _Trace.apply(projection.geom, projection, rim, most)
     camera, n = projection.camera, len(projection.geom)
-    return Fragments(weight, uv, depth, surfel, pixel, sigma, tile_start, camera.width, camera.height, layout, n)
+    return Fragments(weight, uv, depth, sigma, tile_start, camera.width, camera.height, layout, n, places)
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
@@ -155,14 +166,13 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
     Raises:
         ValueError: the mask has another number of pixels or lies on another device.
     """
-    on_same_device(fragments.surfel, mask=mask)
+    on_same_device(fragments.weight, mask=mask)
     if n != fragments.surfels:
         raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {n}")
     if mask.numel() != fragments.width * fragments.height:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
-    counts = torch.zeros(n, dtype=torch.int32, device=fragments.surfel.device)
+    counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    f = fragments
-    where = {"layout": f.layout, "width": f.width, "height": f.height, "surfel": f.surfel, "pixel": f.pixel}
+    where = {"layout": fragments.layout, "width": fragments.width, "height": fragments.height}
     function("masked_counts", counts.device)(**where, mask=flat, counts=counts)
     return counts

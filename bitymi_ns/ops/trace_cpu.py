@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import kernel_class, module, require
-from .fragment_list import empty_list, too_many
+from .backend import function, kernel_class, module, require
+from .fragment_list import Places, empty_list, empty_places, too_many
 from .pool import Pool
 from .project import Projection
 
 MOST = 1 << 25
-"""Fragments of a list whose length memory decides: 1.5 GB with what blending and its backward pass add, 44 bytes per
+"""Fragments of a list whose length memory decides: 1.2 GB with what blending and its backward pass add, 36 bytes per
 fragment; 68 where a field shades them. Fixed, so that what is computed does not depend on the machine."""
 
 _pool = functools.cache(Pool)
@@ -27,7 +27,7 @@ def tracers(like: Tensor) -> Pool[Any]:
 
 def find_fragments(
     geom: Tensor, projection: Projection, most: int | None = None
-) -> tuple[Any, Tensor, dict[str, Tensor]]:
+) -> tuple[Any, Tensor, dict[str, Tensor], Places]:
     """The fragments of a view.
 
     Args:
@@ -36,7 +36,7 @@ def find_fragments(
         most: fragments that there may be; 0 = `MOST`, None = any number.
 
     Returns:
-        layout, tile_start, and the arrays of `Fragments` by name.
+        layout, tile_start, the numbers of `Fragments` by name, and its places.
 
     Raises:
         TooManyFragments: there are more than `most`.
@@ -47,12 +47,20 @@ def find_fragments(
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), most=most)
         if most and n > most:
-            raise too_many(geom, projection, n, most)
+            raise too_many(geom, projection, n, most, places=False)
         found = empty_list(geom, n)
         starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
         packs = torch.empty(tracer.packs, 2, dtype=torch.int32)
         tracer.copy(**found, **starts, packs=packs)
-    return module(geom.device).TilePacks(**starts, packs=packs), starts["tile_start"], found
+    layout = module(geom.device).TilePacks(**starts, packs=packs)
+    size = {"width": projection.camera.width, "height": projection.camera.height}
+
+    def places() -> dict[str, Tensor]:
+        listed = empty_places(packs, n)
+        function("list_places", packs.device)(layout=layout, **size, **listed)
+        return listed
+
+    return layout, starts["tile_start"], found, Places(places)
 
 
 def count(projection: Projection) -> int:

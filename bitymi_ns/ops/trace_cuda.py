@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .backend import kernel, module, on_device, require, workspace
 from .constants import TILE
-from .fragment_list import empty_list, too_many
+from .fragment_list import Places, empty_list, empty_places, too_many
 from .project import Projection
 
 NUMBERS = 24
@@ -116,23 +116,23 @@ def check_capacity(geom: Tensor, projection: Projection, count: int, most: int |
     if most == 0 and geom.device.type == "cuda" and count > FEW:
         most = fragment_capacity(geom)
     if most and count > most:
-        raise too_many(geom, projection, count, most)
+        raise too_many(geom, projection, count, most, places=True)
 
 
-def fill(geom: Tensor, projection: Projection, layout: Any) -> dict[str, Tensor]:
-    """The arrays of `Fragments` by name; raises TooManyFragments where they find no room."""
+def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[dict[str, Tensor], Places]:
+    """The numbers of `Fragments` by name, and its places; raises TooManyFragments where they find no room."""
     count = layout.fragments
     try:
-        found = empty_list(geom, count)
+        found, places = empty_list(geom, count), empty_places(geom, count)
     except torch.cuda.OutOfMemoryError as error:
-        raise too_many(geom, projection, count, fragment_capacity(geom)) from error
-    kernel("trace_fill", geom)(**projection.view(geom), **found, layout=layout)
-    return found
+        raise too_many(geom, projection, count, fragment_capacity(geom), places=True) from error
+    kernel("trace_fill", geom)(**projection.view(geom), **found, **places, layout=layout)
+    return found, Places(lambda: places)
 
 
 def find_fragments(
     geom: Tensor, projection: Projection, most: int | None = None
-) -> tuple[Any, Tensor, dict[str, Tensor]]:
+) -> tuple[Any, Tensor, dict[str, Tensor], Places]:
     """The fragments of a view.
 
     Args:
@@ -141,7 +141,7 @@ def find_fragments(
         most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
 
     Returns:
-        layout, tile_start, and the arrays of `Fragments` by name.
+        layout, tile_start, the numbers of `Fragments` by name, and its places.
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more.
@@ -149,7 +149,7 @@ def find_fragments(
     """
     layout, tile_start = blended(geom, projection, tile_lists(geom, projection))
     check_capacity(geom, projection, layout.fragments, most)
-    return layout, tile_start, fill(geom, projection, layout)
+    return layout, tile_start, *fill(geom, projection, layout)
 
 
 def backward_memory(geom: Tensor, layout: Any) -> dict[str, Tensor]:

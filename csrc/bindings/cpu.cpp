@@ -133,6 +133,7 @@ NB_MODULE(BITYMI_MODULE, m) {
   bind_operations<float>(m);
   bind_operations<double>(m);
   bind_operation(m, "masked_counts", &masked_counts);
+  bind_operation(m, "list_places", &list_places);
   m.attr("SUPPORT") = kSupport, m.attr("ALPHA_MAX") = kAlphaMax, m.attr("ALPHA_MIN") = kAlphaMin;
   m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin, m.attr("BETA_MAX") = kBetaMax, m.attr("TILE") = kTile;
   m.attr("GEOM") = int(kGeom), m.attr("FRAME") = kFrame;

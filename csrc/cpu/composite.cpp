@@ -1,5 +1,6 @@
 // Weighted sums of the fragments per pixel, and their backward pass.
 #include "cpu/kernels.h"
+#include "cpu/packs.h"
 #include "cpu/threads.h"
 
 namespace bt {
@@ -9,16 +10,16 @@ template <bool kMaps, class S>
 void forward(const CompositeForward<S, TilePacks>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const S *geom = a.geom, *colors = a.colors;
-  const int64_t *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
+  const TilePacks& layout = a.fragments.layout;
   const FragmentArrays<S>& f = a.fragments.f;
   S* image = a.image;
   std::fill(image, image + a.pixels() * channels, S(0));
-  parallel_tiles(tile_start, tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
-    for (int64_t i = tile_start[first]; i < tile_start[last]; ++i) {
-      const S* g = geom + int64_t(f.surfel[i]) * kGeom;
-      S* to = image + int64_t(f.pixel[i]) * channels;
-      add_blended<kMaps>(f.weight[i], colors + 3 * i, g[kBeta], f.depth[i], g + kNx, to);
-    }
+  parallel_tiles(layout.start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
+    for (int64_t tile = first; tile < last; ++tile)
+      each_fragment(layout, tile, a.width, [&](const PackRun& run, int64_t i, int64_t pixel) {
+        const S* g = geom + int64_t(run.surfel) * kGeom;
+        add_blended<kMaps>(f.weight[i], colors + 3 * i, g[kBeta], f.depth[i], g + kNx, image + pixel * channels);
+      });
   });
 }
 
@@ -26,27 +27,27 @@ template <bool kMaps, class S>
 void backward(const CompositeBackward<S, TilePacks>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const S *geom = a.geom, *colors = a.colors, *dimage = a.dimage;
-  const int64_t n = a.n, *tile_start = a.fragments.layout.start, tiles = a.fragments.layout.tiles;
+  const int64_t n = a.n;
+  const TilePacks& layout = a.fragments.layout;
   const FragmentArrays<S>& f = a.fragments.f;
   S *dweight = a.dweight, *dcolors = a.dcolors, *ddepth = a.ddepth, *dgeom = a.dgeom;
   constexpr int kSums = 4;  // beta and the normal, per surfel
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
-  const int parts = parallel_tiles(tile_start, tiles, 64, [&](int part, int64_t first, int64_t last) {
+  const int parts = parallel_tiles(layout.start, layout.tiles, 64, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
-    for (int64_t i = tile_start[first]; i < tile_start[last]; ++i) {
-      const S w = f.weight[i];
-      const S* g = geom + int64_t(f.surfel[i]) * kGeom;
-      const S* d = dimage + int64_t(f.pixel[i]) * channels;
-      S* to = sums.data() + int64_t(f.surfel[i]) * kSums;
-      dweight[i] = weight_gradient<kMaps>(d, colors + 3 * i, g[kBeta], f.depth[i], g + kNx);
-      dcolors[3 * i] = w * d[0], dcolors[3 * i + 1] = w * d[1], dcolors[3 * i + 2] = w * d[2];
-      to[0] += w * d[4];
-      if (kMaps) {
-        ddepth[i] = w * d[5];
-        to[1] += w * d[6], to[2] += w * d[7], to[3] += w * d[8];
-      }
-    }
+    for (int64_t tile = first; tile < last; ++tile)
+      each_fragment(layout, tile, a.width, [&](const PackRun& run, int64_t i, int64_t pixel) {
+        const S w = f.weight[i], *g = geom + int64_t(run.surfel) * kGeom, *d = dimage + pixel * channels;
+        S* to = sums.data() + int64_t(run.surfel) * kSums;
+        dweight[i] = weight_gradient<kMaps>(d, colors + 3 * i, g[kBeta], f.depth[i], g + kNx);
+        dcolors[3 * i] = w * d[0], dcolors[3 * i + 1] = w * d[1], dcolors[3 * i + 2] = w * d[2];
+        to[0] += w * d[4];
+        if (kMaps) {
+          ddepth[i] = w * d[5];
+          to[1] += w * d[6], to[2] += w * d[7], to[3] += w * d[8];
+        }
+      });
   });
   parallel_parts(n, 1024, [&](int, int64_t begin, int64_t end) {
     std::fill(dgeom + begin * kGeom, dgeom + end * kGeom, S(0));

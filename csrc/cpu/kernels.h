@@ -56,7 +56,6 @@ template <class S>
 struct FoundFragments {
   std::vector<int64_t> tile_start, pack_start;  // [tiles + 1]
   int64_t total = 0, packs = 0;
-  int width = 0;  // of the image
   // Filled by trace, read out by copy. Blocks are large, so that what is not written to takes no memory and what is
   // freed goes back to the operating system. A tile's fragments lie in one block.
   struct Block {
@@ -110,12 +109,31 @@ struct TraceCopy {
     r.rows("tile_start", tile_start, starts, 1);
     r.array("pack_start", pack_start, starts);
     r.rows("packs", packs, packs_listed, 2);
-    out.fields(r);
+    out.fields(r, false);
   }
 };
 // Large lists give their memory back, a block of every thread at a time.
 template <class S>
 void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
+
+// surfel and pixel [F] are written: whose the fragments of a list are and where.
+struct ListedPlaces {
+  TilePacks layout;
+  int width, height;
+  int64_t total;
+  int32_t *surfel, *pixel;
+
+  template <class R>
+  void fields(R& r) {
+    take(r, "layout", layout);
+    r.number("width", width);
+    r.number("height", height);
+    r.rows("surfel", surfel, total, 1);
+    r.array("pixel", pixel, total);
+    if (layout.fragments != total || !layout.fits(0, width, height)) r.refuse("the layout is not that of such a list");
+  }
+};
+void list_places(const ListedPlaces& a);
 
 template <class S>
 void trace_backward(const TraceBackward<S, TilePacks>& a);

@@ -33,7 +33,6 @@ void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
   for (auto& own : list.blocks)
     for (auto& block : own) block.used = block.used_packs = 0;
   list.pieces.assign(tiles, {});
-  list.width = width;
   std::vector<int> current(threads, 0);
   std::atomic<int64_t> found{0};
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
@@ -92,25 +91,6 @@ void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
   with_kernel(a.view.through_pixel, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.most, to); });
 }
 
-namespace {
-// Whose the fragments of a tile are and where, by its packs; they begin at `surfel` and `pixel`.
-void list_packs(const int32_t* packs, int64_t count, int64_t tile, int width, int64_t fragments, int32_t* surfel,
-                int32_t* pixel) {
-  int32_t *surfels = surfel + fragments, *pixels = pixel + fragments;  // where they end
-  using Whole = Wide<int32_t>;
-  Whole in_pack;  // the pixels, from the first one on
-  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane_row(lane) * width + lane_column(lane));
-  const int32_t corner = int32_t(tile / tiles_across(width) * kTile * width + tile % tiles_across(width) * kTile);
-  for (int64_t k = 0; k < count; ++k) {
-    const PackPart part(packs + 2 * k);
-    const int32_t first = corner + pack_row(part.pack) * width + pack_column(part.pack);
-    compress_until(pixels, pixel, in_pack + first, part.lanes);
-    compress_until(surfels, surfel, all_lanes<Whole>(part.surfel), part.lanes);
-    surfel += part.count(), pixel += part.count();
-  }
-}
-}  // namespace
-
 template <class S>
 void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
   FoundFragments<S>& list = from.list;
@@ -136,8 +116,6 @@ void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
       const auto& p = list.pieces[tiles[k][i]];
       const auto& block = list.blocks[p.thread][k];
       const int64_t to = list.tile_start[tiles[k][i]];
-      list_packs(block.packs + 2 * p.from_pack, p.packs, tiles[k][i], list.width, p.count, out.surfel + to,
-                 out.pixel + to);
       std::copy_n(block.weight + p.from, p.count, out.weight + to);
       std::copy_n(block.u + p.from, p.count, out.uv + to);
       std::copy_n(block.v + p.from, p.count, out.uv + list.total + to);
@@ -232,8 +210,30 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
   with_kernel(a.view.through_pixel, [&](auto kernel) { trace_backward<decltype(kernel)>(a); });
 }
 
+void list_places(const ListedPlaces& a) {
+  using Whole = Wide<int32_t>;
+  Whole in_pack;  // the pixels, from the first one on
+  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane_row(lane) * a.width + lane_column(lane));
+  parallel_tiles(a.layout.start, a.layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
+    // what lies behind belongs to another thread
+    int32_t *const surfels = a.surfel + a.layout.start[last], *const pixels = a.pixel + a.layout.start[last];
+    for (int64_t tile = first; tile < last; ++tile) {
+      const int32_t corner = first_pixel(tile, a.width);
+      each_run(a.layout, tile, [&](const PackRun& run) {
+        each_pack(a.layout, run, [&](int64_t, int64_t at, const PackPart& part) {
+          const int32_t from = corner + pack_row(part.pack) * a.width + pack_column(part.pack);
+          compress_until(pixels, a.pixel + at, in_pack + from, part.lanes);
+          compress_until(surfels, a.surfel + at, all_lanes<Whole>(part.surfel), part.lanes);
+        });
+      });
+    }
+  });
+}
+
 void masked_counts(const MaskedCounts<TilePacks>& a) {
-  for (int64_t i = 0; i < a.fragments; ++i) a.counts[a.surfel[i]] += a.mask[a.pixel[i]] != 0;
+  for (int64_t tile = 0; tile < a.layout.tiles; ++tile)
+    each_fragment(a.layout, tile, a.width,
+                  [&](const PackRun& run, int64_t, int64_t pixel) { a.counts[run.surfel] += a.mask[pixel] != 0; });
 }
 
 #define BT_INSTANTIATE(S)                                         \

@@ -39,6 +39,7 @@ struct Pairs {
   const int32_t* order;       // [surfels] front to back
   const int64_t* slot_start;  // [surfels + 1]
   int64_t fragments;
+  static constexpr bool kPlaces = false;  // kernels read them from the list
   int64_t tiles() const { return tiles_of(width, height); }
   bool fits(int64_t n, int wide, int high) const { return n == surfels && wide == width && high == height; }
 

@@ -37,14 +37,17 @@ struct FragmentArrays {
   int32_t *surfel, *pixel;
   S *weight, *uv, *depth, *sigma;  // uv [2, total]; sigma is negative in the low-pass branch
 
+  // Without `places` surfel and pixel are null: a layout says them.
   template <class R>
-  void fields(R& r) {
-    r.rows("surfel", surfel, total, 1);
-    r.array("pixel", pixel, total);
-    r.array("weight", weight, total);
+  void fields(R& r, bool places = true) {
+    r.rows("weight", weight, total, 1);
     r.array("uv", uv, 2 * total);
     r.array("depth", depth, total);
     r.array("sigma", sigma, total);
+    surfel = pixel = nullptr;
+    if (!places) return;
+    r.array("surfel", surfel, total);
+    r.array("pixel", pixel, total);
   }
 };
 
@@ -70,7 +73,8 @@ struct TilePacks {
   const int64_t* pack_start;  // [tiles + 1] and where its packs do
   const int32_t* packs;       // [count, 2] what a pack has of a surfel, see PackPart
   int64_t tiles, count, fragments;
-  static constexpr int64_t pairs = 0;  // of surfel and tile: not kept
+  static constexpr int64_t pairs = 0;    // of surfel and tile: not kept
+  static constexpr bool kPlaces = true;  // whose all fragments are and where
   bool fits(int64_t, int width, int height) const { return tiles == tiles_of(width, height); }
 
   template <class R>
@@ -100,7 +104,7 @@ struct Fragments {
   template <class R>
   void fields(R& r, int64_t surfels, int width, int height) {
     take(r, "layout", layout);
-    f.fields(r);
+    f.fields(r, !Layout::kPlaces);
     if (layout.fragments != f.total || !layout.fits(surfels, width, height))
       r.refuse("the layout does not belong to these fragments");
   }

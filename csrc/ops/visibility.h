@@ -172,22 +172,18 @@ template <class Layout>
 struct MaskedCounts {
   Layout layout;
   int width, height;
-  int64_t fragments, n;
-  const int32_t *surfel, *pixel;
+  int64_t n;
   const uint8_t* mask;
   int32_t* counts;
 
   template <class R>
   void fields(R& r) {
     take(r, "layout", layout);
-    r.rows("surfel", surfel, fragments, 1);
-    r.array("pixel", pixel, fragments);
     r.number("width", width);
     r.number("height", height);
     r.array("mask", mask, int64_t(width) * height);
     r.rows("counts", counts, n, 1);
-    if (layout.fragments != fragments || !layout.fits(n, width, height))
-      r.refuse("the layout does not belong to these fragments");
+    if (!layout.fits(n, width, height)) r.refuse("the layout is not that of such a view");
   }
 };
 

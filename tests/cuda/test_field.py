@@ -12,6 +12,7 @@ from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.field_tiles import field_tiles
+from bitymi_ns.ops.fragment_list import Places
 from bitymi_ns.scene import Camera, HashField, SceneConfig
 from tests.ops.golden import SURFEL_KEYS, extreme_scenes, random_scene
 from tests.ops.test_kernels import field_reference, make_field, relative
@@ -120,7 +121,7 @@ class Shading:
     def run(self, device: torch.device, mode: str, bound: float = 0.05) -> list[Tensor]:
         """Colours and gradients of base colours, frames, uv, table and weights; those that the mode has."""
         f = self.fragments
-        moved = {name: getattr(f, name).to(device) for name in ("weight", "uv", "depth", "surfel", "pixel", "sigma")}
+        moved = {name: getattr(f, name).to(device) for name in ("weight", "uv", "depth", "sigma")}
         leaves = [t.to(device).requires_grad_() for t in (self.base.clone(), self.projection.frames.clone())]
         moved["uv"] = moved["uv"].clone().requires_grad_()
         fragments = ops.Fragments(
@@ -130,6 +131,7 @@ class Shading:
             height=f.height,
             layout=f.layout,
             surfels=f.surfels,
+            places=Places(lambda: {name: t.to(device) for name, t in f.places.arrays().items()}),
         )
         params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]
         geometry = None if mode == "plain" else self.field.geometry

@@ -269,8 +269,8 @@ def test_every_order_of_the_threads_gives_the_same_bits(dtype: torch.dtype, devi
             results.append(render(case, dtype, device))
     first = results[0]
     for other in results[1:]:
-        for a, b in zip(first.fragments.arrays, other.fragments.arrays, strict=True):
-            assert torch.equal(a, b)
+        for name, array in first.fragments.arrays.items():
+            assert torch.equal(array, other.fragments.arrays[name])
         assert torch.equal(first.image, other.image)
         for key, value in first.leaves.items():
             assert torch.equal(value, other.leaves[key]), key

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from bitymi_ns.ops import Fragments, soft_overdraw
+from bitymi_ns.ops.fragment_list import Places
 
 
 def a_list(weight: torch.Tensor, width: int = 4, height: int = 3) -> Fragments:
@@ -14,7 +15,8 @@ def a_list(weight: torch.Tensor, width: int = 4, height: int = 3) -> Fragments:
     pixel = torch.arange(n, dtype=torch.int32) % (width * height)
     nothing = torch.zeros(n)
     start = torch.tensor([0, n])
-    return Fragments(weight, nothing.expand(2, n), nothing, pixel, pixel, nothing, start, width, height, start, n)
+    places = Places(lambda: {"surfel": pixel, "pixel": pixel})
+    return Fragments(weight, nothing.expand(2, n), nothing, nothing, start, width, height, start, n, places)
 
 
 def test_soft_overdraw_is_the_sum_over_a_pixel():

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from bitymi_ns import ops
-from bitymi_ns.ops.backend import kernel_class, module
+from bitymi_ns.ops import trace_cpu
+from bitymi_ns.ops.backend import function, kernel_class, module
 from bitymi_ns.ops.constants import TILE
-from bitymi_ns.ops.fragment_list import empty_list
+from bitymi_ns.ops.fragment_list import empty_list, empty_places
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
 
 
@@ -55,10 +56,32 @@ def test_packs_say_whose_fragments_are_and_where(
         runs = [owner for k, owner in enumerate(owners) if k == 0 or owners[k - 1] != owner]
         assert len(runs) == len(set(runs))
     assert len(surfel) == found["tile_start"][-1] > 0
-    assert surfel == found["surfel"].tolist() and pixel == found["pixel"].tolist()
     fragments = ops.trace(projection)
-    for name in ("surfel", "pixel", "weight", "uv", "depth", "sigma", "tile_start"):
+    assert surfel == fragments.surfel.tolist() and pixel == fragments.pixel.tolist()
+    for name in ("weight", "uv", "depth", "sigma", "tile_start"):
         assert torch.equal(getattr(fragments, name), found[name])
+
+
+def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step without a field, and what it is looked at for, need none: 8 bytes per fragment."""
+    made = []
+    monkeypatch.setattr(trace_cpu, "empty_places", lambda *given: made.append(given) or empty_places(*given))
+    case = random_scene(80, 1, width=64, height=48)
+    surfels = [case.params[key].clone().requires_grad_() for key in SURFEL_KEYS]
+    projection = ops.project(*surfels, camera_of(case, torch.float64))
+    fragments = ops.trace(projection)
+    ops.blended_image(fragments, projection, torch.full((80, 3), 0.3).double(), maps=True).sum().backward()
+    counts = ops.masked_counts(fragments, torch.ones(64 * 48, dtype=torch.bool), 80)
+    assert not made
+    assert torch.equal(counts, torch.bincount(fragments.surfel, minlength=80))
+    assert fragments.surfel is fragments.surfel and len(fragments.pixel) == len(fragments) and len(made) == 1
+    listed = {"surfel": fragments.surfel, "pixel": fragments.pixel[1:]}
+    with pytest.raises(ValueError, match="pixel has"):
+        function("list_places", torch.device("cpu"))(layout=fragments.layout, width=64, height=48, **listed)
+    with pytest.raises(ValueError, match="not that of such a list"):
+        function("list_places", torch.device("cpu"))(
+            layout=fragments.layout, width=65, height=48, **fragments.places.arrays()
+        )
 
 
 def test_a_layout_that_does_not_fit_is_refused() -> None:

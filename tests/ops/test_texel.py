@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
+from bitymi_ns.ops.fragment_list import Places
 from bitymi_ns.ops.reference.texel import texel_image as reference
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
@@ -197,7 +198,8 @@ def one_surfel(uv: Tensor, weight: Tensor) -> ops.Fragments:
     count = uv.shape[1]
     zeros, start = torch.zeros(count, dtype=torch.int32), torch.tensor([0, count])
     pixel = torch.arange(count, dtype=torch.int32)
-    return ops.Fragments(weight, uv, weight, zeros, pixel, weight, start, count, 1, start, 1)
+    places = Places(lambda: {"surfel": zeros, "pixel": pixel})
+    return ops.Fragments(weight, uv, weight, weight, start, count, 1, start, 1, places)
 
 
 @settings(max_examples=60, deadline=None)

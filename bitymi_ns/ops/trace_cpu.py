@@ -54,10 +54,11 @@ def find_fragments(
         tracer.copy(**found, **starts, packs=packs)
     layout = module(geom.device).TilePacks(**starts, packs=packs)
     size = {"width": projection.camera.width, "height": projection.camera.height}
+    list_places = function("list_places", packs.device)
 
     def places() -> dict[str, Tensor]:
         listed = empty_places(packs, n)
-        function("list_places", packs.device)(layout=layout, **size, **listed)
+        list_places(layout=layout, **size, **listed)
         return listed
 
     return layout, starts["tile_start"], found, Places(places)

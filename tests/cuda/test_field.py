@@ -12,9 +12,8 @@ from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.texels import evaluate_tiles
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.field_tiles import field_tiles
-from bitymi_ns.ops.fragment_list import Places
 from bitymi_ns.scene import Camera, HashField, SceneConfig
-from tests.ops.golden import SURFEL_KEYS, extreme_scenes, random_scene
+from tests.ops.golden import SURFEL_KEYS, changed, extreme_scenes, random_scene
 from tests.ops.test_kernels import field_reference, make_field, relative
 
 
@@ -131,7 +130,7 @@ class Shading:
             height=f.height,
             layout=f.layout,
             surfels=f.surfels,
-            places=Places(lambda: {name: t.to(device) for name, t in f.places.arrays().items()}),
+            places=changed(f.places, lambda t: t.to(device)),
         )
         params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]
         geometry = None if mode == "plain" else self.field.geometry

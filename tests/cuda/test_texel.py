@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
-from tests.ops.golden import extreme_scenes
+from tests.ops.golden import changed, extreme_scenes
 from tests.ops.test_kernels import relative
 from tests.ops.test_texel import SIZES, Case, colors_by_reference, fragments_of, one_surfel
 
@@ -33,7 +33,10 @@ def exactly():
 def moved(of: ops.Fragments | ops.TexelTiles, device: torch.device):
     """Fragments or tiles with their tensors on a device."""
     tensors = {f.name: getattr(of, f.name) for f in fields(of)}
-    return replace(of, **{name: t.to(device) for name, t in tensors.items() if isinstance(t, Tensor)})
+    found = {name: t.to(device) for name, t in tensors.items() if isinstance(t, Tensor)}
+    if isinstance(of, ops.Fragments):
+        found["places"] = changed(of.places, lambda t: t.to(device))
+    return replace(of, **found)
 
 
 def direction(like: Tensor) -> Tensor:
@@ -80,8 +83,9 @@ def test_any_number_of_fragments(count: int, device: torch.device, cpu: Context)
     case = case_of(cpu)
     f = case.fragments
     assert len(f) > count
-    few = {name: getattr(f, name)[:count] for name in ("weight", "depth", "surfel", "pixel", "sigma")}
-    case.fragments = replace(f, **few, uv=f.uv[:, :count].contiguous())
+    few = {name: getattr(f, name)[:count] for name in ("weight", "depth", "sigma")}
+    places = changed(f.places, lambda t: t[:count])
+    case.fragments = replace(f, **few, uv=f.uv[:, :count].contiguous(), places=places)
     got = run(case, device)
     with cpu():
         want = run(case, torch.device("cpu"))
@@ -136,8 +140,9 @@ def test_one_surfel_of_any_tile(
 def test_without_fragments_and_without_texels(device: torch.device, cpu: Context) -> None:
     case = case_of(cpu)
     f = case.fragments
-    none = {name: getattr(f, name)[:0] for name in ("weight", "depth", "surfel", "pixel", "sigma")}
-    shown, case.fragments = f, replace(f, **none, uv=f.uv[:, :0].contiguous())
+    none = {name: getattr(f, name)[:0] for name in ("weight", "depth", "sigma")}
+    places = changed(f.places, lambda t: t[:0])
+    shown, case.fragments = f, replace(f, **none, uv=f.uv[:, :0].contiguous(), places=places)
     colors, *grads = run(case, device)
     assert colors.shape == (0, 3) and not any(grad.any() for grad in grads)
     case.fragments, size = shown, torch.zeros_like(case.tiles.size)

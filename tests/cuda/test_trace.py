@@ -253,7 +253,8 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
         layout, tile_start = trace_cuda.blended(geom, listed, bins)
         want_layout, want_start = trace_cuda.blended(geom, listed, want)
         assert torch.equal(tile_start, want_start) and layout.fragments == want_layout.fragments > 0
-        got, fragments = (trace_cuda.fill(geom, listed, each) for each in (layout, want_layout))
+        filled = (trace_cuda.fill(geom, listed, each) for each in (layout, want_layout))
+        got, fragments = (numbers | places.arrays() for numbers, places in filled)
         assert all(torch.equal(got[name], value) for name, value in fragments.items())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, random_scene
+from bitymi_ns.ops.fragment_list import Places
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene import Camera
@@ -109,3 +110,8 @@ def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
     """[P, N] of one number per fragment."""
     out = values.new_zeros(fragments.width * fragments.height, n)
     return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)
+
+
+def changed(places: Places, change: Callable[[Tensor], Tensor]) -> Places:
+    """Places whose arrays are changed: moved to another device, say."""
+    return Places(lambda: {name: change(t) for name, t in places.arrays().items()})

@@ -69,9 +69,9 @@ def blended_image(
     """What `composite_image` gives for the colours of `texel_colors`, or of `shade` where there are no texels.
 
     It is one pass over the fragments, and one backward, which list neither colours nor their gradients: of 64 bytes per
-    fragment 40 are left. On the CPU the sums of the backward pass depend neither on the number of threads nor on what
-    learns: each surfel's are added by one thread. On a card only the gradients of texels depend on the order of sums,
-    and not even they after torch.use_deterministic_algorithms(True).
+    fragment 40 are left on a card, 32 on the CPU. On the CPU the sums of the backward pass depend neither on the number
+    of threads nor on what learns: each surfel's are added by one thread. On a card only the gradients of texels depend
+    on the order of sums, and not even they after torch.use_deterministic_algorithms(True).
 
     Args:
         fragments: F fragments of an H x W view.

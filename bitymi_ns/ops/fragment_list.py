@@ -32,7 +32,8 @@ class Places:
     def arrays(self) -> dict[str, Tensor]:
         """surfel, pixel [F] int32."""
         if self._found is None:
-            self._found = self._find()
+            with torch.inference_mode(False):  # kept, so that a graph may need them later
+                self._found = self._find()
         return self._found
 
 

@@ -246,7 +246,7 @@ BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { 
 // The same where what lies up to `end` is written later: a masked store costs AMD's processors dozens of operations.
 template <class T, class V>
 BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
-  to + kLanes <= end ? compress(to, a, lanes) : compress_only(to, a, lanes);
+  end - to >= kLanes ? compress(to, a, lanes) : compress_only(to, a, lanes);
 }
 template <class S>
 BT_HD Pack<S> expand(const S* from, uint32_t lanes) {

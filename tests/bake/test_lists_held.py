@@ -34,7 +34,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     def counted(*args, **kwargs) -> Fragments:
         assert not any(other() is not None for other in alive), "an earlier list is still held"
         fragments = whole_trace(*args, **kwargs)
-        alive.append(weakref.ref(fragments.surfel))
+        alive.append(weakref.ref(fragments.sigma))
         lengths.append(len(fragments))
         return fragments
 

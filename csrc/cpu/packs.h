@@ -89,21 +89,20 @@ BT_HD void each_run_back(const TilePacks& of, int64_t tile, F&& fn) {
   }
 }
 
-// A tile's first pixel in an image.
-inline int64_t first_pixel(int64_t tile, int width) {
-  return (tile / tiles_across(width) * width + tile % tiles_across(width)) * kTile;
+// The first pixel of a tile's pack in an image, and another lane's from it on.
+inline int64_t first_pixel(int64_t tile, int pack, int width) {
+  const int64_t corner = (tile / tiles_across(width) * width + tile % tiles_across(width)) * kTile;
+  return corner + pack_row(pack) * width + pack_column(pack);
 }
+constexpr int pixels_on(int lane, int width) { return lane_row(lane) * width + lane_column(lane); }
 // fn(run, i, pixel) for the fragments i of a tile, in the list's order.
 template <class F>
 BT_HD void each_fragment(const TilePacks& of, int64_t tile, int width, F&& fn) {
-  const int64_t corner = first_pixel(tile, width);
   each_run(of, tile, [&](const PackRun& run) {
     each_pack(of, run, [&](int64_t, int64_t at, const PackPart& part) {
-      const int64_t from = corner + pack_row(part.pack) * width + pack_column(part.pack);
-      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1) {
-        const int lane = __builtin_ctz(lanes);
-        fn(run, at++, from + lane_row(lane) * width + lane_column(lane));
-      }
+      const int64_t from = first_pixel(tile, part.pack, width);
+      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
+        fn(run, at++, from + pixels_on(__builtin_ctz(lanes), width));
     });
   });
 }

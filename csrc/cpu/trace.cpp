@@ -213,20 +213,18 @@ void trace_backward(const TraceBackward<S, TilePacks>& a) {
 void list_places(const ListedPlaces& a) {
   using Whole = Wide<int32_t>;
   Whole in_pack;  // the pixels, from the first one on
-  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, lane_row(lane) * a.width + lane_column(lane));
+  for (int lane = 0; lane < kLanes; ++lane) set_lane(in_pack, lane, pixels_on(lane, a.width));
   parallel_tiles(a.layout.start, a.layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     // what lies behind belongs to another thread
     int32_t *const surfels = a.surfel + a.layout.start[last], *const pixels = a.pixel + a.layout.start[last];
-    for (int64_t tile = first; tile < last; ++tile) {
-      const int32_t corner = first_pixel(tile, a.width);
+    for (int64_t tile = first; tile < last; ++tile)
       each_run(a.layout, tile, [&](const PackRun& run) {
         each_pack(a.layout, run, [&](int64_t, int64_t at, const PackPart& part) {
-          const int32_t from = corner + pack_row(part.pack) * a.width + pack_column(part.pack);
+          const int32_t from = first_pixel(tile, part.pack, a.width);
           compress_until(pixels, a.pixel + at, in_pack + from, part.lanes);
           compress_until(surfels, a.surfel + at, all_lanes<Whole>(part.surfel), part.lanes);
         });
       });
-    }
   });
 }
 

@@ -69,7 +69,7 @@ class Fragments:
     @property
     def arrays_for_layout(self) -> dict[str, Tensor]:
         """The same for kernels that take the layout, from which those of the CPU know the places."""
-        return self.arrays if cuda_backend(self.weight.device) else self._numbers
+        return _for_layout(self._numbers, self.places)
 
     @property
     def _numbers(self) -> dict[str, Tensor]:
@@ -90,13 +90,17 @@ class Fragments:
         return masked_counts(self, mask, n)
 
 
+def _for_layout(numbers: dict[str, Tensor], places: Places) -> dict[str, Tensor]:
+    return numbers | places.arrays() if cuda_backend(numbers["weight"].device) else numbers
+
+
 class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, projection, rim, most):
         find_fragments = trace_cuda.find_fragments if cuda_backend(geom.device) else trace_cpu.find_fragments
         layout, tile_start, found, places = find_fragments(geom.detach(), projection, most)
         weight, uv, depth, sigma = (found[name] for name in ("weight", "uv", "depth", "sigma"))
-        arrays = found | (places.arrays() if cuda_backend(geom.device) else {})
+        arrays = _for_layout(found, places)
         ctx.save_for_backward(geom, *arrays.values())
         ctx.projection, ctx.rim, ctx.layout, ctx.names = projection, rim, layout, tuple(arrays)
         ctx.mark_non_differentiable(sigma, tile_start)

@@ -1,4 +1,4 @@
-"""Section of gpu.py: frames of the baked renderer, stage by stage, beside gsplat's.
+"""Section of gpu.py: frames of the baked renderer, stage by stage, beside gsplat's; frames.py counts more of a bundle.
 
 The scene of `gpu_common.trained_like` with BC7 tiles of random texels, as large as the surfels are on screen, and the
 weight bound of the presets; or bundles (--bundles), seen from three places around their middle. What a stage cannot do
@@ -26,6 +26,7 @@ from pathlib import Path
 import gpu_gsplat
 import torch
 from common import number, say, table
+from frames import pair_counts
 from gpu_common import (
     Options,
     Section,
@@ -51,6 +52,8 @@ HEADER = (
     "scene",
     "size",
     "million pairs",
+    "pairs/tile",
+    "of discs across the camera's plane",
     "fragments/pixel",
     "prepare ms",
     "bin ms",
@@ -133,7 +136,7 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
     many 8-bit steps this differs at most."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
-    sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
+    sums = dict.fromkeys(("pairs", "per_tile", "across", "fragments", *TIMED), 0.0)
     ending = replace(scene, transmittance_min=FAST)
     for camera in cameras:
         sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
@@ -144,6 +147,9 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
         for renderer in (frame, recorded, packed, early):
             renderer.draw([camera])
         sums["pairs"] += frame.workspace.pairs
+        counts = pair_counts(frame.workspace, scene, camera)
+        sums["per_tile"] += counts.per_tile
+        sums["across"] += counts.across
         cases: list[tuple[str, Callable[[], object]]] = [
             ("prepare", lambda frame=frame: frame.run(Stage.PREPARE)),
             ("bin", lambda frame=frame: frame.run(Stage.BIN)),
@@ -170,6 +176,8 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         name,
         f"{width} x {height}",
         number(mean["pairs"] / 1e6, 2),
+        number(mean["per_tile"], 1),
+        number(mean["across"], 1),
         number(mean["fragments"] / pixels, 1),
         *(number(mean[key], 3) for key in TIMED),
         number(mean["steps"], 2),

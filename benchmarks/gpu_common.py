@@ -235,7 +235,8 @@ def trained_like(
 
     Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
     deviation 0.85, the mean log scale in pixels 0.7, opacity and kernel exponent are logistic-normal (medians 0.45 and
-    2.4); about 23 fragments per pixel are blended, whatever n. A fifth of the surfels lies outside the view.
+    2.4); about 23 fragments per pixel are blended, whatever n. A fifth of the surfels lies outside the view; as many as
+    in trained scenes (`CROSSING`) are discs beside the camera that cross its plane.
     """
     g = torch.Generator().manual_seed(0)
 
@@ -261,6 +262,8 @@ def trained_like(
         "opacity_logits": 1.3 * normal(n) - 0.2,
         "beta_raw": normal(n) + 0.45,
     }
+    beside = n - round(CROSSING * n)
+    _put_beside_the_camera({name: value[beside:] for name, value in surfels.items()}, g)
     if view_color == "sv":
         surfels |= {"sv_sites": normal(n, SITES, 3), "sv_log_tau": torch.zeros(n, SITES)}
         surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
@@ -277,6 +280,23 @@ def trained_like(
     return scene, Camera(torch.eye(4), K, width, height).to(device)
 
 
+def _put_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> None:
+    """Moves surfels to where they cross the camera's plane out of view, in place.
+
+    As in a room of 12,900 surfels: median depth 0.09 where surfels have 1.0 (here 4), 12 depths off the axis, the
+    larger scale 0.9 depths, three times the smaller.
+    """
+    n = len(surfels["means"])
+    z = 0.35 * torch.exp(0.3 * torch.randn(n, generator=g)).clamp(min=0.75)  # behind `near`
+    lateral = 12 * torch.exp(0.8 * torch.randn(n, generator=g)).clamp(min=0.25)
+    turn = 2 * math.pi * torch.rand(n, generator=g)
+    surfels["means"].copy_(z[:, None] * torch.stack([lateral * turn.cos(), lateral * turn.sin(), torch.ones(n)], dim=1))
+    size = torch.log(0.9 * z) + 0.3 * torch.randn(n, generator=g)
+    surfels["log_scales"].copy_(torch.stack([size, size - 1.1], dim=1))
+    forward = torch.tensor([1.0, 0.0, -1.0, 0.0])  # turns the first axis to the camera's
+    surfels["quats"].copy_(forward + 0.2 * torch.randn(n, 4, generator=g))
+
+
 def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[Scene, Camera]:
     """The same with a tile for every surfel, as fine as that camera sees it, and random texels, which backward passes
     move by a rate of zero: the work of a step, but they stay what they are."""
@@ -291,5 +311,7 @@ def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[
     return scene, camera
 
 
+CROSSING = 0.016
+"""Share of the surfels that cross the camera's plane out of view."""
 PIXEL_SCALE = 0.9
 """Median scale of a surfel over the side of its share of the image."""

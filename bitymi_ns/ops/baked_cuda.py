@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from enum import IntFlag
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -193,6 +193,45 @@ class Workspace:
         fitted = pairs <= self.capacity
         self.capacity = pairs + pairs // 4 + 1
         return fitted
+
+
+class ListedPairs(NamedTuple):
+    """The lists of a frame.
+
+    Attributes:
+        ranges: [tiles, 2] where the list of each screen tile begins and ends, all views one after the other.
+        depth: [surfels * views] keys in the order of depth, 2^32 - 1: not visible.
+        pairs: [capacity] row << 8 | mask of the 8 x 4 parts of the tile.
+    """
+
+    ranges: Tensor
+    depth: Tensor
+    pairs: Tensor
+
+    @property
+    def visible(self) -> Tensor:
+        """[surfels * views] which of the surfels are visible."""
+        return self.depth != 0xFFFFFFFF
+
+
+def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
+    """What the latest frame left in the working memory (`lay_out` of csrc/cuda/baked_bin.cu), on the CPU: for tests and
+    for counting what a frame costs."""
+    assert workspace.memory is not None
+    memory, at = workspace.memory.cpu(), 256
+    tiles, rows = -(-width // 16) * -(-height // 16) * views, surfels * views
+
+    def take(count: int) -> Tensor:
+        nonlocal at
+        values = memory[at : at + 4 * count].view(torch.int32)
+        at += -(-4 * count // 256) * 256
+        return values
+
+    ranges = take(2 * tiles).view(tiles, 2)
+    take(24 * rows)
+    return ListedPairs(
+        ranges, take(rows).long() & 0xFFFFFFFF, take(-(-workspace.capacity // 8) * 8).long() & 0xFFFFFFFF
+    )
 
 
 def empty_images(names: Sequence[str], views: int, width: int, height: int, device: torch.device) -> dict[str, Tensor]:

@@ -77,9 +77,22 @@ BT_HD Level<T> level_of(const T* g, double sharp, double room) {
     l.blur = select(blurred >= almost, low_pass_radius(log_(max_(blurred, one)) + T(room)) / T(sqrt_(sharp)), T(0.0f));
   return l;
 }
-// Its conic and the box of that, in doubles.
+// What core/kernel.h's `reached` takes of such a row: r_c^2, and the squared radius of the low pass, 0 where the kernel
+// covers it.
+struct ReachLevels {
+  float r2, blur2;
+};
+template <class Kernel, class S>
+BT_HD ReachLevels reach_levels(const S* geom, S near, double sharp) {
+  double g[kGeom];
+  for (int c = 0; c < kGeom; ++c) g[c] = double(geom[c]);
+  const Level<double> l = level_of<Kernel>(g, sharp, kFloatRoom);
+  const float blur = covers_low_pass(g, double(near), 1 / sharp) ? 0.0f : float(l.blur);
+  return {float(l.r2), blur * blur};
+}
+// Its conic and the box of that, in doubles; of an image of that size.
 template <class T>
-BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur) {
+BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height) {
   const T zero = T(0.0f);
   const T u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
   ExtentOf<T> e;
@@ -104,17 +117,19 @@ BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur) {
   e.ellipse = hit & before;
   e.whole = hit & (select(boxed, zero, T(1.0f)) > zero);
   e.thin = select(c33 > T(1e-10) * scale, zero, T(1.0f)) > zero;
+  if (any_(e.whole)) cut_to_view<T>(disc_image(g, rc2), g[kCx], g[kCy], width, height, e);
   return e;
 }
 
+// In an image of that size.
 template <class Kernel, class F>
-BT_HD Extent extent(const F* geom, double sharp = 1) {
+BT_HD Extent extent(const F* geom, int width, int height, double sharp = 1) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
   if (filtered<Kernel>(g)) return filtered_extent(g);
   const Level<double> level = level_of<Kernel>(g, sharp, 0);
   if (!level.visible) return {};
-  Extent e = conic_extent(g, level.r2, level.blur);
+  Extent e = conic_extent(g, level.r2, level.blur, width, height);
   e.visible = true;
   if (e.ellipse && !e.whole) find_outermost(e);
   return e;

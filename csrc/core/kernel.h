@@ -44,6 +44,30 @@ BT_HD MaskOf<T> in_support(const Planes<T>& p) {
   return within(p, T(kSupport2));
 }
 
+// How far pixels lie from the middle of a cell of them, with what rounding may add; offsets of pixels are up to
+// `largest`.
+template <class S>
+BT_HD S cell_half(S half, S centre, S largest) {
+  return half + S(1e-6) * (largest + abs_(centre));
+}
+// Whether a cell of an image has a pixel in the kernel's level set u^2 + v^2 < r2, and in that of the low pass, d^2 <
+// blur2. x, y: offset of its middle from the surfel's projected centre. Never one cell too few, few too many: within a
+// cell a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
+template <class T>
+struct Reached {
+  MaskOf<T> support, centre;
+};
+template <class S, class T>
+BT_HD Reached<T> reached(const S* g, T x, T y, S half_x, S half_y, S r2, S blur2) {
+  const T zero = T(S(0));
+  const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
+  const Planes<T> p = planes(g, x, y);
+  const Planes<T> nearest = {max_(abs_(p.U) - T(spread(kU1)), zero), max_(abs_(p.V) - T(spread(kV1)), zero),
+                             p.W + T(spread(kW1) + S(1e-6) * abs_(g[kW0]))};
+  const T dx = max_(abs_(x) - T(half_x + S(1e-3)), zero), dy = max_(abs_(y) - T(half_y + S(1e-3)), zero);
+  return {within_in_front(nearest, T(r2 * S(1 + 1e-5))), dx * dx + dy * dy < T(blur2)};
+}
+
 // Whether the plane lies behind `near` there, where it is in front of the camera.
 template <class S, class T>
 BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {

@@ -1,6 +1,6 @@
 // A surfel's pixels are bounded in two ways: in double (core/bounds.h), and in the reals of the fragments
-// (core/plane_bounds.h). This is what both share: the level set, the padding, and which x offsets a box, an ellipse and
-// the low pass have between two lines.
+// (core/plane_bounds.h). This is what both share: the level set, the padding, which discs lie out of view, and which x
+// offsets a box, an ellipse and the low pass have between two lines.
 #pragma once
 
 #include "core/surfel.h"
@@ -62,6 +62,56 @@ struct Outline {
   T y_left = T(0), y_right = T(0);                 // where its leftmost and its rightmost point lie
   T blur = T(0);                                   // radius of the low pass; 0: none
 };
+
+// The image of the disc u^2 + v^2 <= r^2 of a row: the three planes of surfel.h solved for the pixel,
+//   dx = X.q / (1 + C.q),  dy = Y.q / (1 + C.q)   with q = (u, v) / r on the unit disc,
+// where a point lies in front of the camera if 1 + C.q > 0. What costs digits is a small angle between the lines U = 0
+// and V = 0 on the screen; r is widened by as much.
+template <class T>
+struct DiscImage {
+  T xu, xv, yu, yv, cu, cv;  // X, Y, C
+  T angle;                   // sine of the angle between the two lines, up to a factor of 2
+};
+template <class T>
+BT_HD DiscImage<T> disc_image(const T* g, T r2) {
+  const T mu = T(1.0f) / max_(abs_(g[kU1]), abs_(g[kU2])), mv = T(1.0f) / max_(abs_(g[kV1]), abs_(g[kV2]));
+  const T u1 = g[kU1] * mu, u2 = g[kU2] * mu, v1 = g[kV1] * mv, v2 = g[kV2] * mv;  // in [-1, 1]
+  const T det = u1 * v2 - u2 * v1, angle = abs_(det);
+  const T inv = T(1.0f) / det;
+  const T r = sqrt_(r2) * (T(1.0001) + T(1e-6) / angle);
+  const T ku = g[kW0] * mu * inv * r, kv = g[kW0] * mv * inv * r;
+  return {ku * v2,
+          -kv * u2,
+          -ku * v1,
+          kv * u1,
+          (g[kW2] * v1 - g[kW1] * v2) * mu * inv * r,
+          (g[kW1] * u2 - g[kW2] * u1) * mv * inv * r,
+          angle};
+}
+
+// Whether all that lies in front of the camera of a disc lies beyond a border of the image: the disc against the plane
+// through the camera and the border. `border`: offset from the projected centre of the border's line, which lies
+// between the centre and the image; 0: the centre is not beyond it. With X.q < border (1 + C.q) on the whole disc, or
+// >, no ray of the image meets it, also where it crosses the camera's plane and has no box. False for NaN.
+template <class T>
+BT_HD MaskOf<T> beyond_border(T xu, T xv, T cu, T cv, T border) {
+  const T u = xu - border * cu, v = xv - border * cv, far = abs_(border);
+  const T room = far - T(1e-5) * (abs_(xu) + abs_(xv) + far * (abs_(cu) + abs_(cv)));  // less what rounding may add
+  return (room > T(0.0f)) & (u * u + v * v < room * room);
+}
+template <class T>
+BT_HD MaskOf<T> out_of_view(const DiscImage<T>& d, T cx, T cy, int width, int height) {
+  const auto border = [](T c, int size) { return select(c < T(0.0f), -c, min_(T(double(size)) - c, T(0.0f))); };
+  return (d.angle > T(1e-6)) & (beyond_border(d.xu, d.xv, d.cu, d.cv, border(cx, width)) |
+                                beyond_border(d.yu, d.yv, d.cu, d.cv, border(cy, height)));
+}
+// Leaves the low pass alone of the discs without a box, `d`, that are out of view.
+template <class T>
+BT_HD void cut_to_view(const DiscImage<T>& d, T cx, T cy, int width, int height, Outline<T>& e) {
+  const MaskOf<T> in_view = not_(e.whole & out_of_view(d, cx, cy, width, height));
+  e.whole = e.whole & in_view, e.ellipse = e.ellipse & in_view;
+}
+
 template <class T>
 BT_HD Interval<T> range_of(const Outline<T>& e, T low, T high) {
   Interval<T> r;

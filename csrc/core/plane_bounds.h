@@ -1,11 +1,7 @@
 // Which pixels a surfel can touch, like bounds.h, but in the reals of the fragments: for the baked renderer on devices
-// on which doubles are slow. It solves the three planes of surfel.h for the pixel instead of forming a conic:
-//
-//   dx = X.q / (1 + C.q),  dy = Y.q / (1 + C.q)   with q = (u, v) / r on the unit disc,
-//
-// where r is the radius of the level set sigma = 1/255. A box and the crossings with a line then follow from sums of
-// squares; no determinant of squared coefficients is taken, so that a needle costs no digits. What does cost digits is
-// a small angle between the lines U = 0 and V = 0 on the screen; r is widened by as much.
+// on which doubles are slow. It takes the image of the level set's disc (outline.h) instead of forming a conic. A box
+// and the crossings with a line then follow from sums of squares; no determinant of squared coefficients is taken, so
+// that a needle costs no digits.
 #pragma once
 
 #include "core/bounds.h"
@@ -47,9 +43,7 @@ BT_HD LevelSet<S> level_set(const S* g, S near) {
 }
 
 template <class S>
-struct PlaneBounds : Outline<S> {
-  S xu = S(0), xv = S(0), yu = S(0), yv = S(0), cu = S(0), cv = S(0);  // X, Y, C
-};
+struct PlaneBounds : Outline<S>, DiscImage<S> {};
 
 // Box and outermost points from X, Y and C.
 template <class S>
@@ -73,25 +67,17 @@ BT_HD void bounding_box(PlaneBounds<S>& e) {
   }
 }
 
-// r2 and blur2 are those of level_set.
+// r2 and blur2 are those of level_set; of an image of that size.
 template <class S>
-BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2) {
-  PlaneBounds<S> e;
+BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, int width, int height) {
+  PlaneBounds<S> e = {};
   if (blur2 > S(0)) e.blur = low_pass_radius(blur2);
   if (!(g[kW0] > S(0))) return e;  // seen exactly edge-on: no ray hits it
   e.ellipse = true;
-  const S mu = S(1) / max_(abs_(g[kU1]), abs_(g[kU2])), mv = S(1) / max_(abs_(g[kV1]), abs_(g[kV2]));
-  const S u1 = g[kU1] * mu, u2 = g[kU2] * mu, v1 = g[kV1] * mv, v2 = g[kV2] * mv;  // in [-1, 1]
-  const S det = u1 * v2 - u2 * v1, angle = abs_(det);
-  const S inv = S(1) / det;
-  const S r = sqrt_(r2) * (S(1.0001) + S(1e-6) / angle);
-  const S ku = g[kW0] * mu * inv * r, kv = g[kW0] * mv * inv * r;
-  e.xu = ku * v2, e.xv = -kv * u2;
-  e.yu = -ku * v1, e.yv = kv * u1;
-  e.cu = (g[kW2] * v1 - g[kW1] * v2) * mu * inv * r;
-  e.cv = (g[kW1] * u2 - g[kW2] * u1) * mv * inv * r;
+  static_cast<DiscImage<S>&>(e) = disc_image(g, r2);
   bounding_box(e);
-  e.whole = e.whole || !(angle > S(1e-6));
+  e.whole = e.whole || !(e.angle > S(1e-6));
+  if (e.whole) cut_to_view<S>(e, g[kCx], g[kCy], width, height, e);
   return e;
 }
 
@@ -106,7 +92,7 @@ BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
   const Extent x = filtered_extent(g);
-  FilteredBounds<S> f;
+  FilteredBounds<S> f = {};
   f.visible = x.visible;
   PlaneBounds<S>& e = f.bounds;
   e.whole = x.visible && x.whole, e.ellipse = x.visible;

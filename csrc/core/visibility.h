@@ -15,6 +15,9 @@ BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
   return finite;
 }
 
+// Half extents of what has no box, in pixels, and the most that those of a box are.
+constexpr double kBoxless = 1e6;
+
 // What a camera sees of a surfel, or of one in each lane: rows of geom and frames, and half extents of the level set's
 // box in pixels. `projected`: it is finite and in front of the camera; `seen`: and its box meets the image.
 template <class T>
@@ -27,7 +30,7 @@ template <class T, class E>
 BT_HD void find_seen(MaskOf<T> visible, const E& extent, int width, int height, Sight<T>& s) {
   const auto columns = columns_of(extent), rows = rows_of(extent);
   const T x0 = narrowed<T>(columns.x0), x1 = narrowed<T>(columns.x1), y0 = narrowed<T>(rows.x0),
-          y1 = narrowed<T>(rows.x1), zero = T(0.0f), most = T(1e6);
+          y1 = narrowed<T>(rows.x1), zero = T(0.0f), most = T(kBoxless);
   const T cx = s.geom[kCx], cy = s.geom[kCy];
   s.seen = s.projected & visible & (x0 < x1) & (cx + x1 >= zero) & (T(width) >= cx + x0);
   s.seen = s.seen & (cy + y1 >= zero) & (T(height) >= cy + y0);
@@ -39,7 +42,7 @@ BT_HD Sight<S> sight(const Pinhole<S>& cam, int width, int height, const SurfelR
   Sight<S> s;
   s.projected = project<Kernel>(cam, in, near, s.geom, s.frame);
   if constexpr (Kernel::kResized) s.projected = s.projected && resize(to, s.geom);
-  const Extent e = extent<Kernel>(s.geom, double(to.sharp));
+  const Extent e = extent<Kernel>(s.geom, width, height, double(to.sharp));
   find_seen(e.visible, e, width, height, s);
   return s;
 }

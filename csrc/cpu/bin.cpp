@@ -56,6 +56,8 @@ class Extents {
       : geom_(view.geom),
         radii_(view.radii),
         near_(view.near),
+        width_(view.width),
+        height_(view.height),
         sharp_(double(Resize<S>(view.photo_pixel).sharp)),
         order_(order),
         next_(begin),
@@ -80,13 +82,9 @@ class Extents {
     else
       for (int lane = 0; lane < next_ - first_; ++lane) {
         const S* g = row(lane);
-        found_[lane] = extent<Kernel>(g, sharp_);
+        found_[lane] = extent<Kernel>(g, width_, height_, sharp_);
         if (filtered<Kernel>(g)) continue;  // has no level set of its own
-        double wide[kGeom];
-        for (int c = 0; c < kGeom; ++c) wide[c] = double(g[c]);
-        const Level<double> l = level_of<Kernel>(wide, sharp_, kFloatRoom);
-        const bool covered = covers_low_pass(wide, double(near_), 1 / sharp_);
-        note(lane, float(l.r2), covered ? 0.0f : float(l.blur));
+        note(lane, reach_levels<Kernel>(g, near_, sharp_));
       }
   }
   void look_at_pack() {
@@ -97,7 +95,7 @@ class Extents {
     }
     P g[kGeom];
     for (int c = 0; c < kGeom; ++c) g[c] = load(columns[c]);
-    auto [level, e] = pack_extent<Kernel>(g, sharp_);
+    auto [level, e] = pack_extent<Kernel>(g, width_, height_, sharp_);
     find_outermost(e);
     const P blur = select(covers_low_pass(g, P(near_), P(1 / sharp_)), P(0.0f), level.blur);
     const uint32_t whole = bits(e.whole), ellipse = bits(e.ellipse), thin = bits(e.thin);
@@ -109,16 +107,17 @@ class Extents {
       to.y_left = e.y_left[lane], to.y_right = e.y_right[lane], to.blur = e.blur[lane];
       to.qa = e.qa[lane], to.qb = e.qb[lane], to.qc = e.qc[lane];
       to.qd = e.qd[lane], to.qe = e.qe[lane], to.qf = e.qf[lane];
-      note(lane, level.r2[lane], blur[lane]);
+      note(lane, {level.r2[lane], blur[lane] * blur[lane]});
     }
   }
   const S* row(int lane) const { return geom_ + int64_t(order_[std::min(first_ + lane, end_ - 1)].second) * kGeom; }
-  void note(int lane, float r2, float blur) {
+  void note(int lane, ReachLevels levels) {
     float* to = level_ + 2 * int64_t(order_[first_ + lane].second);
-    to[0] = r2, to[1] = blur * blur;
+    to[0] = levels.r2, to[1] = levels.blur2;
   }
 
   const S *geom_, *radii_, near_;
+  int width_, height_;
   double sharp_;
   const Order<S>* order_;
   int64_t first_ = 0, next_, end_;
@@ -193,7 +192,7 @@ void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn)
   for (int row = 0; row < bins.tiles_y; ++row)
     for (int first = 0; first < bins.tiles_x; first += kLanes) {
       const P y = P(S(row * kTile) + S(0.5 * kTile) - g[kCy]);
-      const Reached r = reached_cells(g, column + P(S(first * kTile)), y, half_x, half_y, level);
+      const ReachedCells r = reached_cells(g, column + P(S(first * kTile)), y, half_x, half_y, level);
       const int there = std::min(kLanes, bins.tiles_x - first);
       for (uint32_t some = (r.support | r.centre) & ((1u << there) - 1); some; some &= some - 1)
         fn(row * bins.tiles_x + first + __builtin_ctz(some));

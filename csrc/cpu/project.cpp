@@ -47,7 +47,7 @@ Sight<P> sight(const Pinhole<float>& cam, int width, int height, const SurfelRow
   Sight<P> s;
   s.projected = project<Kernel>(cam, in, near, s.geom, s.frame);
   if constexpr (Kernel::kResized) s.projected = s.projected & resize(to, s.geom);
-  const PackExtent e = pack_extent<Kernel>(s.geom, double(to.sharp));
+  const PackExtent e = pack_extent<Kernel>(s.geom, width, height, double(to.sharp));
   find_seen(e.level.visible, e.conic, width, height, s);
   return s;
 }

@@ -17,26 +17,13 @@ BT_HD void prefetch(const View<S>& view, const Bins& bins, int64_t id) {
 }
 
 // Of 16 cells of an image those with a pixel in the kernel's level set, and in the low pass's.
-struct Reached {
+struct ReachedCells {
   uint32_t support, centre;
 };
-// How far pixels lie from a cell's middle, with what rounding may add; offsets of pixels are up to `largest`.
 template <class S>
-S cell_half(S half, S centre, S largest) {
-  return half + S(1e-6) * (largest + abs_(centre));
-}
-// x, y: offsets of the middles from the surfel's projected centre. Never one cell too few, few too many: within a cell
-// a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
-template <class S>
-BT_HD Reached reached_cells(const S* g, Pack<S> x, Pack<S> y, S half_x, S half_y, const float* level) {
-  using P = Pack<S>;
-  const P zero = P(S(0));
-  const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
-  const Planes<P> p = planes(g, x, y);
-  const Planes<P> nearest = {max_(abs_(p.U) - P(spread(kU1)), zero), max_(abs_(p.V) - P(spread(kV1)), zero),
-                             p.W + P(spread(kW1) + S(1e-6) * abs_(g[kW0]))};
-  const P dx = max_(abs_(x) - P(half_x + S(1e-3)), zero), dy = max_(abs_(y) - P(half_y + S(1e-3)), zero);
-  return {bits(within_in_front(nearest, P(S(level[0]) * S(1 + 1e-5)))), bits(dx * dx + dy * dy < P(S(level[1])))};
+BT_HD ReachedCells reached_cells(const S* g, Pack<S> x, Pack<S> y, S half_x, S half_y, const float* level) {
+  const Reached<Pack<S>> r = reached(g, x, y, half_x, half_y, S(level[0]), S(level[1]));
+  return {bits(r.support), bits(r.centre)};
 }
 
 // A tile's transmittance while its surfels are drawn front to back.
@@ -71,7 +58,7 @@ struct TileState {
   template <class Kernel, bool kAll, class F>
   void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp = S(1)) {
     const S *g = view.geom + id * kGeom, cx = g[kCx] - x0, cy = g[kCy] - y0;
-    const Reached r = reached<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
+    const ReachedCells r = reached_in_tile<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
     uint32_t packs = open_packs & (r.support | r.centre);
     // all fragments first: what a branch on one of them waits for is then known
     Fragment<P> found[kPacks];
@@ -107,13 +94,13 @@ struct TileState {
     if (!bits(open[pack])) open_packs &= ~(1u << pack);
   }
   template <class Kernel>
-  Reached reached(const S* g, S cx, S cy, const S* radius, const float* level) const {
+  ReachedCells reached_in_tile(const S* g, S cx, S cy, const S* radius, const float* level) const {
     constexpr S kHalf = S(0.5 * (kPackSide - 1));
     const P x = middle_x - P(cx), y = middle_y - P(cy);
     const S half_x = cell_half(kHalf, cx, S(kTile)), half_y = cell_half(kHalf, cy, S(kTile));
     const uint32_t box = bits((abs_(x) < P(radius[0] + half_x)) & (abs_(y) < P(radius[1] + half_y)));
     if (filtered<Kernel>(g)) return {box, 0};
-    const Reached r = reached_cells(g, x, y, half_x, half_y, level);
+    const ReachedCells r = reached_cells(g, x, y, half_x, half_y, level);
     return {box & r.support, box & r.centre};
   }
 };

@@ -62,11 +62,10 @@ struct alignas(Footprint) FootprintRoom {
 };
 __device__ Footprint& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint*>(&room); }
 
-// At most so many tiles are listed for a surfel.
+// At most so many tiles are listed for a surfel that has a box.
 __device__ int most_tiles(const Footprint& of, const BakedFrame& f) {
   const Interval<float> x = columns_of(of);
-  const int left = of.bounds.whole ? 0 : pixel_from(x.x0, f.width) / kTile,
-            right = of.bounds.whole ? f.tiles_x - 1 : pixel_to(x.x1, f.width) / kTile;
+  const int left = pixel_from(x.x0, f.width) / kTile, right = pixel_to(x.x1, f.width) / kTile;
   return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
 }
 
@@ -91,7 +90,7 @@ __device__ int64_t take_places(const BakedFrame& f, int pairs) {
 
 // Threads take a surfel each, then a row of tiles each, then a pair each, so that all are busy and neighbours write to
 // neighbouring places however many rows a surfel has and however wide they are. A block takes `owned` surfels. Those
-// of many tiles are only noted: the block with most of them would be what a frame waits for.
+// of many tiles, or without a box, are only noted: the block with most of them would be what a frame waits for.
 template <class Kernel>
 __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int owned) {
   __shared__ FootprintRoom area[kThreads];
@@ -106,10 +105,10 @@ __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int ow
   const int64_t first = int64_t(blockIdx.x) * owned, r = first + me;
   int mine = 0, rows = 0;
   if (me < owned && r < f.rows && m.depth[r] != kNeverSeen) {
-    const Footprint of = footprint<Kernel>(m.rows + r * kRow, f.height);
+    const Footprint of = footprint<Kernel>(m.rows + r * kRow, f.width, f.height);
     footprint_in(area[me]) = of;
     mine = of.bottom - of.top + 1;
-    if (most_tiles(of, f) >= kLarge) m.large[atomicAdd(m.large_count, 1)] = uint32_t(r), mine = 0;
+    if (of.bounds.whole || most_tiles(of, f) >= kLarge) m.large[atomicAdd(m.large_count, 1)] = uint32_t(r), mine = 0;
   }
   first_row[me] = block_sum_before(mine, sums, rows);
   __syncthreads();
@@ -137,7 +136,23 @@ __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int ow
   }
 }
 
-// The surfels of many tiles, a warp to a share of the rows of tiles of one.
+// Lists a row of tiles of a surfel without a box, of which lanes take a tile each.
+template <class Kernel>
+__device__ void list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
+  const float* row = f.memory.rows + int64_t(r) * kRow;
+  const uint32_t tile = first_tile(f, r, ty);
+  for (int first = 0; first < f.tiles_x; first += kWarp) {
+    const int tx = first + lane;
+    const uint32_t parts = tx < f.tiles_x ? reached_parts<Kernel>(row, tx, ty) : 0;
+    const unsigned votes = __ballot_sync(kFullMask, parts != 0);
+    int64_t place = 0;
+    if (lane == 0 && votes) place = take_places(f, __popc(votes));
+    place = __shfl_sync(kFullMask, place, 0);
+    if (parts) list_pair(f, place + count_below(votes, lane), r, tile + uint32_t(tx), parts);
+  }
+}
+
+// The surfels of many tiles and those without a box, a warp to a share of the rows of tiles of one.
 template <class Kernel>
 __global__ void __launch_bounds__(kThreads) large_pairs_kernel(BakedFrame f) {
   const BakedMemory& m = f.memory;
@@ -145,8 +160,12 @@ __global__ void __launch_bounds__(kThreads) large_pairs_kernel(BakedFrame f) {
   const int64_t shares = int64_t(*m.large_count) * kLargeParts;
   for (int64_t i = int64_t(blockIdx.x) * kWarps + threadIdx.x / kWarp; i < shares; i += warps) {
     const uint32_t r = m.large[i / kLargeParts];
-    const Footprint of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.height);
+    const Footprint of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.width, f.height);
     for (int ty = of.top + int(i % kLargeParts); ty <= of.bottom; ty += kLargeParts) {
+      if (of.bounds.whole) {
+        list_reached<Kernel>(f, r, ty, lane);
+        continue;
+      }
       const TileRow row = tile_row(of, ty, f.width);
       const int width = row.right - row.left + 1;
       if (width <= 0) continue;

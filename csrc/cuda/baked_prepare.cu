@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
         level = level_set(geom, s.near);
       for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
       row[kR2] = level.r2, row[kBlur2] = level.blur2;
-      const Footprint area = footprint<Kernel>(row, v.height);
+      const Footprint area = footprint<Kernel>(row, v.width, v.height);
       const Interval<float> x = columns_of(area);
       seen = level.visible && area.top <= area.bottom && (area.bounds.whole || (x.x1 >= 0 && x.x0 <= v.width));
       z = geom[kZ];

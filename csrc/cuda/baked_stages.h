@@ -1,6 +1,7 @@
 // What the stages of the baked renderer share: working memory, a surfel's row, and the tiles it touches.
 #pragma once
 
+#include "core/kernel.h"
 #include "core/plane_bounds.h"
 #include "core/resize.h"
 #include "cuda/baked.h"
@@ -77,14 +78,14 @@ BT_HD void geom_of(const float* row, float* geom) {
   geom[kArea] = row[kBlur2] < 0 ? -row[kBlur2] : 0.0f;
 }
 template <class Kernel>
-BT_HD Footprint footprint(const float* row, int height) {
+BT_HD Footprint footprint(const float* row, int width, int height) {
   Footprint f;
   if (Kernel::kPixel && row[kBlur2] < 0) {
     float geom[kGeom];
     geom_of(row, geom);
     f.bounds = filtered_bounds<float>(geom).bounds;
   } else {
-    f.bounds = plane_bounds(row, row[kR2], row[kBlur2]);
+    f.bounds = plane_bounds(row, row[kR2], row[kBlur2], width, height);
   }
   f.cx = row[kCx], f.cy = row[kCy];
   f.pad = float(kBoundPad) + 1e-6f * (abs_(f.cx) + abs_(f.cy));
@@ -106,7 +107,8 @@ BT_HD Interval<float> columns_of(const Footprint& f) {
   return {f.cx + x.x0 - pad, f.cx + x.x1 + pad};
 }
 
-// A row of tiles: the pixels that can be touched in each of its bands of four rows, and the tiles of these.
+// A row of tiles: the pixels that can be touched in each of its bands of four rows, and the tiles of these; of a
+// footprint with a box.
 struct TileRow {
   int from[kBands], to[kBands];  // pixels, none when from > to
   int left, right;               // tiles, none when left > right
@@ -116,13 +118,11 @@ BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
   const PlaneBounds<float>& e = f.bounds;
   int from = width, to = -1;
   Interval<float> upper;  // crossings with the line above a band; below it those of the next
-  if (e.ellipse && !e.whole) add_crossings(e, ty * kTile - f.cy, upper);
+  if (e.ellipse) add_crossings(e, ty * kTile - f.cy, upper);
   for (int band = 0; band < kBands; ++band) {
     const float lo = ty * kTile + band * kBandRows - f.cy, hi = lo + kBandRows;
     Interval<float> x;
-    if (e.whole) {
-      x.add(-1e30f, 1e30f);
-    } else if (e.ellipse) {
+    if (e.ellipse) {
       Interval<float> lower;
       add_crossings(e, hi, lower);
       x.add(min_(upper.x0, lower.x0), max_(upper.x1, lower.x1));
@@ -130,7 +130,7 @@ BT_HD TileRow tile_row(const Footprint& f, int ty, int width) {
       add_outermost(true, e, lo, hi, f.pad + float(kBoundSlack) * (e.y1 - e.y0), x);
       x.x0 -= f.pad, x.x1 += f.pad;
     }
-    add_low_pass(!e.whole, e, lo, hi, x);
+    add_low_pass(true, e, lo, hi, x);
     r.from[band] = x.empty() ? width : pixel_from(f.cx + x.x0, width);
     r.to[band] = x.empty() ? -1 : pixel_to(f.cx + x.x1, width);
     if (r.from[band] <= r.to[band]) from = min_(from, r.from[band]), to = max_(to, r.to[band]);
@@ -146,6 +146,23 @@ BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   for (int band = 0; band < kBands; ++band) {
     mask |= uint32_t(r.from[band] < x + half && r.to[band] >= x) << (2 * band);
     mask |= uint32_t(r.from[band] < x + 2 * half && r.to[band] >= x + half) << (2 * band + 1);
+  }
+  return mask;
+}
+// The same for a disc without a box that crosses the camera's plane: the parts that its level set or its low pass
+// reaches. All of those of a disc seen through a pixel.
+template <class Kernel>
+BT_HD uint32_t reached_parts(const float* row, int tx, int ty) {
+  if (Kernel::kPixel && row[kBlur2] < 0) return (1u << 2 * kBands) - 1;
+  constexpr float kPartWidth = kTile / 2;
+  const float x = tx * kTile - row[kCx], y = ty * kTile - row[kCy];
+  const float half_x = cell_half(0.5f * (kPartWidth - 1), row[kCx], abs_(x) + kTile),
+              half_y = cell_half(0.5f * (kBandRows - 1), row[kCy], abs_(y) + kTile);
+  uint32_t mask = 0;
+  for (int part = 0; part < 2 * kBands; ++part) {
+    const Reached<float> r = reached(row, x + (float(part % 2) + 0.5f) * kPartWidth,
+                                     y + (float(part / 2) + 0.5f) * kBandRows, half_x, half_y, row[kR2], row[kBlur2]);
+    mask |= uint32_t(r.support || r.centre) << part;
   }
   return mask;
 }

@@ -4,8 +4,10 @@
 // the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
 // order. There are about six pairs per surfel: the large sort moves 8 bytes per pair through two passes (13 bits for
 // 4,000 tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
+#include "core/kernel.h"
 #include "cuda/kernels.h"
 #include "cuda/primitives.h"
+#include "cuda/warp.h"
 #include "cuda/workspace.h"
 
 namespace bt::cuda {
@@ -54,17 +56,50 @@ struct FillSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
+// Whether a disc crosses the camera's plane, so that it has no box whose tiles could be listed.
 template <class Kernel, class S>
-__global__ void __launch_bounds__(kThreads)
-    count_kernel(int64_t n, const S* geom, const S* radii, int width, int height, CountSpace<S> w) {
+__device__ bool boxless(const Extent& e, const S* g) {
+  return e.whole && !filtered<Kernel>(g);
+}
+// fn(votes, tile) by all lanes of a warp for the tiles that such a disc reaches: lanes take a tile each, those with a
+// vote have one that is reached.
+template <class Kernel, class S, class F>
+__device__ void for_reached_tiles(const S* g, S near, int width, int height, int lane, F&& fn) {
+  const ReachLevels levels = reach_levels<Kernel>(g, near, 1);
+  const int across = tiles_across(width), tiles = across * tiles_across(height);
+  const S side = S(kTile), half = S(0.5) * (side - S(1));
+  const S half_x = cell_half(half, g[kCx], S(width) + side), half_y = cell_half(half, g[kCy], S(height) + side);
+  for (int first = 0; first < tiles; first += kWarp) {
+    const int tile = first + lane, row = tile / across, column = tile - row * across;
+    const Reached<S> r = reached(g, (S(column) + S(0.5)) * side - g[kCx], (S(row) + S(0.5)) * side - g[kCy], half_x,
+                                 half_y, S(levels.r2), S(levels.blur2));
+    const unsigned votes = __ballot_sync(kFullMask, tile < tiles && (r.support || r.centre));
+    if (votes) fn(votes, tile);
+  }
+}
+
+template <class Kernel, class S>
+__global__ void __launch_bounds__(kThreads) count_kernel(View<S> v, CountSpace<S> w) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= n) return;
-  const bool visible = radii[2 * i] > S(0);
+  const int lane = int(threadIdx.x) % kWarp;
+  const bool visible = i < v.n && v.radii[2 * i] > S(0);
+  bool crosses = false;
   int64_t count = 0;
-  if (visible)
-    for_tile_rows(extent<Kernel>(geom + i * kGeom), geom + i * kGeom, width, height,
-                  [&](int, int first, int last) { count += last - first + 1; });
-  w.keys[i] = visible ? sort_key(geom[i * kGeom + kZ]) : ~typename SortKey<S>::type(0);
+  if (visible) {
+    const S* g = v.geom + i * kGeom;
+    const Extent e = extent<Kernel>(g, v.width, v.height);
+    crosses = boxless<Kernel>(e, g);
+    if (!crosses) for_tile_rows(e, g, v.width, v.height, [&](int, int first, int last) { count += last - first + 1; });
+  }
+  for (unsigned todo = __ballot_sync(kFullMask, crosses); todo; todo &= todo - 1) {
+    const int j = __ffs(int(todo)) - 1;
+    int reached = 0;
+    for_reached_tiles<Kernel>(v.geom + (i - lane + j) * kGeom, v.near, v.width, v.height, lane,
+                              [&](unsigned votes, int) { reached += __popc(votes); });
+    if (lane == j) count = reached;
+  }
+  if (i >= v.n) return;
+  w.keys[i] = visible ? sort_key(v.geom[i * kGeom + kZ]) : ~typename SortKey<S>::type(0);
   w.rows[i] = int32_t(i);
   w.counts[i] = int32_t(count);  // at most the tiles of an image
 }
@@ -82,39 +117,55 @@ __global__ void __launch_bounds__(kThreads)
 // slot without a tile is a pair behind those of all tiles, and the difference is noted.
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kThreads)
-    list_kernel(int64_t n, const S* geom, int width, int height, const int32_t* order, const int64_t* slot_start,
-                FillSpace w, int32_t* differing) {
+    list_kernel(View<S> v, const int32_t* order, const int64_t* slot_start, FillSpace w, int32_t* differing) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int lane = int(threadIdx.x) % kWarp, across = tiles_across(width);
-  const int64_t from = r < n ? slot_start[r] : 0, count = r < n ? slot_start[r + 1] - from : 0;
-  const auto list = [&](int32_t id, int64_t at, int64_t end, int mine, int step) {
-    const S* g = geom + int64_t(id) * kGeom;
-    for_tile_rows(extent<Kernel>(g), g, width, height, [&](int row, int first, int last) {
+  const int lane = int(threadIdx.x) % kWarp, across = tiles_across(v.width);
+  const int64_t from = r < v.n ? slot_start[r] : 0, count = r < v.n ? slot_start[r + 1] - from : 0;
+  const int32_t id = count ? order[r] : 0;
+  const auto put = [&](int64_t slot, int tile, int32_t whose) {
+    w.tile[slot] = uint32_t(tile);
+    w.slots[slot] = int32_t(slot);
+    w.owner[slot] = whose;
+  };
+  // the tiles of a box by `step` threads, of which this is number `mine`; where the next slot is
+  const auto list_box = [&](const Extent& e, int32_t whose, int64_t at, int64_t end, int mine, int step) {
+    for_tile_rows(e, v.geom + int64_t(whose) * kGeom, v.width, v.height, [&](int row, int first, int last) {
       for (int column = first + mine; column <= last; column += step) {
         const int64_t slot = at + column - first;
         if (slot >= end) break;
-        w.tile[slot] = uint32_t(row * across + column);
-        w.slots[slot] = int32_t(slot);
-        w.owner[slot] = id;
+        put(slot, row * across + column, whose);
       }
       at += last - first + 1;
     });
-    if (at != end && mine == 0) atomicAdd(differing, int32_t(at < end ? end - at : at - end));
-    for (int64_t slot = at + mine; slot < end; slot += step) {
-      w.tile[slot] = uint32_t(across * tiles_across(height));
-      w.slots[slot] = int32_t(slot);
-      w.owner[slot] = id;
-    }
+    return at;
   };
-  const int32_t id = count ? order[r] : 0;
-  if (count && count <= kAlone) list(id, from, from + count, 0, 1);
-  unsigned large = __ballot_sync(kFullMask, count > kAlone);
-  while (large) {
-    const int j = __ffs(int(large)) - 1;
-    large &= large - 1;
+  const auto close = [&](int32_t whose, int64_t at, int64_t end, int mine, int step) {
+    if (at != end && mine == 0) atomicAdd(differing, int32_t(at < end ? end - at : at - end));
+    for (int64_t slot = at + mine; slot < end; slot += step) put(slot, across * tiles_across(v.height), whose);
+  };
+  bool by_warp = false;
+  if (count) {
+    const S* g = v.geom + int64_t(id) * kGeom;
+    const Extent e = extent<Kernel>(g, v.width, v.height);
+    by_warp = count > kAlone || boxless<Kernel>(e, g);
+    if (!by_warp) close(id, list_box(e, id, from, from + count, 0, 1), from + count, 0, 1);
+  }
+  for (unsigned todo = __ballot_sync(kFullMask, by_warp); todo; todo &= todo - 1) {
+    const int j = __ffs(int(todo)) - 1;
     const int32_t whose = __shfl_sync(kFullMask, id, j);
-    const int64_t at = __shfl_sync(kFullMask, from, j);
-    list(whose, at, at + __shfl_sync(kFullMask, count, j), lane, kWarp);
+    int64_t at = __shfl_sync(kFullMask, from, j);
+    const int64_t end = at + __shfl_sync(kFullMask, count, j);
+    const S* g = v.geom + int64_t(whose) * kGeom;
+    const Extent e = extent<Kernel>(g, v.width, v.height);
+    if (boxless<Kernel>(e, g))
+      for_reached_tiles<Kernel>(g, v.near, v.width, v.height, lane, [&](unsigned votes, int tile) {
+        const int64_t slot = at + count_below(votes, lane);
+        if ((votes >> lane & 1u) && slot < end) put(slot, tile, whose);
+        at += __popc(votes);
+      });
+    else
+      at = list_box(e, whose, at, end, lane, kWarp);
+    close(whose, at, end, lane, kWarp);
   }
 }
 
@@ -163,8 +214,7 @@ void bin_count(const BinCount<S>& a, Stream stream) {
   const CountSpace<S> w(arena, n);
   if (n)
     with_kernel(v.through_pixel, [&](auto kernel) {
-      BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, n, v.geom, v.radii, v.width,
-                v.height, w);
+      BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, v, w);
     });
   sort_pairs(w.keys, w.sorted, w.rows, a.order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
   BT_LAUNCH(rank_kernel, blocks(n + 1), dim3(kThreads), 0, stream, n, a.order, w.counts, w.ranked);
@@ -180,8 +230,8 @@ void bin_fill(const BinFill<S>& a, Stream stream) {
   fill_zero(a.differing, 1, stream);
   if (pairs) {
     with_kernel(v.through_pixel, [&](auto kernel) {
-      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v.n, v.geom, v.width,
-                v.height, a.order, a.slot_start, w, a.differing);
+      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start, w,
+                a.differing);
     });
     sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
     BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, a.slot, w.owner, a.surfel);

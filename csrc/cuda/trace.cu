@@ -6,6 +6,7 @@
 // marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes
 // with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
+#include "core/visibility.h"
 #include "cuda/fast.h"
 #include "cuda/kernels.h"
 #include "cuda/primitives.h"
@@ -26,6 +27,17 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
+// Whether the support or the low pass of a surfel without a box may reach the warp's pixels.
+template <class Kernel, class S>
+__device__ bool reached_by_warp(const S* g, const TileThread& s) {
+  if (filtered<Kernel>(g)) return true;
+  const S x = S(s.left) + S(0.5 * kWarpWidth) - g[kCx], y = S(s.top) + S(0.5 * kWarpHeight) - g[kCy];
+  const Reached<S> r = reached(g, x, y, cell_half(S(0.5 * (kWarpWidth - 1)), g[kCx], abs_(x) + S(kTile)),
+                               cell_half(S(0.5 * (kWarpHeight - 1)), g[kCy], abs_(y) + S(kTile)), S(kSupport2),
+                               S(kLowPassReach * kLowPassReach));
+  return r.support || r.centre;
+}
+
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
@@ -39,7 +51,7 @@ __global__ void __launch_bounds__(kTileThreads)
   bool open = s.x < width && s.y < height;  // the pixel still takes light
   S transmittance = S(1);
   for (; first < end && __any_sync(kFullMask, open); first += kWarp) {
-    // one lane per pair: does its box meet the warp's pixels?
+    // one lane per pair: does its box meet the warp's pixels, or do these reach it where it has none?
     const int64_t own = first + s.lane;
     int32_t id = 0;
     bool meets = false;
@@ -49,6 +61,7 @@ __global__ void __launch_bounds__(kTileThreads)
       const S rx = radii[2 * int64_t(id)], ry = radii[2 * int64_t(id) + 1];
       meets = cx + rx >= S(s.left) && cx - rx <= S(s.left + kWarpWidth) && cy + ry >= S(s.top) &&
               cy - ry <= S(s.top + kWarpHeight);
+      if (meets && max_(rx, ry) >= S(kBoxless)) meets = reached_by_warp<Kernel>(geom + int64_t(id) * kGeom, s);
     }
     unsigned todo = __ballot_sync(kFullMask, meets);
     uint32_t mark = 0;

@@ -6,12 +6,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.ops.baked_cuda import Stage, listed_pairs
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.cuda.baked_scenes import FLIP, camera_of, front, most, scene_of
-from tests.ops.golden import random_scene
+from tests.ops.golden import SURFEL_KEYS, crossing_scene, random_scene, reference, tiles_reached
+
+
+def mask_pixels(renderer: BakedRenderer, surfels: int, width: int, height: int) -> int:
+    """Pixels of all parts of tiles that pairs of a frame of one view name, within the image or not."""
+    pairs = listed_pairs(renderer.workspace, surfels, 1, width, height).pairs
+    masks = pairs[: renderer.workspace.pairs] & 0xFF
+    return 32 * sum(int((masks >> part & 1).sum()) for part in range(8))
 
 
 def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, views: int) -> list[Tensor]:
@@ -20,18 +27,7 @@ def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, vie
     They must be front to back, those of one depth by their number, each once; the lists must not overlap and hold all
     pairs that fit.
     """
-    memory, at = renderer.workspace.memory.cpu(), 256
-    tiles, rows, capacity = -(-width // 16) * -(-height // 16) * views, surfels * views, renderer.workspace.capacity
-
-    def take(count: int) -> Tensor:
-        nonlocal at
-        values = memory[at : at + 4 * count].view(torch.int32)
-        at += -(-4 * count // 256) * 256
-        return values
-
-    ranges = take(2 * tiles).view(tiles, 2)
-    take(24 * rows)
-    depth, pairs = take(rows).long() & 0xFFFFFFFF, take(-(-capacity // 8) * 8).long() & 0xFFFFFFFF
+    ranges, depth, pairs = listed_pairs(renderer.workspace, surfels, views, width, height)
     order = ranges[ranges[:, 0].argsort(stable=True)]
     order = order[order[:, 0] < order[:, 1]]
     assert order[0, 0] == 0 and torch.equal(order[1:, 0], order[:-1, 1])
@@ -52,7 +48,7 @@ def test_large_surfels(count: int, device: torch.device, cpu) -> None:
     scene, camera = scene_of(case), camera_of(case)
     renderer = BakedRenderer(scene.to(device), camera.width, camera.height, images=("overdraw",))
     got = renderer.draw([camera])["overdraw"].cpu()
-    assert renderer.workspace.pairs > 40 * count
+    assert renderer.workspace.pairs > 30 * count
     with cpu():
         want = scene.render(camera, maps=True).overdraw
     assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
@@ -70,6 +66,24 @@ def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: 
     with cpu():
         want = scene.render(camera, maps=True).overdraw
     assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
+
+
+@pytest.mark.parametrize("width, height", [(96, 80), (300, 200)])
+@pytest.mark.parametrize("seed", range(2))
+def test_discs_across_the_camera_plane_are_listed_where_they_show(
+    seed: int, width: int, height: int, device: torch.device, cpu
+) -> None:
+    """They have no box: none beyond the image's borders, the others in tiles that they reach, and in parts of these."""
+    case = crossing_scene(60, seed, width, height)
+    scene, camera = scene_of(case), camera_of(case)
+    renderer = BakedRenderer(scene.to(device), width, height, images=("overdraw",))
+    got = renderer.draw([camera])["overdraw"].cpu()
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
+    weights = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    assert renderer.workspace.pairs <= 1.25 * int(tiles_reached(weights, width, height).sum())
+    assert mask_pixels(renderer, 60, width, height) <= 1.25 * float(want.sum())
 
 
 def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu) -> None:

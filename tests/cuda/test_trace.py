@@ -16,7 +16,18 @@ from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.scene import Camera
-from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, load_golden, random_scene
+from tests.ops.golden import (
+    GOLDEN_NAMES,
+    SURFEL_KEYS,
+    SV_KEYS,
+    SceneCase,
+    crossing_scene,
+    extreme_scenes,
+    load_golden,
+    random_scene,
+    reference,
+    tiles_reached,
+)
 
 CpuContext = Callable[[], AbstractContextManager[None]]
 EXACT_RIM = 1e-12  # the references bound nothing
@@ -336,3 +347,21 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
     shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
     with pytest.raises(ValueError, match="16 bytes"):
         ops.trace(replace(projection, geom=shifted))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("seed", range(2))
+def test_discs_across_the_camera_plane_are_listed_where_they_show(
+    seed: int, dtype: torch.dtype, device: torch.device, cpu: CpuContext
+) -> None:
+    case = crossing_scene(60, seed, 300, 200)
+    values = [case.params[name].to(device, dtype) for name in SURFEL_KEYS]
+    projection = ops.project(*values, Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height))
+    fragments = ops.trace(projection, EXACT_RIM)
+    weights = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    shown = tiles_reached(weights, case.width, case.height)
+    seen = projection.radii[:, 0].cpu() > 0
+    assert not ((shown > 0) & ~seen).any() and (seen & (shown == 0)).sum() <= 10
+    assert fragments.layout.pairs <= 1.25 * int(shown.sum())
+    count = int((weights > 0).sum())
+    assert abs(fragments.surfel.shape[0] - count) <= (0 if dtype == torch.float64 else 1e-4 * count)

@@ -11,7 +11,14 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase, extreme_scenes, random_scene
+from bitymi_ns.measure.stability.scenes import (
+    SURFEL_KEYS,
+    SV_KEYS,
+    SceneCase,
+    crossing_scene,
+    extreme_scenes,
+    random_scene,
+)
 from bitymi_ns.ops.fragment_list import Places
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
@@ -24,11 +31,13 @@ __all__ = [
     "Golden",
     "SceneCase",
     "camera_of",
+    "crossing_scene",
     "dense",
     "extreme_scenes",
     "load_golden",
     "random_scene",
     "reference",
+    "tiles_reached",
     "traced",
 ]
 
@@ -104,6 +113,14 @@ def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False
     """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
+
+
+def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:
+    """[N]: in how many screen tiles of 16 x 16 pixels each surfel has a fragment; weights [H W, N]."""
+    across, down = -(-width // 16), -(-height // 16)
+    padded = weights.new_zeros(16 * down, 16 * across, weights.shape[1])
+    padded[:height, :width] = weights.view(height, width, -1)
+    return (padded.view(down, 16, across, 16, -1).amax((1, 3)) > 0).sum((0, 1))
 
 
 def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:

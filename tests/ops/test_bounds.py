@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bitymi_ns.measure.stability.scenes import quaternions
 from bitymi_ns.ops import backend
-from tests.ops.golden import SURFEL_KEYS, dense, random_scene, reference, traced
+from tests.ops.golden import SURFEL_KEYS, crossing_scene, dense, random_scene, reference, tiles_reached, traced
 
 
 @pytest.mark.parametrize("prefilter", [False, True], ids=["low pass", "prefilter"])
@@ -46,3 +49,43 @@ def test_bounds_leave_most_tiles_out() -> None:
     tracer.run(**projection.view(projection.geom), most=0)
     boxes = (2 * projection.radii / 16 + 1).clamp(max=20).prod(-1).sum()
     assert tracer.pairs < 0.9 * float(boxes)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("seed", range(4))
+def test_discs_across_the_camera_plane_are_listed_where_they_show(seed: int, dtype: torch.dtype) -> None:
+    """Such a disc has no box. It is left out beyond the image's borders, and listed in tiles that it reaches."""
+    case = crossing_scene(120, seed)
+    fragments, projection = traced(case, [case.params[name].to(dtype) for name in SURFEL_KEYS])
+    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    found = dense(fragments, fragments.weight, 120)
+    assert ((found > 0) != (want > 0)).double().mean() < (1e-12 if dtype == torch.float64 else 1e-4)
+    shown, seen = tiles_reached(want, case.width, case.height), projection.radii[:, 0] > 0
+    assert (shown == 0).sum() > 40 and (shown > 0).sum() > 40
+    assert not ((shown > 0) & ~seen).any()
+    assert (seen & (shown == 0)).sum() <= 20  # by no one border alone
+    tracer = backend.kernel_class("Trace", projection.geom)()
+    tracer.run(**projection.view(projection.geom.detach()), most=0)
+    assert tracer.pairs <= 1.25 * int(shown.sum())
+
+
+def test_a_disc_out_of_view_keeps_its_low_pass() -> None:
+    """A disc along the plane of the left border, a third of a pixel beyond it, that crosses the camera's plane."""
+    case = crossing_scene(1, 0, width=40, height=30)
+    case = replace(case, viewmat=torch.eye(4, dtype=torch.float64))
+    fx, cx = case.K[0, 0].item(), case.K[0, 2].item()
+    along = torch.tensor([-(cx + 0.3) / fx, 0.0, 1.0], dtype=torch.float64)
+    border = torch.tensor([-cx / fx, 0.0, 1.0], dtype=torch.float64)
+    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    u = border / border.norm()
+    case.params |= {
+        "means": 0.5 * along[None],
+        "quats": quaternions(torch.stack([u, down, torch.linalg.cross(u, down)], dim=1)[None]),
+        "log_scales": torch.zeros(1, 2, dtype=torch.float64),
+        "opacity_logits": torch.full((1,), 3.0, dtype=torch.float64),
+    }
+    values = [case.params[name] for name in SURFEL_KEYS]
+    fragments, projection = traced(case, values)
+    want = reference(case, values).weight
+    assert (want > 0).sum() == 7 and 2 < float(projection.radii.max()) < 3
+    torch.testing.assert_close(dense(fragments, fragments.weight, 1), want, rtol=1e-9, atol=1e-12)

@@ -4,14 +4,14 @@
 
 struct Rectangle {
   visible: bool,
-  whole: bool,  // the disc comes near the camera plane: anything on the screen
   axis: vec2f,
-  middle: vec2f,
+  middle: vec2f,  // pixels
   half_size: vec2f,
 }
 
 const BOUND_PAD: f32 = 0.02;  // pixels
 const WIDEST: f32 = 1e5;  // pixels, beyond which the whole screen is drawn
+const LEAST_ANGLE: f32 = 1e-6;  // between the lines U = 0 and V = 0, below which floats do not tell where a disc is
 
 // Squared radius in scale units at which the kernel is exp(-level) of its centre, a little wide.
 fn level_radius2(level: f32, beta: f32) -> f32 {
@@ -32,22 +32,91 @@ fn reach(e: vec2f, p: vec2f, q: vec2f, c: vec2f, rest: f32) -> vec2f {
   return vec2f(-pc - h, h - pc) / rest;
 }
 
-fn finish(axis: vec2f, along: vec2f, across: vec2f) -> Rectangle {
-  var r: Rectangle;
-  r.visible = true;
-  r.axis = axis;
-  r.middle = 0.5 * vec2f(along.x + along.y, across.x + across.y);
-  r.half_size = 0.5 * vec2f(along.y - along.x, across.y - across.x) * 1.0002 + BOUND_PAD;
-  r.whole = !(max(r.half_size.x, r.half_size.y) < WIDEST);
+fn hidden() -> Rectangle {
+  return Rectangle(false, vec2f(0.0), vec2f(0.0), vec2f(0.0));
+}
+fn screen() -> Rectangle {
+  return Rectangle(true, vec2f(1.0, 0.0), 0.5 * frame.size, 0.5 * frame.size);
+}
+
+// From `low` to `high` along an axis and across it, offsets from the projected centre.
+fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
+  let half_size = 0.5 * (high - low) * 1.0002 + BOUND_PAD;
+  if !(max(half_size.x, half_size.y) < WIDEST) { return screen(); }
+  let middle = 0.5 * (low + high);
+  return Rectangle(true, axis, center + axis * middle.x + vec2f(-axis.y, axis.x) * middle.y, half_size);
+}
+
+// Whether all of a disc that lies in front of the camera lies beyond a border of the image; core/outline.h.
+fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
+  let off = along - border * c;
+  let far = abs(border);
+  let room = far - 1e-5 * (abs(along.x) + abs(along.y) + far * (abs(c.x) + abs(c.y)));
+  return room > 0.0 && dot(off, off) < room * room;
+}
+
+const CORNERS: u32 = 8;  // of a polygon about the disc
+const MOST_CORNERS: u32 = CORNERS + 5;  // each plane adds one
+
+// What is left of a polygon about a disc behind `near` and within the image, and the low pass: for discs that cross the
+// camera's plane, whose image is no ellipse, and those whose ellipse is larger than the screen.
+fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
+  let border = select(-s.center, min(frame.size - s.center, vec2f(0.0)), s.center >= vec2f(0.0));
+  var low = vec2f(-blur);
+  var high = vec2f(blur);
+  var count = CORNERS;
+  if beyond_border(vec2f(p.x, q.x), c, border.x) || beyond_border(vec2f(p.y, q.y), c, border.y) { count = 0; }
+  var corners: array<vec3f, MOST_CORNERS>;  // offset from the centre times depth, and depth, in units of the centre's
+  for (var k = 0u; k < count; k++) {
+    let turn = (f32(k) + 0.5) * 6.2831853 / f32(CORNERS);
+    let at = 1.0824 * vec2f(cos(turn), sin(turn));  // 1 / cos(pi / 8)
+    corners[k] = vec3f(at.x * p + at.y * q, 1.0 + dot(c, at));
+  }
+  let planes = array<vec4f, 5>(
+    vec4f(0.0, 0.0, 1.0, -frame.near / s.z),
+    vec4f(1.0, 0.0, s.center.x, 0.0),
+    vec4f(-1.0, 0.0, frame.size.x - s.center.x, 0.0),
+    vec4f(0.0, 1.0, s.center.y, 0.0),
+    vec4f(0.0, -1.0, frame.size.y - s.center.y, 0.0),
+  );
+  for (var side = 0u; side < 5; side++) {
+    let polygon = corners;
+    let before = count;
+    count = 0;
+    for (var k = 0u; k < before; k++) {
+      let here = polygon[k];
+      let next = polygon[select(k + 1, 0, k + 1 == before)];
+      let inner = dot(planes[side], vec4f(here, 1.0));
+      let after = dot(planes[side], vec4f(next, 1.0));
+      if inner >= 0.0 {
+        corners[count] = here;
+        count++;
+      }
+      if (inner >= 0.0) != (after >= 0.0) && count < MOST_CORNERS {
+        corners[count] = here + inner / (inner - after) * (next - here);
+        count++;
+      }
+    }
+  }
+  if count > 0 && blur == 0.0 {  // nothing of the centre
+    low = vec2f(1e9);
+    high = -low;
+  }
+  for (var k = 0u; k < count; k++) {
+    let at = corners[k].xy / corners[k].z;
+    low = min(low, at - 0.5);
+    high = max(high, at + 0.5);
+  }
+  var r = finish(s.center, vec2f(1.0, 0.0), low, high);
+  r.visible = count > 0 || blur > 0.0;
   return r;
 }
 
 fn rectangle(s: Seen) -> Rectangle {
-  var r: Rectangle;
   let ratio = s.opacity / ALPHA_MIN;
   let blurred = -s.area * ratio;  // of the low pass
   let almost = 1.0 - 1e-6;
-  if max(ratio, blurred) < almost { return r; }
+  if max(ratio, blurred) < almost { return hidden(); }
   let r2 = level_radius2(log(max(ratio, 1.0)) + 1e-5, s.beta);
   // where the kernel is larger than the low pass everywhere, the low pass needs no room
   let blur2 = 1.0 / low_pass_sharp();
@@ -58,30 +127,31 @@ fn rectangle(s: Seen) -> Rectangle {
   var blur = 0.0;
   if !covered && blurred >= almost { blur = sqrt((log(max(blurred, 1.0)) + 1e-5) * blur2) + 0.01; }
   if !(s.w0 > 0.0) {  // seen exactly edge-on: no ray hits it
-    return finish(vec2f(1.0, 0.0), vec2f(-blur, blur), vec2f(-blur, blur));
+    return finish(s.center, vec2f(1.0, 0.0), vec2f(-blur), vec2f(blur));
   }
   let mu = 1.0 / max(abs(s.u.x), abs(s.u.y));
   let mv = 1.0 / max(abs(s.v.x), abs(s.v.y));
   let u = s.u * mu;
   let v = s.v * mv;
   let det = u.x * v.y - u.y * v.x;
-  r.visible = true;
-  r.whole = true;
-  if !(abs(det) > 1e-6) { return r; }
+  if !(abs(det) > LEAST_ANGLE) { return screen(); }
   let wide = sqrt(r2) * (1.0001 + 1e-6 / abs(det)) / det;
   let p = s.w0 * mu * wide * vec2f(v.y, -v.x);
   let q = s.w0 * mv * wide * vec2f(-u.y, u.x);
   let c = vec2f(s.w.y * v.x - s.w.x * v.y, s.w.x * u.y - s.w.y * u.x) * vec2f(mu, mv) * wide;
   let rest = 1.0 - dot(c, c);
-  if !(rest > 1e-3 && dot(p, p) + dot(q, q) < 1e12) { return r; }
+  if !(dot(p, p) + dot(q, q) < 1e12) { return screen(); }
+  if !(rest > 1e-3) { return clipped(s, p, q, c, blur); }
   let axis = major_axis(p, q);
   let along = reach(axis, p, q, c, rest);
   let across = reach(vec2f(-axis.y, axis.x), p, q, c, rest);
-  return finish(
-    axis,
-    vec2f(min(along.x, -blur), max(along.y, blur)),
-    vec2f(min(across.x, -blur), max(across.y, blur)),
-  );
+  let low = min(vec2f(along.x, across.x), vec2f(-blur));
+  let high = max(vec2f(along.y, across.y), vec2f(blur));
+  let r = finish(s.center, axis, low, high);
+  if max(r.half_size.x, r.half_size.y) < max(frame.size.x, frame.size.y) { return r; }
+  let cut = clipped(s, p, q, c, blur);
+  if !cut.visible || cut.half_size.x * cut.half_size.y < r.half_size.x * r.half_size.y { return cut; }
+  return r;
 }
 
 fn filter_variance(beta: f32) -> f32 {
@@ -90,36 +160,29 @@ fn filter_variance(beta: f32) -> f32 {
 
 // Seen through a pixel: the ellipse of the largest blur and magnification that any pixel can have (core/bounds.h).
 fn filtered_rectangle(s: Seen) -> Rectangle {
-  var r: Rectangle;
   let ratio = s.opacity / ALPHA_MIN;
-  if !(s.w0 > 0.0) || !(ratio > 1.0) { return r; }
+  if !(s.w0 > 0.0) || !(ratio > 1.0) { return hidden(); }
   let c = filter_variance(s.beta);
   let e = vec2f(s.w.x * s.v.y - s.w.y * s.v.x, s.u.x * s.w.y - s.u.y * s.w.x);
   let eta = SUPPORT * length(e) * s.area / s.w0 * 1.001;
-  r.visible = true;
-  r.whole = true;
-  if !(eta < 0.9) { return r; }
+  if !(eta < 0.9) { return screen(); }
   let w = 1.0 / (1.0 - eta);
   let p = w * s.area * vec2f(s.u.y, -s.u.x);
   let q = w * s.area * vec2f(s.v.y, -s.v.x);
   let area = w * w * s.area * s.w0;
   let det = area * area + c * (dot(p, p) + dot(q, q) + c);
   let level = log(ratio * area / sqrt(det)) + 1e-4;
-  r.visible = level >= 0.0;
-  if !r.visible { return r; }
+  if !(level >= 0.0) { return hidden(); }
   let r2 = level_radius2(level, s.beta);
   let axis = major_axis(p, q);
   let other = vec2f(-axis.y, axis.x);
   let along = sqrt(r2 * (dot(axis, p) * dot(axis, p) + dot(axis, q) * dot(axis, q) + c)) * 1.001;
   let across = sqrt(r2 * (dot(other, p) * dot(other, p) + dot(other, q) * dot(other, q) + c)) * 1.001;
-  return finish(axis, vec2f(-along, along), vec2f(-across, across));
+  return finish(s.center, axis, -vec2f(along, across), vec2f(along, across));
 }
 
 // Whether the rectangle meets the image.
-fn on_screen(s: Seen, r: Rectangle, size: vec2f) -> bool {
-  if !r.visible { return false; }
-  if r.whole { return true; }
+fn on_screen(r: Rectangle) -> bool {
   let box = abs(r.axis) * r.half_size.x + abs(r.axis.yx) * r.half_size.y;
-  let at = s.center + r.axis * r.middle.x + vec2f(-r.axis.y, r.axis.x) * r.middle.y;
-  return all(at + box >= vec2f(0.0)) && all(at - box <= size);
+  return r.visible && all(r.middle + box >= vec2f(0.0)) && all(r.middle - box <= frame.size);
 }

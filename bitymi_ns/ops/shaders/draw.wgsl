@@ -33,12 +33,9 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
   let s = seen[i];
   let surfel = surfels[i];
   let side = vec2f(f32(vertex & 1) * 2.0 - 1.0, f32(vertex >> 1) * 2.0 - 1.0);
-  var at = side;
-  if s.half_size.x >= 0.0 {
-    let offset = s.middle + side * s.half_size;
-    let pixel = s.center + s.axis * offset.x + vec2f(-s.axis.y, s.axis.x) * offset.y;
-    at = (pixel / frame.size * 2.0 - 1.0) * vec2f(1.0, -1.0);
-  }
+  let offset = side * s.half_size;
+  let pixel = s.middle + s.axis * offset.x + vec2f(-s.axis.y, s.axis.x) * offset.y;
+  let at = (pixel / frame.size * 2.0 - 1.0) * vec2f(1.0, -1.0);
   var out: Corner;
   out.position = vec4f(at, 0.0, 1.0);
   out.center_u = vec4f(s.center, s.u);

@@ -57,10 +57,10 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
 
   var r: Rectangle;
   if s.area > 0.0 { r = filtered_rectangle(s); } else { r = rectangle(s); }
-  if !on_screen(s, r, frame.size) { return; }
+  if !on_screen(r) { return; }
   s.axis = r.axis;
   s.middle = r.middle;
-  s.half_size = select(r.half_size, vec2f(-1.0), r.whole);
+  s.half_size = r.half_size;
   let direction = unit(surfel.mean - frame.color_center.xyz);
   s.level = tile_level(s, surfel);
   s.color = max(view_color(frame.kind, surfel, direction) + COLOR_BIAS, vec3f(0.0));

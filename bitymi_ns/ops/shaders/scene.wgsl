@@ -44,8 +44,8 @@ struct Seen {
   color: vec3f,  // relu(f_view + 0.5)
   area: f32,  // > 0 where the surfel is seen through a pixel; else by how much the low pass is higher, negative
   axis: vec2f,  // of the rectangle that holds it on the screen, a unit vector
-  middle: vec2f,  // of the rectangle, along the axis and across, pixels from `center`
-  half_size: vec2f,  // x < 0: the whole screen
+  middle: vec2f,  // of the rectangle, pixels
+  half_size: vec2f,  // along the axis and across
   normal_z: f32,
   level: u32,  // of its tile; TILE_LEVELS: the mean residual alone
 }

@@ -24,6 +24,8 @@ SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}
 BLOCK, DIGITS, ROUNDS = 1024, 16, 8
 """Of sort.wgsl: keys per block, digits, rounds of 4 bits."""
 MOST_LAYERS = 64
+_RECTANGLE = slice(16, 22)
+"""Columns of `Seen` in scene.wgsl."""
 _STRIDE = 256  # between the uniforms of batches and of rounds, which devices want so
 
 
@@ -76,10 +78,10 @@ class SceneOnDevice:
         self._surfels = self._upload(packed.surfels, storage)
         self._terms = self._upload(packed.terms, storage)
         self._frame = self._empty(160, flags.UNIFORM | flags.COPY_DST)
-        self._seen = self._empty(96 * n, storage)
+        self._seen = self._empty(96 * n, storage | flags.COPY_SRC)
         self._keys = [self._empty(4 * n, storage) for _ in range(2)]
-        self._order = [self._empty(4 * n, storage) for _ in range(2)]
-        self._visible = self._empty(4, storage | flags.COPY_DST)
+        self._order = [self._empty(4 * n, storage | flags.COPY_SRC) for _ in range(2)]
+        self._visible = self._empty(4, storage | flags.COPY_DST | flags.COPY_SRC)
         self._draws = self._empty(16 * MOST_LAYERS, storage | flags.INDIRECT)
         numbers = np.zeros((MOST_LAYERS, _STRIDE // 4), np.uint32)
         numbers[:, 0] = np.arange(MOST_LAYERS)
@@ -282,6 +284,15 @@ class SceneOnDevice:
         self._encode_drawing(encoder, target, show, layers)
         self._device.queue.submit([encoder.finish()])
         return target
+
+    def rectangles(self) -> npt.NDArray[np.float32]:
+        """What the latest view drew, front to back: [M, 6] a rectangle for each surfel, its axis (a unit vector on the
+        screen), its middle, and half its size along the axis and across, in pixels."""
+        queue = self._device.queue
+        count = int(np.frombuffer(queue.read_buffer(self._visible), np.uint32)[0])
+        order = np.frombuffer(queue.read_buffer(self._order[0]), np.uint32)[:count]
+        seen = np.frombuffer(queue.read_buffer(self._seen), np.float32).reshape(-1, 24)
+        return seen[order, _RECTANGLE]
 
     def _encode_sorting(self, encoder: Any) -> None:
         p, work = self._programs, encoder.begin_compute_pass()

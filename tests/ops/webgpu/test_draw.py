@@ -13,17 +13,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bitymi_ns.bake.quantise import bc7_encoder
 from bitymi_ns.ops import webgpu
+from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
 from bitymi_ns.ops.bc7 import decode_bc7
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ops.webgpu import on_device
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import camera_of, front, scene_of, textured
-from tests.ops.golden import GOLDEN_NAMES, SceneCase, atlas_of, extreme_scenes, load_golden
+from tests.ops.golden import (
+    GOLDEN_NAMES,
+    SURFEL_KEYS,
+    SceneCase,
+    atlas_of,
+    crossing_scene,
+    extreme_scenes,
+    load_golden,
+    reference,
+)
 from tests.ops.test_view_color import lean_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
@@ -64,6 +75,33 @@ def test_golden_scenes(name: str) -> None:
 def test_numbers_that_misbehave(case: SceneCase, prefilter: str) -> None:
     case = replace(case, width=min(case.width, 300), height=min(case.height, 300))
     check(scene_of(case, prefilter=prefilter), camera_of(case), case.background.float(), PICTURE)
+
+
+def covered(rectangle: NDArray[np.float32], width: int, height: int) -> int:
+    """Pixels of the image within a row of `SceneOnDevice.rectangles`."""
+    axis, middle, half_size = rectangle.reshape(3, 2).astype(np.float64)
+    y, x = np.mgrid[:height, :width] + 0.5 - middle[::-1, None, None]
+    along, across = x * axis[0] + y * axis[1], y * axis[0] - x * axis[1]
+    return int(((np.abs(along) < half_size[0]) & (np.abs(across) < half_size[1])).sum())
+
+
+@pytest.mark.parametrize("photo_pixel", [1.0, 0.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_discs_across_the_camera_plane_are_drawn_where_they_show(seed: int, photo_pixel: float) -> None:
+    """They have no ellipse: none beyond the image's borders, and of the others no more than the box of what shows."""
+    case = crossing_scene(80, seed, 150, 120)
+    scene, camera = scene_of(case), camera_of(case)
+    device = on_device.SceneOnDevice(scene)
+    counts = device.draw(camera, "overdraw", 1, photo_pixel)[..., 0]
+    want = draw_on_cpu(scene, [camera], None, ("overdraw",), photo_pixel)["overdraw"][0, ..., 0].numpy()
+    assert (np.abs(counts - want) > 0.5).mean() < 2e-3
+    if photo_pixel < 1:
+        return
+    shows = (reference(case, [case.params[name] for name in SURFEL_KEYS]).weight > 0).view(120, 150, -1)
+    boxes = [(x.any(0).sum() * x.any(1).sum()).item() for x in shows.unbind(-1) if x.any()]
+    drawn = [covered(r, 150, 120) for r in device.rectangles()]
+    assert len(drawn) <= len(boxes) + 8  # by no one border alone
+    assert sum(drawn) <= 1.25 * sum(boxes)
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])

@@ -85,6 +85,10 @@ __global__ void __launch_bounds__(kThreads) prepare_kernel(BakedScene s, BakedVi
       const Interval<float> x = columns_of(area);
       seen = level.visible && area.top <= area.bottom && (area.bounds.whole || (x.x1 >= 0 && x.x0 <= v.width));
       z = geom[kZ];
+      // where the nearest point of the disc lies behind `near`, so do all pixels of it
+      const PlaneBounds<float>& disc = area.bounds;
+      const float nearest = z * (1 - sqrt_(disc.cu * disc.cu + disc.cv * disc.cv));
+      if (!Kernel::kPixel && row[kBlur2] == 0 && (disc.whole || !(nearest > s.near * 1.0001f))) row[kBlur2] = kNearCuts;
     }
     if (seen) {
       float4* to = reinterpret_cast<float4*>(f.memory.rows + at * kRow);

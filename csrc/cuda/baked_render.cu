@@ -104,9 +104,9 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 }
 
 // A row under the thread's pixels, of which the first is dx, dy from the projected centre. Both are worked on together,
-// so that one does not wait for the other's steps. With LowPassKernel, kBlur says whether the low pass shows;
-// PixelKernel is for the rows that it filters alone.
-template <bool kMaps, class Kernel, bool kBlur>
+// so that one does not wait for the other's steps. Unless kAll the low pass does not show, and no pixel of the disc
+// lies before the near plane; PixelKernel is for the rows that it filters alone.
+template <bool kMaps, class Kernel, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];
   FastFloat y[kPixels];
@@ -117,8 +117,8 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
     taken[j] = p[j].transmittance > 0;
     if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
       at[j] = planes(s.g, FastFloat(dx), y[j]);
-      bool inside = within_in_front(at[j], FastFloat(s.r2)) & behind_near(s.g, a.near, at[j].W);
-      if (kBlur) inside |= dx * dx + y[j].v * y[j].v < s.blur2;
+      bool inside = within_in_front(at[j], FastFloat(s.r2));
+      if (kAll) inside = (inside & behind_near(s.g, a.near, at[j].W)) | (dx * dx + y[j].v * y[j].v < s.blur2);
       taken[j] &= inside;
     }
     any |= taken[j];
@@ -129,7 +129,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   any = false;
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
-    if (Kernel::kPixel || kBlur)
+    if (Kernel::kPixel || kAll)
       f[j] = fragment<Kernel, true>(s.g, a.near, FastFloat(dx), y[j], a.sharp);
     else
       f[j] = fragment_within(s.g, at[j]);
@@ -239,7 +239,7 @@ __global__ void __launch_bounds__(kThreads, (kMaps || Kernel::kPixel ? 3 : 4) * 
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
         if (filtered<Kernel>(s.g))
           blend<kMaps, Kernel, true>(a, s, dx, dy, p);
-        else if (s.blur2 > 0)
+        else if (Kernel::kPixel || s.blur2 != 0)
           blend<kMaps, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
         else
           blend<kMaps, Unfiltered<Kernel>, false>(a, s, dx, dy, p);

@@ -14,8 +14,9 @@ constexpr uint32_t kNeverSeen = 0xffffffffu;  // depth key of a surfel that is n
 // A surfel's row: the first twelve columns are those of GeomColumn. 24 floats are three sectors of 32 bytes.
 enum RowColumn {
   kR2 = kBeta + 1,  // level set u^2 + v^2 <= r2
-  kBlur2,           // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel.
-                    // With ResizedKernel it also says how high the low pass is: 1/255 is left of it there
+  kBlur2,           // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel;
+                    // kNearCuts: no low pass, but pixels have to be compared with the near plane. With ResizedKernel it
+                    // also says how high the low pass is: 1/255 is left of it there
   kRed,             // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
   kPage,                   // handle of the texture, 64 bits
@@ -24,6 +25,7 @@ enum RowColumn {
   kRow = kSpanX + 2
 };
 static_assert(kRow == 24 && kR2 == 12);
+constexpr float kNearCuts = -1;  // without PixelKernel, which compares all rows that it does not filter
 
 struct BakedMemory {
   int64_t* total;                     // pairs of surfel and tile

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import time
-import urllib.error
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bitymi_ns.host import lpips
 from bitymi_ns.host.errors import warn
 from bitymi_ns.train.losses import cc_psnr, psnr
 
-LPIPS_TIMEOUT = 30.0
-"""Seconds to wait for the server that has the weights of LPIPS."""
-
-_lpips: list[Any] = []
-"""Empty, or holding the network, or None when it cannot be had: tried once per process."""
+LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
+"""Names of LPIPS in the results, by the backbone: the conventions of nerfstudio and gsplat, and of 3DGS."""
+_lpips_missing: list[bool] = []
 _flip_missing: list[bool] = []
 
 
 def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-    """psnr, cc_psnr (after an affine fit of the colours), ssim, flip (where its package is installed) and lpips (where
-    its weights can be had).
+    """psnr, cc_psnr (after an affine fit of the colours), ssim, flip (where its package is installed), and lpips and
+    lpips_vgg (where their weights can be had).
 
     Args:
         image, reference: [H, W, 3] in [0, 1].
@@ -39,10 +34,10 @@ def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) 
         image, reference = image * mask, reference * mask
     result = {"psnr": psnr(image, reference, mask), "cc_psnr": cc_psnr(image, reference, mask)}
     result["ssim"] = ssim(image, reference)
-    for name, value in (("flip", flip(image, reference)), ("lpips", lpips(image, reference))):
-        if value is not None:
-            result[name] = value
-    return result
+    found = flip(image, reference)
+    if found is not None:
+        result["flip"] = found
+    return result | lpips_metrics(image, reference)
 
 
 def ssim(image: Tensor, reference: Tensor) -> float:
@@ -69,35 +64,17 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
     return float(mean)
 
 
-def lpips(image: Tensor, reference: Tensor) -> float | None:
-    """LPIPS with AlexNet; None when the weights cannot be had (one warning per process says why)."""
-    if not _lpips:
-        _lpips.append(_build_lpips())
-    network = _lpips[0]
-    if network is None:
-        return None
-    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
-    network.to(image.device)
-    with torch.no_grad():
-        return float(network(*pair))
-
-
-def _build_lpips() -> Any:
-    """The network, of which torchmetrics ships the heads and torch.hub fetches the backbone into its cache."""
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / "alexnet-owt-7be5be79.pth"
-    timeout = socket.getdefaulttimeout()
+def lpips_metrics(image: Tensor, reference: Tensor) -> dict[str, float]:
+    """`LPIPS` of two images; empty when the weights cannot be had (one warning per process says why), and for images
+    of fewer than 32 pixels along a side."""
+    if _lpips_missing or min(image.shape[:2]) < lpips.LEAST_SIDE:
+        return {}
     try:
-        if not weights.is_file() and os.environ.get("BITYMI_NO_DOWNLOAD"):
-            raise OSError("BITYMI_NO_DOWNLOAD is set")
-        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-        socket.setdefaulttimeout(LPIPS_TIMEOUT)
-        return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).eval()
-    except (OSError, urllib.error.URLError, ImportError, RuntimeError, ValueError) as error:
-        warn(f"LPIPS is left out: its weights are not at {weights} and cannot be fetched ({error}).")
-        return None
-    finally:
-        socket.setdefaulttimeout(timeout)
+        return {name: lpips.lpips(image, reference, backbone) for name, backbone in LPIPS.items()}
+    except lpips.LpipsUnavailable as error:
+        _lpips_missing.append(True)
+        warn(f"LPIPS is left out: {error}.")
+        return {}
 
 
 def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats: int = 3) -> float:

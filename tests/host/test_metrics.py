@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-import urllib.error
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,7 @@ def pair() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_equal_images_are_perfect(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics, "_lpips", [None])
+    monkeypatch.setattr(metrics, "_lpips_missing", [True])
     image = pair()[1]
     result = metrics.image_metrics(image, image)
     assert result["ssim"] == pytest.approx(1.0) and result["flip"] == pytest.approx(0.0, abs=1e-6)
@@ -35,7 +34,7 @@ def test_equal_images_are_perfect(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     flip_evaluator = pytest.importorskip("flip_evaluator")
-    monkeypatch.setattr(metrics, "_lpips", [None])
+    monkeypatch.setattr(metrics, "_lpips_missing", [True])
     image, reference = pair()
     result = metrics.image_metrics(image, reference)
     _, flip, _ = flip_evaluator.evaluate(reference.numpy(), image.numpy(), "LDR")
@@ -44,7 +43,7 @@ def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics, "_lpips", [None])
+    monkeypatch.setattr(metrics, "_lpips_missing", [True])
     _, reference = pair()
     darker = 0.7 * reference + 0.02
     result = metrics.image_metrics(darker, reference)
@@ -59,16 +58,24 @@ def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: 
 def test_lpips_that_cannot_be_had_is_left_out_with_one_warning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def offline(*args: object, **kwargs: object) -> None:
-        raise urllib.error.URLError("[Errno -2] offline")
+    def offline(backbone: str) -> None:
+        raise metrics.lpips.LpipsUnavailable("pip is offline")
 
-    monkeypatch.setattr(metrics, "_lpips", [])
-    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", offline)
-    monkeypatch.delenv("BITYMI_NO_DOWNLOAD", raising=False)
-    assert metrics.lpips(*pair()) is None
-    assert metrics.lpips(*pair()) is None
+    monkeypatch.setattr(metrics, "_lpips_missing", [])
+    monkeypatch.setattr(metrics.lpips, "load", offline)
+    metrics.lpips._on_device.cache_clear()
+    for _ in range(2):
+        assert "lpips" not in metrics.image_metrics(*pair())
     output = " ".join(capsys.readouterr().out.split())
-    assert output.count("LPIPS is left out") == 1 and "[Errno -2] offline" in output
+    assert output.count("LPIPS is left out") == 1 and "pip is offline" in output
+
+
+def test_images_too_small_for_lpips_go_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_lpips_missing", [])
+    monkeypatch.setattr(metrics.lpips, "lpips", lambda *_: 0.25)
+    assert metrics.image_metrics(*pair())["lpips_vgg"] == 0.25
+    image = torch.rand(40, 31, 3)
+    assert "lpips" not in metrics.image_metrics(image, image)
 
 
 def test_rendering_is_timed_alone() -> None:

@@ -15,13 +15,14 @@ from bitymi_ns.measure.bench.matrix import Matrix, Run, Stage
 from bitymi_ns.measure.markdown import table
 
 HEADER = (
-    "scene", "row", "form", "PSNR", "ccPSNR", "SSIM", "FLIP", "LPIPS", "surfels", "fragments/px", "render ms",
-    "training s", "training CPU s", "process CPU s", "peak RSS MB", "bundle bytes", "atlas bytes", "dPSNR",
+    "scene", "row", "form", "PSNR", "ccPSNR", "SSIM", "FLIP", "LPIPS", "LPIPS (VGG)", "surfels", "fragments/px",
+    "render ms", "training s", "training CPU s", "process CPU s", "peak RSS MB", "bundle bytes", "atlas bytes", "dPSNR",
 )  # fmt: skip
 TEXT_COLUMNS = 3
 NOTES = (
     "Means over the held-out views; render ms: one view, rendering alone; dPSNR: a bundle's PSNR minus that of the "
-    "trained scene it was baked from; ccPSNR: after an affine fit of each view's colours to its photograph.",
+    "trained scene it was baked from; ccPSNR: after an affine fit of each view's colours to its photograph. LPIPS: "
+    "AlexNet fed with [-1, 1]; LPIPS (VGG): VGG16 fed with [0, 1], as the code of 3D Gaussian Splatting does.",
     "Training seconds: the training steps alone; process CPU seconds and peak RSS: ns-train from start to end, with "
     "loading, evaluation and saving.",
 )
@@ -63,7 +64,7 @@ def _line(
     run: Run, form: str, results: dict[str, Any], cost: dict[str, Any], size: int | None, delta: str
 ) -> list[str]:
     peak = cost.get("peak_bytes")
-    digits = {"psnr": 2, "cc_psnr": 2, "ssim": 4, "flip": 4, "lpips": 4}
+    digits = {"psnr": 2, "cc_psnr": 2, "ssim": 4, "flip": 4, "lpips": 4, "lpips_vgg": 4}
     digits |= {"surfels": 0, "fragments_per_pixel": 2, "render_ms": 1}
     return [
         *_names(run),

@@ -86,6 +86,7 @@ _SHOWN = (
     ("ssim", 3, "SSIM"),
     ("flip", 3, "FLIP"),
     ("lpips", 3, "LPIPS"),
+    ("lpips_vgg", 3, "LPIPS (VGG)"),
 )
 
 

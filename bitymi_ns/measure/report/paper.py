@@ -57,7 +57,7 @@ PRINTED_WHOLE = (*PRINTED[:4], count)
 
 
 def _quality(row: Evaluation) -> tuple[float | None, ...]:
-    return row.get("psnr"), row.get("ssim"), row.get("lpips"), row.get("surfels"), _fps(row)
+    return row.get("psnr"), row.get("ssim"), row.get("lpips_vgg"), row.get("surfels"), _fps(row)
 
 
 def _quality_text(rows: Sequence[Evaluation]) -> tuple[str, ...]:

@@ -38,6 +38,7 @@ METRICS = (
     Metric("ssim", "SSIM", True, 0.01),
     Metric("flip", "FLIP", False, 0.01),
     Metric("lpips", "LPIPS", False, 0.01),
+    Metric("lpips_vgg", "LPIPS (VGG)", False, 0.01),
 )
 
 

@@ -94,6 +94,7 @@ COLUMNS = (
     Column("ccPSNR", _key("cc_psnr"), "{:.2f}".format, "up"),
     Column("SSIM", _key("ssim"), "{:.3f}".format, "up"),
     Column("LPIPS", _key("lpips"), "{:.3f}".format, "down"),
+    Column("LPIPS (VGG)", _key("lpips_vgg"), "{:.3f}".format, "down"),
     Column("FLIP", _key("flip"), "{:.3f}".format, "down"),
     Column("Points", _key("surfels"), count, "down"),
     Column("Fragments / px", _key("fragments_per_pixel"), significant, "down"),

@@ -87,6 +87,13 @@ class BitymiTrainerConfig(TrainerConfig):
 
     def _check_machine(self) -> None:
         machine = self.machine
+        for name in ("mixed_precision", "use_grad_scaler"):
+            if getattr(self, name):
+                fail(
+                    f"--{name.replace('_', '-')} True is not supported: it scales the loss, and with it the gradients "
+                    "by which texels move and surfels are densified. The kernels compute in single precision anyway; "
+                    "leave the option out"
+                )
         if machine.num_machines != 1:
             fail(f"a run is of one machine, not {machine.num_machines} (--machine.num-machines)")
         if machine.num_devices < 1:

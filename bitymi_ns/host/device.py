@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from functools import cache, lru_cache
+from functools import cache
+from types import ModuleType
 
 import torch
 
@@ -16,9 +17,12 @@ def has_cuda_kernels() -> bool:
     return torch.cuda.is_available() and importlib.util.find_spec("bitymi_ns._cuda") is not None
 
 
-@lru_cache(maxsize=1)
-def why_not_cuda() -> str | None:
-    """Why the kernels cannot run on a GPU here and what can be done about it; None when they can."""
+def why_not_cuda(index: int | None = None) -> str | None:
+    """Why the kernels cannot run on a GPU here and what can be done about it; None when they can.
+
+    Args:
+        index: of the GPU; None = the current one.
+    """
     if not torch.cuda.is_available():
         if torch.version.cuda is None:
             return f"torch {torch.__version__} is a build without CUDA"
@@ -32,7 +36,13 @@ def why_not_cuda() -> str | None:
         kernels = importlib.import_module("bitymi_ns._cuda")
     except ImportError as error:
         return f"the CUDA kernels cannot be loaded: {error}"
-    return kernels.device_problem(torch.cuda.current_device()) or None
+    return _device_problem(kernels, torch.cuda.current_device() if index is None else index)
+
+
+@cache
+def _device_problem(kernels: ModuleType, index: int) -> str | None:
+    """The kernels' own trial on that GPU."""
+    return kernels.device_problem(index) or None
 
 
 def default_device_type() -> str:
@@ -44,7 +54,9 @@ def kernel_device(device: torch.device | str) -> torch.device:
     """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one)."""
     device = torch.device(device)
     if device.type != "cpu":
-        problem = why_not_cuda() if device.type == "cuda" else f"there are no kernels for the device '{device}'"
+        problem = (
+            why_not_cuda(device.index) if device.type == "cuda" else f"there are no kernels for the device '{device}'"
+        )
         if problem is None:
             return device
         _say_once(f"The scene stays on the CPU: {problem}.")

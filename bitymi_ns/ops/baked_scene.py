@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -25,9 +26,12 @@ lowest."""
 
 
 class DrawCache:
-    """What drawing keeps of a scene from frame to frame: the atlas as its device reads it, and working memory."""
+    """What drawing keeps of a scene from frame to frame: the atlas as its device reads it, and working memory.
+
+    Several threads may draw a scene, as those of nerfstudio's viewer do: what one makes the others wait for."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._sources: list[tuple[Any, int]] = []
         self._atlas: Any = None
         self._coarser: Any = None
@@ -36,25 +40,28 @@ class DrawCache:
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
         """What `make` gives: made for the first frame, and again when a source is another one or was written to."""
         now = [(t, t._version if isinstance(t, Tensor) else 0) for t in sources]
-        if len(now) != len(self._sources) or any(
-            a is not b and (isinstance(a, Tensor) or a != b) or version != before
-            for (a, version), (b, before) in zip(now, self._sources, strict=True)
-        ):
-            self._atlas, self._coarser, self._sources = make(), None, now
-        return self._atlas
+        with self._lock:
+            if len(now) != len(self._sources) or any(
+                a is not b and (isinstance(a, Tensor) or a != b) or version != before
+                for (a, version), (b, before) in zip(now, self._sources, strict=True)
+            ):
+                self._atlas, self._coarser, self._sources = make(), None, now
+            return self._atlas
 
     def coarser(self, make: Callable[[], Any]) -> Any:
         """The levels of the atlas that `atlas` gave last: made for the first frame that is smaller than the
         photographs."""
-        if self._coarser is None:
-            self._coarser = make()
-        return self._coarser
+        with self._lock:
+            if self._coarser is None:
+                self._coarser = make()
+            return self._coarser
 
     def workspaces(self, make: Callable[[], Any]) -> Pool[Any]:
         """Working memory of frames, by what makes it."""
-        if self._workspaces is None:
-            self._workspaces = Pool(make)
-        return self._workspaces
+        with self._lock:
+            if self._workspaces is None:
+                self._workspaces = Pool(make)
+            return self._workspaces
 
 
 class BakedScene(Protocol):

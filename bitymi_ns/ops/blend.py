@@ -43,9 +43,7 @@ class _BlendedImage(torch.autograd.Function):
         out |= {"dbase": torch.empty_like(base), "dtexels": torch.empty_like(texels) if learns else None}
         out |= {"duv": torch.empty_like(arrays["uv"]) if moves else None}
         out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.given["maps"] else None}
-        step = {"rate": 0.0}
-        if ctx.descent is not None:
-            step = {"moved": texels, "share": ctx.descent.share, "rate": ctx.descent.rate}
+        step = {"rate": 0.0} if ctx.descent is None else ctx.descent.arguments(texels)
         inputs = {"geom": geom, "base": base, "texels": texels, "dimage": dense(dimage, geom)}
         work = backward_memory(texels, 0, learns or ctx.descent is not None)
         if cuda_backend(geom.device):  # what a pair of surfel and tile adds to its surfel

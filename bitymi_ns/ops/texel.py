@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,10 +65,16 @@ class TexelDescent:
     Attributes:
         share: [T] of the texels' dtype.
         rate: of all texels.
+        moved: [T, 3] the texels that are moved; None = those that are read.
     """
 
     share: Tensor
     rate: float
+    moved: Tensor | None = None
+
+    def arguments(self, read: Tensor) -> dict[str, Any]:
+        """The kernels' keywords, for a backward pass that reads the texels `read`."""
+        return {"moved": read if self.moved is None else self.moved, "share": self.share, "rate": self.rate}
 
 
 @dataclass(frozen=True)
@@ -157,7 +164,8 @@ def check_texels(
     Raises:
         ValueError: says what it is.
     """
-    named = {"share": descent.share} if descent is not None else {}
+    named = {} if descent is None else descent.arguments(texels)
+    named.pop("rate", None)
     on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
     _check(base, texels, tiles)
     if fragments.surfels != len(base):
@@ -281,7 +289,7 @@ class _TexelColors(torch.autograd.Function):
         inputs = {"bound": ctx.bound, "base": base, "texels": texels, **ctx.tiles.arrays}
         given = {"colors": colors, "dcolors": dense(dcolors, texels), "rate": 0.0}
         if ctx.descent is not None:
-            given |= {"moved": texels, "share": ctx.descent.share, "rate": ctx.descent.rate}
+            given |= ctx.descent.arguments(texels)
         given |= backward_memory(texels, len(base), dtexels is not None or ctx.descent is not None)
         kernel("texel_colors_backward", texels)(**arrays, **inputs, **given, dbase=dbase, dtexels=dtexels, duv=duv)
         return dbase, dtexels, duv, None, None, None, None

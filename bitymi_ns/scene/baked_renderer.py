@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.ops.backend import cuda_backend, on_device
 from bitymi_ns.ops.baked_cuda import Stage, Workspace, compiled, empty_images, frame, stack_cameras
 
 from .baked import BakedScene
@@ -82,6 +82,10 @@ class BakedRenderer:
 
     def run(self, stages: Stage = Stage.ALL) -> None:
         """Begins the frame of the latest cameras; single stages, for timing them, are never taken from the graph."""
+        with on_device(self._viewmats.device):  # a graph is recorded on a stream of the current one
+            self._run(stages)
+
+    def _run(self, stages: Stage) -> None:
         if not self._use_graph or stages != Stage.ALL:
             self._draw(stages)
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar, NamedTuple, Protocol
 
 import torch
@@ -31,12 +32,14 @@ class Shading(NamedTuple):
         learns: whether the residual gets gradients.
         moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
         maps: also depth and normals.
+        read: what `snapshot` gave, for a view that is drawn in parts.
     """
 
     bound: float
     learns: bool
     moves_surfels: bool
     maps: bool
+    read: Tensor | None = None
 
 
 class ResidualField(Protocol):
@@ -51,6 +54,10 @@ class ResidualField(Protocol):
             base: [N, 3] f_view of every surfel.
             how: it is made.
         """
+
+    def snapshot(self) -> Tensor | None:
+        """What parts of a view have to read in place of the field itself, because the backward passes of other parts
+        change it before they have drawn themselves anew; None: nothing changes."""
 
 
 class HashField(nn.Module):
@@ -143,6 +150,9 @@ class HashField(nn.Module):
         colors = shade(fragments, base, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
         return composite_image(fragments, projection, colors, how.maps)
 
+    def snapshot(self) -> None:
+        """See `ResidualField`: the optimizer changes the weights, after all backward passes."""
+
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
         return field(x, self.geometry, *self.weights)
@@ -215,8 +225,14 @@ class TexelField(nn.Module):
         """See `ResidualField`."""
         descent = self.descent if how.learns else None
         texels = self.texels if how.learns and descent is None else self.texels.detach()
+        if descent is not None and how.read is not None:
+            texels, descent = how.read, replace(descent, moved=texels)
         given = (texels, self.tiles, how.bound, how.maps, how.moves_surfels, descent)
         return blended_image(fragments, projection, base, *given)
+
+    def snapshot(self) -> Tensor | None:
+        """See `ResidualField`."""
+        return None if self.descent is None else self.texels.detach().clone()
 
     @torch.no_grad()
     def residual(self, fragments: Fragments, bound: float) -> Tensor:

@@ -155,6 +155,7 @@ class Scene(nn.Module):
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound if weight_bound is None else weight_bound
         base = self.base_color(projection)
+        read: Tensor | None = None
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
             fragments = trace(part, self.config.rim, most)
@@ -162,7 +163,7 @@ class Scene(nn.Module):
                 image = blended_image(fragments, part, base, maps=maps)
             else:
                 moves = learns and self.config.residual_moves_surfels
-                image = field.image(fragments, part, base, Shading(bound, learns, moves, maps))
+                image = field.image(fragments, part, base, Shading(bound, learns, moves, maps, read))
             if beta_alone:
                 image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)
             if overdraw_half is not None:
@@ -172,6 +173,8 @@ class Scene(nn.Module):
         try:
             image, fragments = draw(projection, self.config.max_fragments)
         except TooManyFragments as error:
+            if field is not None and learns:
+                read = field.snapshot()
             image, fragments = self._draw_in_bands(projection, draw, error)
         image = image.view(camera.height, camera.width, -1)
         if background is not None:

@@ -73,7 +73,7 @@ struct BlendBackward {
     r.number("rate", rate);
     r.work("partial", partial, of.fragments.layout.pairs * blend_sums(of.maps));
     work.fields(r, sums_texels() ? of.table.texels : 0, 0);
-    check_moved(r, of.table, moved, share, dtexels);
+    check_moved(r, moved, share, dtexels);
   }
 };
 

@@ -27,11 +27,11 @@ struct TexelTiles {
     r.rows("texels", values, texels, 3);
   }
 };
-// A backward pass that moves texels moves these, by a share of each, and keeps no gradient of them.
+// A backward pass that moves texels, those that it reads or others in their stead, moves them by a share of each and
+// keeps no gradient of them.
 template <class R, class S>
-void check_moved(R& r, const TexelTiles<S>& table, const S* moved, const S* share, const S* dtexels) {
-  if (moved && (moved != table.values || !share || dtexels))
-    r.refuse("what moves are the texels, by a share of each, and their gradient is not kept");
+void check_moved(R& r, const S* moved, const S* share, const S* dtexels) {
+  if (moved && (!share || dtexels)) r.refuse("texels move by a share of each, and their gradient is not kept");
 }
 // What the fragments of one surfel share.
 template <class S>
@@ -185,7 +185,7 @@ struct TexelColorsBackward {
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
     work.fields(r, sums_texels() ? of.table.texels : 0, of.table.n);
-    check_moved(r, of.table, moved, share, dtexels);
+    check_moved(r, moved, share, dtexels);
   }
 };
 

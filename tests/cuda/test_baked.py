@@ -6,7 +6,11 @@ rounds them alike): 1.2e-3 was the largest difference seen.
 
 from __future__ import annotations
 
+import threading
+import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -21,8 +25,9 @@ from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Stage, draws_blocks
+from bitymi_ns.ops.baked_scene import DrawCache
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from bitymi_ns.scene import Camera
+from bitymi_ns.scene import Camera, baked_renderer
 from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
@@ -326,3 +331,36 @@ def test_a_small_view_has_samples(device: torch.device, cpu) -> None:
     assert views["packed"].shape == (2, 22, 30, 1) and torch.equal(views["rgb"][0], views["rgb"][1])
     red = views["packed"][0, ..., 0] & 255
     assert (red.float() - views["rgb"][0, ..., 0].clamp(0, 1) * 255).abs().max() <= 0.51
+
+
+def test_frames_are_begun_on_the_device_of_the_scene(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch records a graph on a stream of the current device, which may be another one."""
+    entered = []
+
+    @contextmanager
+    def on_device(of: torch.device) -> Iterator[None]:
+        entered.append(of)
+        yield
+
+    monkeypatch.setattr(baked_renderer, "on_device", on_device)
+    BakedRenderer(textured(4, 0).to(device), 8, 9).draw([front(8, 9)])
+    assert [of.type for of in entered] == [device.type]
+
+
+def test_threads_that_draw_a_scene_share_one_atlas() -> None:
+    cache, made, inside = DrawCache(), [], threading.Event()
+
+    def make() -> object:
+        inside.set()
+        time.sleep(0.05)  # the other thread comes meanwhile
+        made.append(object())
+        return made[-1]
+
+    texels, got = torch.zeros(3), []
+    threads = [threading.Thread(target=lambda: got.append(cache.atlas(make, texels))) for _ in range(2)]
+    threads[0].start()
+    inside.wait()
+    threads[1].start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 1 and got[0] is got[1]

@@ -22,10 +22,10 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: kernels)
-    device.why_not_cuda.cache_clear()
+    device._device_problem.cache_clear()
     device._say_once.cache_clear()
     yield kernels
-    device.why_not_cuda.cache_clear()
+    device._device_problem.cache_clear()
 
 
 def test_a_usable_card_is_used(card: ModuleType) -> None:
@@ -40,6 +40,12 @@ def test_a_card_that_the_kernels_cannot_run_on_is_left_alone_with_one_message(
     for _ in range(2):
         assert device.kernel_device("cuda").type == "cpu"
     assert " ".join(capsys.readouterr().out.split()).count("and this card has 75: install again") == 1
+
+
+def test_each_card_is_tried(card: ModuleType) -> None:
+    card.device_problem = lambda number: "too old" if number else ""
+    assert device.kernel_device("cuda:0").type == "cuda" and device.kernel_device("cuda:1").type == "cpu"
+    assert device.why_not_cuda() is None and device.why_not_cuda(1) == "too old"
 
 
 def test_an_installation_without_kernels_says_how_to_get_them(
@@ -71,6 +77,13 @@ def test_a_card_trains_any_texture(config, card: ModuleType, texture: str) -> No
     assert config.machine.device_type == "cuda" and config.pipeline.model.scene.texture == texture
 
 
+@pytest.mark.parametrize("option", ["mixed_precision", "use_grad_scaler"])
+def test_what_scales_the_loss_is_refused(config, option: str) -> None:
+    setattr(config, option, True)
+    with pytest.raises(SystemExit, match=rf"--{option.replace('_', '-')} True is not supported"):
+        config.set_timestamp()
+
+
 def test_there_are_no_more_processes_than_cards(config, card: ModuleType) -> None:
     config.machine.device_type, config.machine.num_devices = "cuda", 2
     with pytest.raises(SystemExit, match=r"1 of 2 GPUs that .*--machine.num-devices"):
@@ -79,7 +92,7 @@ def test_there_are_no_more_processes_than_cards(config, card: ModuleType) -> Non
 
 def test_no_card_and_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    device.why_not_cuda.cache_clear()
+    device._device_problem.cache_clear()
     assert device.why_not_cuda() and device.kernel_device("cuda").type == "cpu"
     assert device.kernel_device("mps").type == "cpu"
-    device.why_not_cuda.cache_clear()
+    device._device_problem.cache_clear()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Bands
+from bitymi_ns.ops import Bands, TexelDescent
 from bitymi_ns.scene import Camera, Scene
+from bitymi_ns.scene.field import TexelField
 from tests.ops.golden import random_scene
 from tests.scene.small import scene_of
 
@@ -37,6 +38,22 @@ def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Ten
         **{f"gradient of {name}": p.grad for name, p in scene.named_parameters()},
     }
     return output.fragments, result
+
+
+def texel_step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Tensor]]:
+    """The fragments, and what a training step gives whose backward pass moves texels."""
+    scene, camera = make(device, most, texture_moves_surfels=True)
+    g = torch.Generator().manual_seed(2)
+    texels = torch.randn(60 * 16, 3, generator=g, dtype=torch.float64)
+    size = torch.full((60, 2), 4, dtype=torch.int32)
+    field = TexelField(size, torch.full((60,), 3.0), texels, torch.rand(60 * 16, generator=g, dtype=torch.float64))
+    scene.field = field.to(device)
+    scene.field.descent = TexelDescent(scene.field.share, 0.5)
+    output = scene.render(camera, maps=True)
+    weight = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
+    (output.rgb * weight).sum().backward()
+    moved = {"texels": scene.field.texels.detach() - texels.to(device)}
+    return output.fragments, moved | {f"gradient of {name}": p.grad for name, p in scene.surfels.items()}
 
 
 def assert_same(got: dict[str, Tensor], want: dict[str, Tensor]) -> None:

@@ -38,6 +38,13 @@ def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.Mo
     bands.assert_same(got, want)
 
 
+def test_bands_read_texels_that_no_other_band_has_moved() -> None:
+    whole, want = bands.texel_step(CPU, 0)
+    parts, got = bands.texel_step(CPU, int(0.3 * len(whole)))
+    assert isinstance(parts, ops.Bands) and len(parts.rows) > 2 and want["texels"].abs().max() > 0.1
+    bands.assert_same(got, want)
+
+
 def test_a_row_of_tiles_with_too_many_is_an_error_with_the_number() -> None:
     scene, camera = bands.make(CPU, 50)
     with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments, \d+ per pixel.*room for 50"):

@@ -73,7 +73,8 @@ def shim_files() -> tuple[Path, Path]:
 
 def import_error() -> str:
     """What `import torchvision` prints to stderr when it fails in a fresh interpreter; empty when it works."""
-    result = subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, text=True, check=False)
+    code = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; import torchvision"  # not from here
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return result.stderr if result.returncode else ""
 
 

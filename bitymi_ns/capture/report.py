@@ -30,9 +30,12 @@ def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Rec
         values: see `poses._values`.
         model: cameras and points, z up.
     """
+    from matplotlib import style
+
     write_file(folder / VALUES, (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())
     write_file(folder / PAGE, _page(values).encode())
-    _draw(folder / PICTURE, model, values.get("metres_per_unit") is not None)
+    with style.context("default"):  # and not as a matplotlibrc in the current folder says: it may ask for LaTeX
+        _draw(folder / PICTURE, model, values.get("metres_per_unit") is not None)
 
 
 def _page(values: Mapping[str, object]) -> str:

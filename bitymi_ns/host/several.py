@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import atexit
 import copy
-import multiprocessing
 import os
+import pickle
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -27,12 +27,11 @@ import torch
 import torch.distributed as dist
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from bitymi_ns import interpreter
 from bitymi_ns.host.errors import fail
 from bitymi_ns.train.processes import ProcessLost
 
 if TYPE_CHECKING:
-    from multiprocessing.process import BaseProcess
-
     from nerfstudio.engine.trainer import TrainerConfig
 
 TIMEOUT = timedelta(minutes=30)
@@ -56,11 +55,8 @@ class Others:
         self._cards = config.machine.device_type == "cuda"
         self._scratch = tempfile.TemporaryDirectory()
         self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)
-        context = multiprocessing.get_context("spawn")
-        self._processes: list[BaseProcess] = [
-            context.Process(target=_work, args=(self._of(config, rank), rank, count, self._store.port), daemon=True)
-            for rank in range(1, count)
-        ]
+        self._inputs = [(self._of(config, rank), rank, count, self._store.port) for rank in range(1, count)]
+        self._processes: list[subprocess.Popen[bytes]] = []
         atexit.register(self.end)
 
     def start(self) -> None:
@@ -69,13 +65,17 @@ class Others:
         Raises:
             InputError: one has ended already.
         """
-        count = len(self._processes) + 1
-        with _environment(PYTHONWARNINGS="ignore"):  # those of nerfstudio's import were shown once
-            for process in self._processes:
-                process.start()
+        count = len(self._inputs) + 1
+        environment = {**os.environ, "PYTHONWARNINGS": "ignore"}  # those of nerfstudio's import were shown once
+        for inputs in self._inputs:
+            process = subprocess.Popen(interpreter.command(__name__, "work"), stdin=subprocess.PIPE, env=environment)
+            self._processes.append(process)
+            assert process.stdin is not None
+            with suppress(BrokenPipeError), process.stdin:  # one that has ended already is noticed below
+                process.stdin.write(pickle.dumps(inputs))
         keys = [_here(rank) for rank in range(1, count)]
         while not self._store.check(keys):
-            if not all(process.is_alive() for process in self._processes):
+            if any(process.poll() is not None for process in self._processes):
                 self.explain()
             time.sleep(0.05)
         _join(self._store, 0, count, self._cards)
@@ -96,8 +96,8 @@ class Others:
         while True:
             for rank, process in enumerate(self._processes, 1):
                 told = self._store.check([_why(rank)])
-                if told or process.exitcode not in (None, LOST):
-                    why = self._store.get(_why(rank)).decode() if told else f"exit status {process.exitcode}"
+                if told or process.poll() not in (None, LOST):
+                    why = self._store.get(_why(rank)).decode() if told else f"exit status {process.returncode}"
                     fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
             if time.monotonic() > until:
                 minutes = round(TIMEOUT.total_seconds() / 60)
@@ -113,30 +113,15 @@ class Others:
         atexit.unregister(self.end)
         processes, self._processes = self._processes, []
         for process in processes:
-            if process.pid is None:  # not started
-                continue
             if orderly:
-                process.join(PATIENCE)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(PATIENCE)
             process.kill()
-            process.join()
+            process.wait()
         self._scratch.cleanup()
         # a card may wait for one that is lost: then the end of this process is the remedy
         if processes and dist.is_initialized() and (orderly or not self._cards):
             dist.destroy_process_group()
-
-
-@contextmanager
-def _environment(**values: str) -> Iterator[None]:
-    """Environment variables for the processes that are started meanwhile."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
 
 
 def _here(rank: int) -> str:
@@ -158,12 +143,13 @@ def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
     dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=TIMEOUT)
 
 
-def _work(config: TrainerConfig, rank: int, count: int, port: int) -> None:
-    """What a process beside the first one does."""
-    from nerfstudio.scripts.train import train_loop
-
+def work() -> None:
+    """What a process beside the first one does; its stdin says of which run, and which of its processes it is."""
     for number in (signal.SIGINT, signal.SIGTERM):  # before and after training the first process decides
         signal.signal(number, signal.SIG_IGN)
+    config, rank, count, port = pickle.loads(sys.stdin.buffer.read())
+    from nerfstudio.scripts.train import train_loop
+
     CONSOLE.quiet = True
     store = dist.TCPStore(HOST, port, count, is_master=False, timeout=TIMEOUT)
     try:

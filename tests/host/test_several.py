@@ -11,25 +11,29 @@ from bitymi_ns.host import several
 from bitymi_ns.host.errors import InputError
 
 
+def process(status: int | None) -> SimpleNamespace:
+    return SimpleNamespace(poll=lambda: status, returncode=status)
+
+
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> several.Others:
     """Two that run."""
     monkeypatch.setattr(several, "PATIENCE", 0.0)
     found = several.Others.__new__(several.Others)
     found._store = dist.TCPStore("127.0.0.1", 0, 3, is_master=True, wait_for_workers=False)
-    found._processes = [SimpleNamespace(exitcode=None), SimpleNamespace(exitcode=None)]
+    found._processes = [process(None), process(None)]
     return found
 
 
 def test_what_went_wrong_in_another_process_is_told(others: several.Others) -> None:
-    others._processes[0].exitcode = several.LOST  # because the other one ended
+    others._processes[0] = process(several.LOST)  # because the other one ended
     others._store.set("why 2", "bitymi: there is no capture")
     with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: bitymi: there is no capture"):
         others.explain()
 
 
 def test_a_process_that_said_nothing(others: several.Others) -> None:
-    others._processes[1].exitcode = -9
+    others._processes[1] = process(-9)
     with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: exit status -9"):
         others.explain()
 

@@ -8,11 +8,11 @@ import re
 import shutil
 import sqlite3
 import subprocess
-import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
 
+from bitymi_ns import interpreter
 from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import size_text
@@ -41,7 +41,7 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
     watch = _Watch(work / DATABASE, progress)
     with open(work / LOG, "wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "bitymi_ns.capture.sfm.worker"],
+            interpreter.command("bitymi_ns.capture.sfm.worker", "main"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,

@@ -1,4 +1,4 @@
-"""The process that runs COLMAP: `python -m bitymi_ns.capture.sfm.worker`, a Job on stdin, lines of JSON on stdout.
+"""The process that runs COLMAP, by `main`: a Job on stdin, lines of JSON on stdout.
 
 A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends when its stdin
 does, so that nothing goes on after whoever started it was killed. What COLMAP has to say goes to stderr.
@@ -117,7 +117,3 @@ def main() -> None:
 def _end_with_parent() -> None:
     sys.stdin.read()
     os._exit(1)
-
-
-if __name__ == "__main__":
-    main()

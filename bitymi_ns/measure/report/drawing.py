@@ -7,11 +7,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+PLAIN = ("default", {"text.parse_math": False})
+"""How plots are drawn, whatever a matplotlibrc in the current folder says: it may ask for LaTeX. Names may hold a $."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,7 @@ def _style(axes: Axes, theme: Theme) -> None:
         spine.set_color(theme.ink)
 
 
+@style.context(PLAIN)
 def _png(sheet: Sheet, theme: Theme) -> bytes:
     """Draw a sheet: at most three panels per row, one legend below."""
     columns = min(3, len(sheet.scenes))

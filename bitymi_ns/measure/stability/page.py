@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib.style
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -166,6 +167,7 @@ FORWARD, GRADIENT, DOUBLE = "#0b62b8", "#d1540b", "#6b6f76"
 LOWEST = 1e-17
 
 
+@matplotlib.style.context("default")  # and not as a matplotlibrc in the current folder says
 def _plot(swept: dict[str, list[Row]]) -> bytes:
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     FigureCanvasAgg(figure)

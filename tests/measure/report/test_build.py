@@ -8,6 +8,7 @@ import json
 import re
 from pathlib import Path
 
+import matplotlib
 import pytest
 from PIL import Image
 
@@ -46,6 +47,11 @@ def test_full_report(results: Path, tmp_path: Path):
             assert image.convert("L").getextrema() != (255, 255)
         assert f"({name}.png)" in markdown
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".report")]
+
+
+def test_plots_are_not_drawn_as_the_current_folder_says(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)
+    assert pictures(build([results / "evals" / "fox"], tmp_path / "report").read_text("utf8"))
 
 
 def test_same_input_gives_the_same_bytes(results: Path, tmp_path: Path):

@@ -1,0 +1,47 @@
+"""Processes of Python run nothing that lies in the current folder."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import bitymi_ns
+from bitymi_ns import interpreter
+from bitymi_ns.capture.sfm import process
+from bitymi_ns.capture.sfm.job import Job
+from bitymi_ns.capture.types import CaptureError
+
+PACKAGE = Path(bitymi_ns.__file__).parent
+
+
+@pytest.fixture
+def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with modules that leave a mark when they are run."""
+    for name in ("getpass", "json", "os", "numpy", "pycolmap"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_function_is_called_and_no_module_of_the_current_folder(hostile: Path) -> None:
+    command = interpreter.command("getpass", "getuser")
+    command[-1] = f"{command[-1]}; print('done')"
+    done = subprocess.run(command, env={"USER": "somebody"}, capture_output=True, text=True, check=True)
+    assert done.stdout == "done\n" and not (hostile / "ran").exists()
+
+
+def test_colmap_is_started_beside_hostile_modules(hostile: Path) -> None:
+    job = Job(str(hostile), str(hostile), None, [], [], {}, False, {})
+    with pytest.raises(CaptureError):  # there are no photographs
+        process.run(job, hostile, lambda *told: None)
+    assert not (hostile / "ran").exists()
+
+
+def test_python_is_started_this_way_alone() -> None:
+    here = {"interpreter.py", "measure/bench/process.py"}  # which looks for programs beside Python
+    for path in PACKAGE.rglob("*.py"):
+        text = path.read_text("utf8")
+        starts = "sys.executable" in text and path.relative_to(PACKAGE).as_posix() not in here
+        assert not starts and "multiprocessing" not in text, f"{path} starts Python by itself"

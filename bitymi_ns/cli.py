@@ -71,7 +71,7 @@ class Sfm:
         from bitymi_ns.progress import rich_progress
 
         with rich_progress() as progress:
-            poses = find_poses(self.source, self.options, progress)
+            poses = find_poses(self.source, self.options, progress, lambda text: print(text, file=sys.stderr))
             if self.output is not None:
                 with explained(self.output, ValueError):
                     write_capture(poses, self.output, progress)

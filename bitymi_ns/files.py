@@ -22,6 +22,8 @@ from typing import BinaryIO
 
 from rich.filesize import decimal
 
+from bitymi_ns.trust import Refused, is_left, no_links
+
 UNFINISHED = ".unfinished"
 Tell = Callable[[str], None]
 """Gets a message for people about something that goes on without what it should have had."""
@@ -55,8 +57,8 @@ _REASONS = {
 
 def reason(error: OSError, path: Path) -> str:
     """Why `path` could not be written, and what to do about it; without a full stop."""
-    if isinstance(error, Busy):
-        return error.who
+    if isinstance(error, (Busy, Refused)):
+        return str(error)
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
         there = _nearest(path.absolute())
         if not there.is_dir():
@@ -99,10 +101,10 @@ def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
 
     Raises:
         BlockingIOError: another process has the lock.
-        OSError: it cannot be opened.
+        OSError: it cannot be opened, or is not what it should be; see `no_links`.
     """
     while True:
-        file = open(path, "r+b", opener=lambda name, flags: os.open(name, flags | os.O_CREAT, 0o666))
+        file = open(path, "r+b", opener=no_links)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -111,7 +113,7 @@ def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
         except OSError:
             return file, False
         with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+            if os.path.samestat(os.fstat(file.fileno()), os.lstat(path)):
                 return file, True
         file.close()  # its last holder has removed or renamed it in the meantime
 
@@ -254,7 +256,7 @@ def _settle(place: Path) -> None:
     one, and there is nothing beside it. To be called by the holder of the lock alone."""
     new, old = _beside(place)
     _remove(new)
-    if old.exists():
+    if is_left(old):
         if place.exists():
             old.rename(new)  # so that an .old is always whole, should this be the moment of a kill
             _remove(new)
@@ -263,7 +265,7 @@ def _settle(place: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    if folder.exists():
+    if is_left(folder):
         shutil.rmtree(folder)
 
 

@@ -16,7 +16,7 @@ import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "train", "bake", "bundle", "interchange", "view", "host", "measure"]
-BESIDE = ["files", "interpreter", "ply", "presets", "progress", "sample", "capture"]
+BESIDE = ["files", "interpreter", "ply", "presets", "progress", "sample", "capture", "trust"]
 """ORDER has the innermost first. These stand beside them and import none of them."""
 KNOW_NERFSTUDIO = ("host", "measure/knobs.py", "measure/pictures.py")
 

@@ -7,49 +7,66 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.files import write_file
+from bitymi_ns.files import Tell, write_file
+from bitymi_ns.trust import Refused, is_own, own_folder
 
 FOLDER = ".bitymi"
 OF = "of.json"
 """File in a work folder: what it is of, and the key of that alone."""
 IN_USE = ".in-use-"
 """Begins the names of the locks of processes that read what a work folder holds."""
-VERSION = 3
+VERSION = 4
 """Raised where the same photographs and options give other poses than before, so that kept ones are found anew."""
 
 
-def content_key(paths: Sequence[Path], settings: object) -> str:
-    """A key of the files' names, sizes and times of change, and of all that decides what is made of them."""
-    stats = [(str(path), path.stat()) for path in paths]
+def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
+    """A key of files and of all that decides what is made of them.
+
+    Args:
+        inputs: the files, each with its name in the capture. That, its size and its time of change count; how the
+            path to it is written does not.
+        settings: plain values.
+    """
+    stats = [(name, path.stat()) for name, path in inputs]
     content = [VERSION, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats], settings]
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @contextmanager
-def work_folder(source: Path, key: str) -> Iterator[Path]:
-    """The folder of this key, held for one process, made where it is missing: `.bitymi` beside what the poses are found
-    of, or the user's cache folder where nothing can be written there.
+def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
+    """The folder of this key, held for one process, made where it is missing: in `.bitymi` beside the photographs, or
+    in the user's cache folder where nothing can be written there, or others can write there.
+
+    Args:
+        photographs: their folder, or a video.
+        key: see `content_key`.
+        tell: told why it is the cache folder, where that is not plain from its permissions.
 
     Raises:
         CaptureError: another process is at work there, or neither can be written.
     """
-    beside = (source if source.is_dir() else source.parent) / FOLDER
-    name = f"poses-{key}"
+    beside, cache = home(photographs), user_cache()
     problem: OSError | None = None
-    for home in (beside, user_cache()):
-        folder = home / name
+    for place in (beside, cache):
+        if place is None:
+            continue
+        folder = place / f"poses-{key}"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            own_folder(place, close=True)
+            own_folder(folder)
             lock = files.Lock(folder / ".lock", tell=lambda text: None)
         except files.Busy as error:
-            raise CaptureError(f"poses of {source} are being found already: {error}") from error
+            raise CaptureError(f"poses of {photographs} are being found already: {error}") from error
         except OSError as error:
+            if place == beside and isinstance(error, Refused):
+                tell(f"{error}. It is not used: the poses are kept in {cache or 'no place that is known'}.")
             problem = error
             continue
         with lock:
@@ -57,23 +74,31 @@ def work_folder(source: Path, key: str) -> Iterator[Path]:
         return
     assert problem is not None
     raise CaptureError(
-        f"neither {beside} nor {user_cache()} can be written ({files.reason(problem, user_cache())}): "
+        f"neither {beside} nor {cache or 'a cache folder'} can be written ({files.reason(problem, cache or beside)}): "
         "set XDG_CACHE_HOME to a folder on a disk with space"
     )
 
 
-def take_place(work: Path, source: Path, contents: str) -> None:
+def home(photographs: Path) -> Path:
+    """The folder beside photographs or a video for what is found of them; the same one, whether a capture is named or
+    its folder `images`."""
+    folder = photographs if photographs.is_dir() else photographs.parent
+    return (folder.parent if folder.name == "images" else folder) / FOLDER
+
+
+def take_place(work: Path, photographs: Path, contents: str) -> None:
     """Say what a work folder is of, and remove those of the same source as it was before: their key cannot come back.
     Those with other options stay, because runs were trained on them; so do those that a process works in or reads from.
 
     Args:
         work: held by this process.
-        source: photographs or a video.
+        photographs: their folder, or a video.
         contents: the key of the files alone.
     """
-    write_file(work / OF, json.dumps({"source": str(source.resolve()), "contents": contents}).encode())
+    source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # still so when both are moved
+    write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob("poses-*"):
-        if other != work and _is_stale(other, str(source.resolve()), contents):
+        if other != work and _is_stale(other, source, contents):
             try:
                 with files.Lock(other / ".lock", tell=lambda text: None):
                     shutil.rmtree(other, ignore_errors=True)
@@ -82,11 +107,13 @@ def take_place(work: Path, source: Path, contents: str) -> None:
 
 
 def _is_stale(other: Path, source: str, contents: str) -> bool:
+    if not is_own(other):
+        return False
     try:
         of = json.loads((other / OF).read_text("utf8"))
         if of["source"] != source or of["contents"] == contents:
             return False
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return False
     for mark in other.glob(f"{IN_USE}*"):
         try:
@@ -104,6 +131,9 @@ def read_from(work: Path) -> None:
         atexit.register(files.release, mark)
 
 
-def user_cache() -> Path:
-    """The user's folder for what can be made again."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bitymi-ns"
+def user_cache() -> Path | None:
+    """The user's folder for what can be made again; None where nothing says where it is."""
+    with suppress(RuntimeError):  # there is no HOME, and the system does not know the user
+        stated = os.environ.get("XDG_CACHE_HOME", "")
+        return (Path(stated) if os.path.isabs(stated) else Path.home() / ".cache") / "bitymi-ns"
+    return None

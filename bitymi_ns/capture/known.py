@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from bitymi_ns.capture.cache import content_key, work_folder
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.files import explained, write_file
+from bitymi_ns.files import Tell, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
 DONE = "points"
@@ -47,7 +48,9 @@ class KnownView:
         return "PINHOLE", self.width, self.height, pinhole
 
 
-def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | None = None) -> Path:
+def triangulate(
+    images: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
+) -> Path:
     """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept and continued as
     `find_poses` does.
 
@@ -55,6 +58,7 @@ def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | N
         images: folder that the views' names are relative to.
         views: the photographs with their cameras.
         progress: told the stage and how far it is.
+        tell: told where the points are kept, if not beside the photographs although these can be written.
 
     Returns:
         folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses.
@@ -72,7 +76,8 @@ def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | N
     if len(views) < 2:
         raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
     settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
-    with work_folder(images, content_key([images / view.name for view in views], settings)) as work:
+    key = content_key([(view.name, images / view.name) for view in views], settings)
+    with work_folder(images, key, tell) as work:
         model = work / MODEL
         if (work / DONE).exists():
             return model

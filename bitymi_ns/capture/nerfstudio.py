@@ -13,6 +13,7 @@ from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.types import Poses
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
+from bitymi_ns.trust import inside
 
 CLOUD = "sparse_pc.ply"
 
@@ -25,7 +26,7 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
 
     Raises:
         OSError: it cannot be written.
-        ValueError: the folder holds something.
+        ValueError: the folder holds something, or a name in the model leads out of it.
     """
 
     def check() -> None:
@@ -37,7 +38,7 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
     with complete_folder(folder, check) as new:
         for i, name in enumerate(names):
             progress("copying photographs", i, len(names))
-            target = new / "images" / name
+            target = inside(new / "images", name)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(poses.images / name, target)
         progress("copying photographs", len(names), len(names))

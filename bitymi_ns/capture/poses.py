@@ -2,39 +2,45 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import statistics
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import pycolmap
+from pydantic import BaseModel
 
 from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, take_place, work_folder
 from bitymi_ns.capture.frame import local_positions, settle, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, find_photos, photo_folder, read_photos
-from bitymi_ns.capture.recognise import VIDEOS
+from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
 from bitymi_ns.capture.video import extract_frames
-from bitymi_ns.files import complete_folder, explained, write_file
+from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
 GUESSED_FOCAL = 1.2
 """First guess of a focal length that is not known, in units of the longer side; COLMAP's own."""
 LEAST = 3
 """Photographs without which there is nothing to find."""
+SPARSE = Path("sparse/0")
+"""Where the model is in a result."""
 
 
-def find_poses(source: Path, options: SfmOptions | None = None, progress: Progress | None = None) -> Poses:
+def find_poses(
+    source: Path, options: SfmOptions | None = None, progress: Progress | None = None, warn: Tell = warnings.warn
+) -> Poses:
     """Find the camera poses of photographs or of the frames of a video.
 
     They are found once. The result is kept beside the photographs, or in the user's cache folder if nothing can be
@@ -44,6 +50,7 @@ def find_poses(source: Path, options: SfmOptions | None = None, progress: Progre
         source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
         options: how; None = the defaults.
         progress: told the stage and how far it is.
+        warn: told where the result is kept, if not beside the photographs although these can be written.
 
     Raises:
         CaptureError: no poses can be found; says what to photograph differently.
@@ -53,17 +60,20 @@ def find_poses(source: Path, options: SfmOptions | None = None, progress: Progre
     tell = progress or no_progress
     source, folder, names = _what(Path(source))
     masks = mask_folder(folder, source, options.masks) if folder.is_dir() else None
-    inputs = [folder / name for name in names] if names else [source]
+    if masks is not None and source.is_dir():
+        below = masks / folder.relative_to(photo_folder(source))
+        masks = below if below.is_dir() else masks
+    inputs = [(name, folder / name) for name in names] or [(source.name, source)]
     if masks is not None:
-        inputs += sorted(path for path in masks.rglob("*") if path.is_file())
-    settings = {**asdict(options), "masks": str(masks), "source": str(source.resolve())}
-    with work_folder(source, content_key(inputs, settings)) as work:
-        finished = _finished(work)
+        inputs += [(f"masks/{p.relative_to(masks)}", p) for p in sorted(masks.rglob("*")) if p.is_file()]
+    settings = {**asdict(options), "masks": masks is not None}
+    with work_folder(folder, content_key(inputs, settings), warn) as work:
+        finished = _finished(work, folder)
         if finished is not None:
             return finished
         with explained(work, CaptureError):
             found = _find(source, folder, names, masks, options, work, tell)
-            take_place(work, source, content_key(inputs, "contents"))
+            take_place(work, folder, content_key(inputs, "contents"))
             return found
 
 
@@ -87,7 +97,8 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
     if len(names) < LEAST:
         also = f" Of its {len(videos)} videos, name one." if videos and not names else ""
         raise CaptureError(f"{folder} holds {_few(len(names))}.{also}")
-    return source, folder, names
+    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if that folder had been named
+    return source, folder / below, [os.path.relpath(name, below) for name in names]
 
 
 def _few(count: int) -> str:
@@ -98,16 +109,32 @@ def _few(count: int) -> str:
     )
 
 
-def _finished(work: Path) -> Poses | None:
-    """The poses that an earlier run has found."""
+class _Kept(BaseModel, extra="forbid"):
+    """poses.json, which makes a result whole."""
+
+    made: bool
+    """The photographs of the model are copies or frames in the folder of the work, and not those of the capture."""
+    left_out: dict[str, str]
+    registered: int
+    given: int
+    reprojection_error: float
+    track_length: float
+    seconds: dict[str, float]
+
+
+def _finished(work: Path, folder: Path) -> Poses | None:
+    """The poses that an earlier run has found of photographs in this folder, or of a video; None where there are none,
+    or they are damaged."""
+    result = work / "result"
     try:
-        values = json.loads((work / "result" / "poses.json").read_text("utf8"))
+        kept = _Kept.model_validate_json((result / "poses.json").read_bytes())
     except (OSError, ValueError):
         return None
-    images = Path(values.pop("images"))
-    if not images.is_dir():
+    images = work / prepare.IMAGES if kept.made else Path(os.path.abspath(folder))
+    whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if kept.made else True
+    if not whole or not is_model(result / SPARSE):
         return None
-    return Poses(model=work / "result" / "sparse" / "0", images=images, report=work / "result", **values)
+    return Poses(model=result / SPARSE, images=images, report=result, **kept.model_dump(exclude={"made"}))
 
 
 def _find(
@@ -261,16 +288,16 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     ]
     keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds")
     with complete_folder(work / "result") as result:
-        sparse = result / "sparse" / "0"
+        sparse = result / SPARSE
         sparse.mkdir(parents=True)
         model.write_binary(sparse)
         write_frame(result, frame)
         write_report(result, values, model)
-        kept = {"images": str(images.resolve()), **{key: values[key] for key in keys}}
-        write_file(result / "poses.json", json.dumps(kept).encode())
+        kept = _Kept(made=images == work / prepare.IMAGES, **{key: values[key] for key in keys})
+        write_file(result / "poses.json", kept.model_dump_json().encode())
     for name in ("links", "masks", MODEL):
         shutil.rmtree(work / name, ignore_errors=True)
     process.forget(work)
-    found = _finished(work)
+    found = _finished(work, images)
     assert found is not None
     return found

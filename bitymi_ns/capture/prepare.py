@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
+IMAGES = "images"
+"""Folder in that of the work for upright copies, or the frames of a video."""
 
 
 def upright_photos(
@@ -32,7 +35,7 @@ def upright_photos(
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
-    target = work / "images"
+    target = work / IMAGES
     if not target.is_dir():
         with complete_folder(target) as new:
             for i, photo in enumerate(photos):
@@ -40,7 +43,8 @@ def upright_photos(
                 path = new / names[photo.name]
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if photo.plain:
-                    path.symlink_to(photo.path.resolve())
+                    there = os.path.realpath(target / names[photo.name])
+                    path.symlink_to(os.path.relpath(photo.path.resolve(), os.path.dirname(there)))  # may move together
                 else:
                     upright(photo).save(path, quality=JPEG_QUALITY, subsampling=0)
             progress("turning photographs upright", len(photos), len(photos))

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from bitymi_ns.capture.photos import sharpness
-from bitymi_ns.capture.prepare import JPEG_QUALITY
+from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
@@ -47,7 +47,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     Raises:
         CaptureError: it cannot be read, or nothing moves in it.
     """
-    target = work / "images"
+    target = work / IMAGES
     if target.is_dir():
         return target
     seen, motion, sharp = _survey(video, progress)

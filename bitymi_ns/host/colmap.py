@@ -18,6 +18,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as reader
 from bitymi_ns.capture.recognise import is_model, models_in
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.point_cloud import point_count
+from bitymi_ns.trust import inside
 
 
 def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:
@@ -142,6 +143,10 @@ def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) ->
     if not images:
         fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path` after `colmap`.")
     for number, image in images.items():
+        try:
+            inside(Path(), image.name)
+        except ValueError as error:
+            fail(f"{path}, image {number}: {error}.", error)
         if cameras and image.camera_id not in cameras:
             fail(
                 f"{path}: image {number} ({image.name}) was taken by camera {image.camera_id}, but the model has only "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -166,7 +167,7 @@ class BitymiTrainerConfig(TrainerConfig):
         for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
             path = getattr(owner, "data", None)
             if path is not None:
-                owner.data = Path(path).expanduser().absolute()
+                owner.data = Path(os.path.expanduser(path)).absolute()
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
             datamanager.dataparser.settle()
 
@@ -174,7 +175,7 @@ class BitymiTrainerConfig(TrainerConfig):
         """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
-            self._take_poses_of(Path(checkpoints_of).expanduser().absolute().parent)
+            self._take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
             dataparser = self.pipeline.datamanager.dataparser
             poses = getattr(dataparser, "poses", None)
             if poses is not None and kept_poses.are_in(Path(poses)):

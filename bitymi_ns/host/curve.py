@@ -8,6 +8,7 @@ from typing import Any
 
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.trust import no_links
 
 FILE = "training_curve.jsonl"
 
@@ -34,7 +35,7 @@ class TrainingCurve:
     def add(self, point: dict[str, Any]) -> None:
         """Write one point, whole and at once. A full disk costs the point, not the run."""
         try:
-            with open(self.path, "a", encoding="utf8") as file:
+            with open(self.path, "a", encoding="utf8", opener=no_links) as file:
                 file.write(json.dumps(point) + "\n")
         except OSError as error:
             warn(f"A point of the training curve {self.path} could not be written: {reason(error, self.path)}.")

@@ -13,7 +13,7 @@ from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import kept_poses
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import Origin, Source, masks_of_capture, source_in
-from bitymi_ns.host.errors import fail, say
+from bitymi_ns.host.errors import fail, say, warn
 from bitymi_ns.host.kept_poses import KeptPoses
 
 
@@ -35,7 +35,7 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
     masks = _masks(found, masks_path)
     try:
         with rich_progress() as progress:
-            poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress)
+            poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress, warn)
         read_from(poses.report.parent)
     except CaptureError as error:
         fail(str(error), error)

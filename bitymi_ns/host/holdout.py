@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import Literal, NamedTuple
@@ -94,7 +95,7 @@ def read_names(given: Sequence[str]) -> tuple[str, ...]:
     """Names as they were given, or those in a text file, one per line, where its name was given instead."""
     if len(given) != 1 or not given[0].lower().endswith((".txt", ".lst", ".list")):
         return tuple(given)
-    path = Path(given[0]).expanduser()
+    path = Path(os.path.expanduser(given[0]))
     try:
         lines = path.read_text("utf8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -130,7 +130,7 @@ def write(folder: Path, source: Source, origin: Origin) -> None:
 def _link(file: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     if file.is_symlink():
-        target.symlink_to(os.readlink(file))
+        target.symlink_to(os.path.realpath(file))
         return
     try:
         os.link(file, target)

@@ -23,6 +23,7 @@ from bitymi_ns.capture.recognise import PHOTOGRAPHS, is_model
 from bitymi_ns.host.cameras import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.poses import rotations
+from bitymi_ns.trust import leads_inside
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")
@@ -89,6 +90,8 @@ def load(path: Path, own_format: bool, announce: bool = True) -> Any:
         _distribute(path, meta, announce)
         _check_transform(path, meta)
         _check_lists(path, meta)
+        if announce:
+            _tell_outside(path, meta["frames"])
     elif isinstance(meta, dict):
         _check_other_format(path, meta)
     frames = meta.get("frames") if isinstance(meta, dict) else None
@@ -116,6 +119,13 @@ def _check_frames(path: Path, meta: Any) -> None:
             f"{path}: {listed(without)} has no mask_path, but other frames have one. Give every frame a mask (a white "
             "picture lets all pixels count), or none."
         )
+
+
+def _tell_outside(path: Path, frames: list[dict[str, Any]]) -> None:
+    """Name photographs that lie elsewhere: nerfstudio reads them there, and what is made of the capture shows them."""
+    outside = [frame["file_path"] for frame in frames if not leads_inside(frame["file_path"])]
+    if outside:
+        warn(f"{path} names photographs outside of its folder, which are read there: {listed(outside)}.")
 
 
 def _file_name(path: Path, i: int, key: str, name: Any) -> str:

@@ -68,6 +68,11 @@ def replace(old: str, new: str) -> Any:
         ),
         ("cameras.txt", replace("48", "wide"), "cameras.txt has a line that cannot be read .*wide"),
         ("images.txt", lambda text: text.replace("\n\n", "\n"), "images.txt has a line .*Each image has two lines"),
+        (
+            "images.txt",
+            lambda text: text.replace("frame_00004.png", "../frame_00004.png"),
+            "images.txt, image 4: the name '../frame_00004.png' leads elsewhere",
+        ),
         ("images.txt", lambda text: "# nothing\n", "images.txt lists no images: COLMAP found no poses"),
         ("points3D.txt", replace("200", "red"), "points3D.txt has a line that cannot be read .*red"),
     ],

@@ -28,7 +28,7 @@ def standing_in(project: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Pa
     options_given: list[SfmOptions] = []
     capture = types.ModuleType("bitymi_ns.capture")
 
-    def find_poses(source: Path, options: Any = None, progress: Any = None) -> Any:
+    def find_poses(source: Path, options: Any, progress: Any, *told: Any) -> Any:
         asked.append(source)
         options_given.append(options)
         progress("matching", 1, 2)

@@ -35,7 +35,7 @@ def test_poses_are_found_with_the_masks_of_the_training(
 ) -> None:
     asked: list[Any] = []
 
-    def find_poses(source: Path, options: Any, progress: Any) -> None:
+    def find_poses(source: Path, options: Any, *told: Any) -> None:
         asked.append(options.masks)
         raise CaptureError("not now")
 

@@ -45,7 +45,7 @@ def photographs(capture: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     colmap_model(capture, capture / "found/sparse/0")
     write_frame(capture / "found", frame())
 
-    def find_poses(source: Path, options: Any = None, progress: Any = None) -> Any:
+    def find_poses(source: Path, options: Any = None, *told: Any) -> Any:
         return types.SimpleNamespace(
             model=capture / "found/sparse/0", images=capture / "images", report=capture / "found", left_out={},
             registered=12, given=12, reprojection_error=0.5,

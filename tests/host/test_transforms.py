@@ -28,6 +28,16 @@ def test_a_byte_order_mark(capture: Path, encoding: str) -> None:
     assert len(load_with(capture, ngp).train_dataset) == 10
 
 
+def test_photographs_outside_of_the_folder_are_named(
+    capture: Path, edit: Any, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    picture = images_of(capture)[3]
+    picture.rename(tmp_path / "elsewhere.png")
+    edit(capture, lambda meta: meta["frames"][3].update(file_path=str(tmp_path / "elsewhere.png")))
+    load(capture)
+    assert f"photographs outside of its folder, which are read there: {tmp_path}/elsewhere.png." in said(capsys)
+
+
 def test_nerfstudios_reader_is_left_as_it_was(capture: Path) -> None:
     before = nerfstudio_dataparser.load_from_json
     load(capture)

@@ -17,6 +17,7 @@ from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import size_text
 from bitymi_ns.progress import Progress
+from bitymi_ns.trust import no_links
 
 LOG = "colmap.log"
 LITTLE_SPACE = 50_000_000
@@ -39,7 +40,7 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
     """
     work = Path(job.work)
     watch = _Watch(work / DATABASE, progress)
-    with open(work / LOG, "wb") as log:
+    with open(work / LOG, "wb", opener=no_links) as log:
         process = subprocess.Popen(
             interpreter.command("bitymi_ns.capture.sfm.worker", "main"),
             stdin=subprocess.PIPE,

@@ -18,6 +18,7 @@ from typing import Any
 from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.machine import commit, machine, versions
 from bitymi_ns.measure.bench.process import BenchError
+from bitymi_ns.trust import no_links
 
 FILE = "cells.jsonl"
 NAMES = ("suite", "row")
@@ -94,7 +95,7 @@ class Cells:
         line = json.dumps(cell, allow_nan=False).encode("utf8") + b"\n"
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.path, "a+b") as file:
+            with open(self.path, "a+b", opener=no_links) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
                 end = file.seek(0, os.SEEK_END)
                 if end:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ class BenchRun:
 
     def run(self) -> int:
         """Do what is missing, then print the table; returns the exit status."""
-        matrix, work = self.matrix(), self.work.expanduser().resolve()
+        matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
         chains, cells = matrix.chains(), open_cells(work)
         if self.output is not None:
             with explained(self.output, BenchError):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bitymi_ns.files import Lock
+from bitymi_ns.trust import no_links
 
 TAIL = 25
 """Lines of a failed command's log that are shown."""
@@ -67,7 +68,7 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    with open(log, "wb") as out:
+    with open(log, "wb", opener=no_links) as out:
         try:
             process = subprocess.Popen(
                 command,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import yaml
 from bitymi_ns.capture.recognise import NotRecognised, recognise
 from bitymi_ns.measure.bench.matrix import Bundle, Row, SceneSpec
 from bitymi_ns.measure.bench.process import BenchError
+from bitymi_ns.trust import inside
 
 FORMATS = ("fp16", "uint8", "bc7", "compact")
 """Formats of `ns-export bitymi-atlas`."""
@@ -61,7 +63,7 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
     scenes = []
     for folder in folders:
-        folder = folder.expanduser().resolve()
+        folder = Path(os.path.expanduser(folder)).resolve()
         try:
             found = recognise(folder)
         except NotRecognised as error:
@@ -86,7 +88,7 @@ def standard_scenes(suite: Suite, root: Path, only: Sequence[str] = ()) -> list[
     unknown = sorted(set(only) - set(suite.scenes))
     if unknown:
         raise BenchError(f"{suite.name} has no scene {', '.join(unknown)}; it has {', '.join(suite.scenes)}")
-    root = root.expanduser().resolve()
+    root = Path(os.path.expanduser(root)).resolve()
     return [_standard_scene(suite, name, root / name) for name in only or suite.scenes]
 
 
@@ -129,7 +131,7 @@ def read_plan(name: str) -> tuple[list[Row], list[Bundle] | None]:
         BenchError: there is no such plan, or it is malformed; the message says where.
     """
     if name.endswith((".yaml", ".yml")):
-        plan = _read(Path(name).expanduser())
+        plan = _read(Path(os.path.expanduser(name)))
     else:
         plans = _read(Path(__file__).with_name("plans.yaml"))
         if name not in plans:
@@ -152,6 +154,10 @@ def read_plan(name: str) -> tuple[list[Row], list[Bundle] | None]:
 def _row(plan: str, title: str, entry: Any) -> Row:
     if not isinstance(entry, dict) or not isinstance(entry.get("method"), str) or set(entry) - {"method", "options"}:
         raise BenchError(f"plan {plan}, row {title}: it must be {{method: NAME, options: [...]}}, not {entry!r}")
+    try:
+        inside(Path("runs"), entry["method"])
+    except ValueError as error:
+        raise BenchError(f"plan {plan}, row {title}: {error}") from error
     return Row(title, entry["method"], _options(f"plan {plan}, row {title}", entry.get("options", [])))
 
 

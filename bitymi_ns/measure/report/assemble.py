@@ -113,7 +113,7 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
     Raises:
         ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.
     """
-    output_dir = Path(output_dir).expanduser().absolute()
+    output_dir = Path(os.path.expanduser(output_dir)).absolute()
     _check_output(output_dir)
     with explained(output_dir, ReportError):
         check_writable(output_dir)

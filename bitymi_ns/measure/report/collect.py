@@ -120,7 +120,7 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
     seen: set[Path] = set()
     skip = output_dir.resolve()
     # Named files first: their errors are fatal, also when a folder holds the same file.
-    paths = [Path(p).expanduser() for p in inputs]
+    paths = [Path(os.path.expanduser(p)) for p in inputs]
     for path in sorted(paths, key=lambda p: p.is_dir()):
         if not path.exists():
             raise ReportError(f"{path} does not exist. Give ns-eval JSON files, training curves (.jsonl) or folders.")

@@ -1,0 +1,134 @@
+"""Files and folders where other people can write, too: links are not followed, their folders are not used, and names
+that a file states stay inside the folder that they belong to."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
+
+
+class Refused(PermissionError):
+    """Something in the place of a file or folder may have been put there by somebody else: what, and what to do."""
+
+    def __init__(self, message: str, path: Path) -> None:
+        super().__init__(errno.EPERM, message, str(path))
+
+    def __str__(self) -> str:
+        return self.strerror
+
+
+def no_links(name: str | os.PathLike[str], flags: int) -> int:
+    """Open a file for writing, made where it is missing; to be given to `open` as its opener.
+
+    Raises:
+        Refused: it is a link, or has another name elsewhere, or is no file; or it is of somebody to whom the folder
+            does not belong either.
+        OSError: it cannot be opened.
+    """
+    path = Path(name)
+    empty = flags & os.O_TRUNC
+    flags = (flags | os.O_NOFOLLOW) & ~(os.O_CREAT | os.O_EXCL | os.O_TRUNC)
+    while True:
+        try:
+            return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+        except FileExistsError:
+            pass
+        try:
+            file = os.open(path, flags | os.O_NONBLOCK)  # which does not wait for the other end of a pipe
+            break
+        except FileNotFoundError:  # it has been removed in the meantime
+            continue
+        except OSError as error:
+            if path.is_symlink():
+                raise Refused(f"{path} is a link, which is not followed: remove it", path) from error
+            raise
+    try:
+        _check(path, os.fstat(file))
+        os.set_blocking(file, True)
+        if empty:
+            os.ftruncate(file, 0)
+    except BaseException:
+        os.close(file)
+        raise
+    return file
+
+
+def _check(path: Path, found: os.stat_result) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise Refused(f"{path} is in the way and is no file: remove it", path)
+    if found.st_nlink > 1:
+        raise Refused(f"{path} is also the file of another name (a hard link): remove it", path)
+    _check_owner(path, found)
+
+
+def _check_owner(path: Path, found: os.stat_result) -> None:
+    """The owner of the folder can put another file there at any time; nobody else may have."""
+    if found.st_uid not in (os.geteuid(), os.stat(path.parent).st_uid):
+        raise Refused(f"{path} belongs to somebody else: have it removed, or give another place", path)
+
+
+def is_left(folder: Path) -> bool:
+    """Whether a folder of this name, which a killed process may have left, is there.
+
+    Raises:
+        Refused: something else is there, or somebody else's.
+    """
+    try:
+        found = os.lstat(folder)
+    except FileNotFoundError:
+        return False
+    if not stat.S_ISDIR(found.st_mode):
+        raise Refused(f"{folder} is in the way and is no folder: remove it", folder)
+    _check_owner(folder, found)
+    return True
+
+
+def own_folder(folder: Path, close: bool = False) -> None:
+    """Make a folder that the user alone can write to, where it is missing.
+
+    Args:
+        folder: its parent is not looked at.
+        close: take the right to write from others where the folder is there already: what is in it does not matter.
+
+    Raises:
+        Refused: what is there belongs to somebody else, can be written by others, or is a link.
+        OSError: it cannot be made.
+    """
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o755)
+        close = True  # an access list of the parent may have given more rights
+    with suppress(OSError):
+        found = os.lstat(folder)
+        if close and stat.S_ISDIR(found.st_mode) and found.st_mode & 0o022 and found.st_uid == os.geteuid():
+            os.chmod(folder, stat.S_IMODE(found.st_mode) & ~0o022)
+    if not is_own(folder):
+        raise Refused(f"{folder} belongs to somebody else, or others can write to it, or it is a link", folder)
+
+
+def is_own(folder: Path) -> bool:
+    """Whether it is a folder, and no link to one, that belongs to the user, and that nobody else can write to."""
+    try:
+        found = os.lstat(folder)
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The file of this name in a folder or the folders in it.
+
+    Raises:
+        ValueError: the name leads elsewhere, or is none.
+    """
+    if not leads_inside(name):
+        raise ValueError(f"the name {name!r} leads elsewhere than to a file in the folder: correct it")
+    return folder / PurePosixPath(name)
+
+
+def leads_inside(name: str) -> bool:
+    """Whether a name is that of a file in the folder that it is relative to, or in the folders in that."""
+    path = PurePosixPath(name)
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name

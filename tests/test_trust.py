@@ -1,0 +1,231 @@
+"""What somebody else may have put where this package writes, and names that lead elsewhere."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bitymi_ns import files
+from bitymi_ns.capture import CaptureError
+from bitymi_ns.capture.cache import content_key, read_from, work_folder
+from bitymi_ns.capture.nerfstudio import write_capture
+from bitymi_ns.capture.sfm import process
+from bitymi_ns.capture.sfm.job import Job
+from bitymi_ns.capture.types import Poses
+from bitymi_ns.files import reason
+from bitymi_ns.host.curve import TrainingCurve
+from bitymi_ns.measure.bench.cells import Cells
+from bitymi_ns.measure.bench.process import BenchError, run_measured
+from bitymi_ns.measure.bench.suites import read_plan
+from bitymi_ns.trust import Refused, inside, is_own, no_links, own_folder
+
+
+@pytest.fixture
+def victim(tmp_path: Path) -> Path:
+    path = tmp_path / "victim"
+    path.write_text("precious")
+    return path
+
+
+def link(path: Path, victim: Path) -> None:
+    path.symlink_to(victim)
+
+
+def hard_link(path: Path, victim: Path) -> None:
+    path.hardlink_to(victim)
+
+
+def pipe(path: Path, victim: Path) -> None:
+    os.mkfifo(path)
+
+
+def no_such(path: Path, victim: Path) -> None:
+    path.symlink_to(victim.with_name("elsewhere"))
+
+
+Plant = Callable[[Path, Path], None]
+
+
+def lock(where: Path) -> None:
+    with files.Lock(where / "planted"):
+        pass
+
+
+def reserve(where: Path) -> None:
+    with files.reserved(where / "x"):
+        pass
+
+
+def write(where: Path) -> None:
+    files.write_file(where / "x", b"new")
+
+
+def curve(where: Path) -> None:
+    made = TrainingCurve(where / "curve")
+    (where / "curve").unlink()
+    (where / "planted").rename(where / "curve")
+    made.add({"step": 1})
+    raise Refused("told as a warning", where)
+
+
+def cell(where: Path) -> None:
+    Cells(where / "planted").add({}, {}, {})
+
+
+def measured(where: Path) -> None:
+    run_measured(["true"], where / "planted")
+
+
+def log(where: Path) -> None:
+    process.run(Job(str(where), str(where), None, [], [], {}, False, {}), where, lambda *told: None)
+
+
+PLACES = {
+    lock: "planted", reserve: ".x.lock", write: ".x.unfinished", cell: "planted", measured: "planted",
+    log: process.LOG, curve: "planted",
+}  # fmt: skip
+"""What opens a file for writing under a name that others can foresee, and that name."""
+
+
+@pytest.mark.parametrize("plant", [link, hard_link, no_such, pipe])
+@pytest.mark.parametrize("action", list(PLACES), ids=lambda action: action.__name__)
+def test_nothing_is_written_through_what_was_planted(
+    action: Callable[[Path], None], plant: Plant, victim: Path, tmp_path: Path
+) -> None:
+    where = tmp_path / "where"
+    where.mkdir()
+    plant(where / PLACES[action], victim)
+    with pytest.raises((OSError, BenchError)):
+        action(where)
+    assert victim.read_text() == "precious" and not victim.with_name("elsewhere").exists()
+
+
+@pytest.mark.parametrize("plant", [link, hard_link, no_such])
+@pytest.mark.parametrize("name", [".x.new", ".x.old"])
+def test_folders_on_their_way_are_not_made_of_what_was_planted(
+    name: str, plant: Plant, victim: Path, tmp_path: Path
+) -> None:
+    plant(tmp_path / name, victim)
+    with pytest.raises(Refused) as refused, files.complete_folder(tmp_path / "x"):
+        pass
+    assert "remove it" in reason(refused.value, tmp_path) and os.path.lexists(tmp_path / name)
+    assert victim.read_text() == "precious" and not (tmp_path / "x").exists()
+
+
+def test_files_of_ones_own_are_opened_again(tmp_path: Path) -> None:
+    for mode, text in (("w", "a"), ("a", "b"), ("w", "c"), ("a", "d")):
+        with open(tmp_path / "f", mode, opener=no_links) as file:
+            file.write(text)
+    assert (tmp_path / "f").read_text() == "cd"
+
+
+def test_files_and_folders_of_others(victim: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own").mkdir()
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    with open(victim, "a", opener=no_links):
+        pass  # of the owner of the folder
+    stat = os.stat
+    elsewhere = os.stat_result([*stat(tmp_path)[:4], os.getuid() + 2, *stat(tmp_path)[5:]])
+    monkeypatch.setattr(os, "stat", lambda path, **how: elsewhere if Path(path) == tmp_path else stat(path, **how))
+    with pytest.raises(Refused, match="belongs to somebody else"), open(victim, "a", opener=no_links):
+        pass
+    assert not is_own(tmp_path / "own")
+    with pytest.raises(Refused, match="belongs to somebody else"):
+        own_folder(tmp_path / "own", close=True)
+
+
+@pytest.fixture
+def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "capture").mkdir()
+    return tmp_path / "capture"
+
+
+def used(photographs: Path) -> tuple[str, list[str]]:
+    """Where the work of a capture is done, cache or capture, and what is said."""
+    said: list[str] = []
+    with work_folder(photographs, "0", said.append) as work:
+        return work.parent.parent.name, said
+
+
+def test_a_folder_of_others_beside_the_photographs_is_not_used(photographs: Path, tmp_path: Path) -> None:
+    assert used(photographs) == ("capture", [])
+    work = photographs / ".bitymi/poses-0"
+    work.chmod(0o777)
+    where, said = used(photographs)
+    assert where == "cache" and len(said) == 1 and "others can write to it" in said[0] and "cache" in said[0]
+    work.rmdir()
+    work.symlink_to(tmp_path)
+    assert used(photographs)[0] == "cache"
+    work.unlink()
+    work.parent.rmdir()
+    work.parent.symlink_to(tmp_path)
+    assert used(photographs)[0] == "cache"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cache", "capture"]
+
+
+def test_others_may_not_write_into_what_is_made(photographs: Path) -> None:
+    before = os.umask(0)
+    try:
+        (photographs / ".bitymi").mkdir()
+        with work_folder(photographs, "0", print) as work:
+            read_from(work)
+            assert [path.stat().st_mode & 0o022 for path in (work.parent, work)] == [0, 0]
+    finally:
+        os.umask(before)
+
+
+def test_neither_place_can_be_used(photographs: Path, tmp_path: Path) -> None:
+    for parent in (photographs / ".bitymi", tmp_path / "cache"):
+        parent.symlink_to(tmp_path / "nothing")
+    with pytest.raises(CaptureError, match="XDG_CACHE_HOME"):
+        used(photographs)
+
+
+@pytest.mark.parametrize("name", ["../a.jpg", "a/../../b.jpg", "/etc/passwd", "", ".", "a\0b", ".."])
+def test_names_that_lead_elsewhere(name: str) -> None:
+    with pytest.raises(ValueError, match="leads elsewhere"):
+        inside(Path("/x"), name)
+
+
+@given(st.text(alphabet="ab./\\ ~", max_size=12))
+def test_names_stay_inside(name: str) -> None:
+    try:
+        found = inside(Path("/x/y"), name)
+    except ValueError:
+        return
+    assert os.path.normpath(found).startswith("/x/y/")
+
+
+def test_a_model_whose_names_lead_elsewhere_is_not_written(victim: Path, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 40, 30)
+    model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image("../../victim", np.zeros((0, 2)), 1, 1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (tmp_path / "model").mkdir()
+    model.write_binary(tmp_path / "model")
+    poses = Poses(tmp_path / "model", tmp_path / "a/b", tmp_path, {}, 1, 1, 0.1, 3.0, {})
+    with pytest.raises(ValueError, match="leads elsewhere"):
+        write_capture(poses, tmp_path / "out", lambda *told: None)
+    assert victim.read_text() == "precious" and not (tmp_path / "out").exists()
+
+
+def test_a_plan_whose_methods_lead_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "plan.yaml").write_text(json.dumps({"rows": {"a": {"method": "../../b"}}}))
+    with pytest.raises(BenchError, match="row a: .*leads elsewhere"):
+        read_plan(str(tmp_path / "plan.yaml"))
+
+
+def test_a_key_is_not_of_how_a_path_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_text("x")
+    monkeypatch.chdir(tmp_path)
+    assert content_key([("a", Path("a"))], {}) == content_key([("a", tmp_path / ".." / tmp_path.name / "a")], {})

@@ -16,7 +16,7 @@ from PIL import ExifTags, Image
 from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, SfmSettings, find_poses, triangulate
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.photos import Photo
-from bitymi_ns.capture.poses import by_camera, camera_group, make_job, ordered
+from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, make_job, ordered
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import View, render
 from bitymi_ns.sample.room import Room
@@ -39,6 +39,57 @@ def capture(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     Image.fromarray(noise).resize((288, 216), Image.BICUBIC).save(folder / "woanders.png")
     find_poses(folder)
     return folder
+
+
+def test_equal_photographs_have_equal_poses(copied: Copy) -> None:
+    models = []
+    for name in ("one", "two"):
+        poses = find_poses(copied(name), SfmOptions(max_features=400))
+        models.append({path.name: path.read_bytes() for path in poses.model.glob("*.bin")})
+    assert models[0] == models[1]
+
+
+def test_poses_are_found_once_however_the_path_is_written(
+    copied: Copy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied("cap").rename(tmp_path / "images")
+    capture = tmp_path / "capture"
+    capture.mkdir()
+    (tmp_path / "images").rename(capture / "images")
+    monkeypatch.chdir(tmp_path)
+    report = find_poses(Path("capture"), SfmOptions(max_features=400)).report
+    monkeypatch.setattr("bitymi_ns.capture.poses._find", None)
+    (tmp_path / "link").symlink_to(capture)
+    for path in (capture, capture / "images", Path("capture/../capture/."), tmp_path / "link", Path("link/images")):
+        again = find_poses(path, SfmOptions(max_features=400))
+        assert again.report.samefile(report) and (again.images / "photo_1.png").is_file()
+    (tmp_path / "link").unlink()
+    capture.rename(tmp_path / "moved")
+    moved = find_poses(tmp_path / "moved", SfmOptions(max_features=400))
+    assert moved.images == tmp_path / "moved/images" and moved.report.is_relative_to(tmp_path / "moved")
+
+
+def test_a_capture_whose_photographs_lie_below_is_theirs(copied: Copy, tmp_path: Path) -> None:
+    """As `ns-train` takes it, which names the folder of the photographs."""
+    (tmp_path / "cap").mkdir()
+    copied("flat").rename(tmp_path / "cap/shots")
+    assert _what(tmp_path / "cap")[1:] == _what(tmp_path / "cap/shots")[1:]
+    mixed = copied("mixed")
+    (mixed / "more").mkdir()
+    (mixed / "photo_1.png").rename(mixed / "more/photo_1.png")
+    assert _what(mixed)[1] == mixed and "more/photo_1.png" in _what(mixed)[2]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "{}", "null", "[" * 100_000, '{"made": false}', '{"images": 3}', "\udcff", '{"seconds": "x"}'],
+    ids=lambda text: text[:16],
+)
+def test_a_result_that_is_damaged_counts_as_none(text: str, tmp_path: Path) -> None:
+    (tmp_path / "result/sparse/0").mkdir(parents=True)
+    (tmp_path / "result/sparse/0/cameras.bin").touch()
+    (tmp_path / "result/poses.json").write_text(text, "utf8", "surrogateescape")
+    assert _finished(tmp_path, tmp_path) is None
 
 
 def known_centers(views: list[View]) -> np.ndarray:

@@ -16,7 +16,16 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
     """Find the features of the photographs that have none yet."""
     total = len(job.order)
     tell("finding features", 0, total, counts="keypoints")
-    for group, camera_id in zip(job.cameras, camera_ids(job, database), strict=True):
+    groups = list(zip(job.cameras, camera_ids(job, database), strict=True))
+    for group, camera_id in groups:  # which numbers the photographs, in an order that threads do not change
+        pycolmap.import_images(
+            database,
+            job.images,
+            image_names=group.names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            options=_reader(job, group, camera_id),
+        )
+    for group, camera_id in groups:
         pycolmap.extract_features(
             database,
             job.images,
@@ -30,11 +39,10 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
-    """The groups' cameras in the database, written there by the first run."""
+    """The groups' cameras in the database; those that an earlier run has not come to are written."""
     with pycolmap.Database.open(database) as opened:
-        if opened.num_cameras() == 0:
-            for group in job.cameras:
-                opened.write_camera(camera_of(group))
+        for group in job.cameras[opened.num_cameras() :]:
+            opened.write_camera(camera_of(group))
         return [camera.camera_id for camera in opened.read_all_cameras()]
 
 

@@ -11,6 +11,9 @@ PAIRS = "pairs.txt"
 MODEL = "model"
 """Names within the folder of the work: COLMAP's database, the pairs to be compared, and the model that comes out."""
 
+SERIAL = 100
+"""Up to so many photographs cameras and points are placed by one thread. Of 50 photographs two take as long."""
+
 
 class StageProgress(Protocol):
     """Gets the stage, how much of it is done, how much there is, and the table of the database whose rows say how much
@@ -60,6 +63,12 @@ class Job:
     max_features: int = 8192
     poses: dict[str, list[list[float]]] = field(default_factory=dict)
     """World to camera [3,4] per photograph where they are known; points are triangulated then."""
+
+    @property
+    def threads(self) -> int:
+        """Threads of what places cameras and points; -1 = all. Several add up in an order of their own, so that poses
+        of equal photographs differ by rounding, and in time by more."""
+        return 1 if len(self.order) <= SERIAL else -1
 
     def text(self) -> str:
         return json.dumps(asdict(self))

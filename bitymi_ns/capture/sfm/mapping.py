@@ -85,6 +85,8 @@ def _global(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict
     tell(stage, 0, 1)
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
+    options.num_threads = options.mapper.num_threads = job.threads
+    options.mapper.bundle_adjustment.ceres.solver_options.num_threads = job.threads
     copy = folder / "database.db"  # its focal lengths are changed, which the other mapper starts from
     shutil.copyfile(database, copy)
     calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and finds out wrong ones from EXIF
@@ -108,6 +110,7 @@ def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) ->
     tell(stage, 0, total)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
+    options.num_threads = options.mapper.num_threads = job.threads
     options.min_model_size = min(10, max(3, total // 2))
     models = pycolmap.incremental_mapping(
         database, job.images, folder, options, next_image_callback=one_more, initial_image_pair_callback=one_more

@@ -53,7 +53,11 @@ def compare(listed: Path, database: Path, tell: StageProgress) -> None:
     options.match_list_path = listed
     total = len(listed.read_text("utf8").splitlines())
     tell("comparing photographs", 0, total, counts="two_view_geometries")
-    pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pycolmap.match_image_pairs(
+        database, pairing_options=options, verification_options=verification, device=pycolmap.Device.cpu
+    )
     tell("comparing photographs", total, total)
 
 

@@ -30,7 +30,7 @@ def refined(model: pycolmap.Reconstruction, job: Job, pixel: float) -> pycolmap.
     _filter(model, pixel)
     if model.num_points3D() == 0:
         return model
-    _adjust(model)
+    _adjust(model, job)
     _filter(model, pixel)
     if job.opencv_if_better and model.compute_num_observations() >= OBSERVATIONS_PER_CAMERA * model.num_cameras():
         freer = copy.deepcopy(model)
@@ -39,17 +39,18 @@ def refined(model: pycolmap.Reconstruction, job: Job, pixel: float) -> pycolmap.
                 focal, cx, cy, k = camera.params
                 camera.model = pycolmap.CameraModelId.OPENCV
                 camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
-        _adjust(freer)
+        _adjust(freer, job)
         if freer.compute_mean_reprojection_error() < (1 - GAIN) * model.compute_mean_reprojection_error():
             _filter(freer, pixel)
             return freer
     return model
 
 
-def _adjust(model: pycolmap.Reconstruction) -> None:
+def _adjust(model: pycolmap.Reconstruction, job: Job) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = job.threads
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-5
     pycolmap.bundle_adjustment(model, options)

@@ -29,6 +29,7 @@ def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:
     pixel = max(1.0, max(max(group.width, group.height) for group in job.cameras) / job.max_image_size)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
+    options.num_threads = options.mapper.num_threads = job.threads
     options.mapper.filter_max_reproj_error *= pixel
     options.triangulation.complete_max_reproj_error *= pixel
     options.triangulation.merge_max_reproj_error *= pixel

@@ -243,16 +243,18 @@ class Pack:
     output: Path | None = None
     """File to write; not given: beside the folder, with its name and .bitymi."""
     overwrite: Flag = False
-    """Replace a file that is there already."""
+    """Replace a bundle in one file that is there already."""
 
     def run(self) -> int:
-        from bitymi_ns.bundle.single import SUFFIX, write_single
+        from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
         from bitymi_ns.files import size_text
 
         folder = self.bundle.resolve()
         output = self.output or folder.with_name(folder.name + SUFFIX)
         if output.exists() and not self.overwrite:
             raise ValueError(f"{output} is there already: choose another place (--output), or add --overwrite")
+        if output.exists() and not is_single(output):
+            raise ValueError(f"{output} is no bundle and is not replaced: choose another place (--output)")
         with explained(output, ValueError):
             first, size = write_single(folder, output)
         print(f"Wrote {output}, {size_text(size)}; the surfels are in its first {size_text(first)}.")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
@@ -115,6 +116,43 @@ def is_own(folder: Path) -> bool:
     except OSError:
         return False
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
+
+
+def strangers(folder: Path, made: Iterable[str]) -> list[str]:
+    """What is in a folder that was not made by what wants to replace it: names of files and folders, seen from it.
+
+    Args:
+        folder: with what it holds.
+        made: names of all files that were made, seen from it.
+    """
+    files = set(made)
+    folders = {str(parent) for name in files for parent in PurePosixPath(name).parents}
+    found = []
+    for place, below, names in os.walk(folder):
+        where = Path(place).relative_to(folder)
+        for name in [*below, *names]:
+            path = (where / name).as_posix()
+            links = (folder / path).is_symlink()
+            if links or path not in (files if name in names else folders):
+                found.append(path)
+        below[:] = [name for name in below if (where / name).as_posix() in folders]
+    return sorted(found)
+
+
+def keep(folder: Path, made: Iterable[str]) -> None:
+    """See that a folder holds nothing that would be lost if it was replaced.
+
+    Raises:
+        Refused: it does; names it.
+    """
+    others = strangers(folder, made)
+    if others:
+        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        raise Refused(
+            f"{folder} also holds {', '.join(others[:3])}{more}, which would be lost: move that away, or choose "
+            "another folder",
+            folder,
+        )
 
 
 def inside(folder: Path, name: str) -> Path:

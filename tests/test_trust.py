@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from bitymi_ns.host.curve import TrainingCurve
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 from bitymi_ns.measure.bench.suites import read_plan
-from bitymi_ns.trust import Refused, inside, is_own, no_links, own_folder
+from bitymi_ns.trust import Refused, inside, is_own, keep, no_links, own_folder
 
 
 @pytest.fixture
@@ -223,6 +224,39 @@ def test_a_plan_whose_methods_lead_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "plan.yaml").write_text(json.dumps({"rows": {"a": {"method": "../../b"}}}))
     with pytest.raises(BenchError, match="row a: .*leads elsewhere"):
         read_plan(str(tmp_path / "plan.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("notes.txt", "notes.txt"),
+        ("more/notes.txt", "more, more/notes.txt"),
+        ("images/notes.txt", "images/notes.txt"),
+        ("a.png/x", "a.png"),
+        ("empty/", "empty"),
+        (".hidden", ".hidden"),
+    ],
+)
+def test_what_was_not_made_is_named_and_stays(tmp_path: Path, name: str, named: str) -> None:
+    made = ["a.png", "images/b.png", "deep/er/c.png"]
+    for each in made:
+        (tmp_path / each).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / each).touch()
+    keep(tmp_path, made)
+    if name.startswith("a.png"):
+        (tmp_path / "a.png").unlink()
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).mkdir() if name.endswith("/") else (tmp_path / name).touch()
+    with pytest.raises(Refused, match=re.escape(f"also holds {named.split(', ')[0]}")):
+        keep(tmp_path, made)
+
+
+def test_links_under_names_that_were_made_are_named(tmp_path: Path, victim: Path) -> None:
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made/a.png").symlink_to(victim)
+    (tmp_path / "made/images").symlink_to(tmp_path)
+    with pytest.raises(Refused, match="holds a.png, images, which"):
+        keep(tmp_path / "made", ["a.png", "images/b.png"])
 
 
 def test_a_key_is_not_of_how_a_path_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,6 +36,15 @@ def write_single(folder: str | Path, path: str | Path) -> tuple[int, int]:
     return first, len(data)
 
 
+def is_single(path: Path) -> bool:
+    """Whether a file is a bundle, and may be replaced by another one."""
+    try:
+        read_manifest(path)
+    except BundleError:
+        return False
+    return path.is_file()
+
+
 def single_bytes(folder: Path) -> bytes:
     """What `write_single` writes; raises as it does."""
     return _joined(folder)[0]

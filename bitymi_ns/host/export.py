@@ -31,6 +31,7 @@ from bitymi_ns.bake import (
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
+from bitymi_ns.bundle.folder import CONFIG
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.bundle.write import World
@@ -217,7 +218,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 "preview.jpg" if self._is_compact else "preview.png": shown,
                 **cameras_of,
             },
-            loose_files={"config.yml": bundle_config(config, self.output_dir, background)},
+            loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
             interchange=self.interchange,
             first=first,

@@ -29,6 +29,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.views import View, at_size
+from bitymi_ns.trust import Refused, keep
 
 Kind = Literal["gaussians", "mesh"]
 Frame = Literal["scene", "capture"]
@@ -77,7 +78,7 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     """Checks what is asked for and its place, before the work.
 
     Raises:
-        BundleError: there is no such kind, or the folder is there and may not be replaced.
+        BundleError: there is no such kind, or the folder is there and may not be replaced, or holds more.
     """
     unknown = [kind for kind in kinds if kind not in FILES]
     if unknown or not kinds:
@@ -89,6 +90,10 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
         raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another place")
     if not overwrite:
         raise BundleError(f"{folder} is there already: choose another place, or add --overwrite")
+    try:
+        keep(folder, [SUMMARY, *FILES.values()])
+    except Refused as error:
+        raise BundleError(str(error)) from error
 
 
 def write_extras(

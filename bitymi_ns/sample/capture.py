@@ -14,10 +14,12 @@ from PIL import Image as PILImage
 
 from bitymi_ns.files import complete_folder
 from bitymi_ns.sample.room import Hits, Room
+from bitymi_ns.trust import keep
 
 FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])
 BAND = 1 << 16  # rays traced at a time
+CAPTURE, CLOUD = "transforms.json", "sparse_pc.ply"
 MADE_BY = "bitymi sample"  # in transforms.json: only such a folder is overwritten
 
 
@@ -132,7 +134,8 @@ def generate(
     Holds transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png and on, and sparse_pc.ply.
     Equal arguments give equal pictures. The folder is written aside and renamed, so it is there whole or not at all.
 
-    Raises ValueError for sizes that make no picture, FileExistsError for a folder that already holds something.
+    Raises ValueError for sizes that make no picture, FileExistsError for a folder that already holds something,
+    and Refused for a sample beside which there is something else, that would be lost.
     """
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():
@@ -147,6 +150,8 @@ def generate(
             raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
         if output_dir.exists() and any(output_dir.iterdir()) and not _is_sample(output_dir):
             raise FileExistsError(f"{output_dir} is not a sample capture and is not replaced; choose another folder")
+        if output_dir.exists() and any(output_dir.iterdir()):
+            keep(output_dir, _files_of(output_dir))
 
     with complete_folder(output_dir, check) as new:
         _write(new, views, width, height, seed, points, progress)
@@ -156,9 +161,15 @@ def generate(
 def _is_sample(folder: Path) -> bool:
     """Whether the folder is one that `generate` wrote."""
     try:
-        return json.loads((folder / "transforms.json").read_bytes()).get("made_by") == MADE_BY
+        return json.loads((folder / CAPTURE).read_bytes()).get("made_by") == MADE_BY
     except (OSError, ValueError, AttributeError):
         return False
+
+
+def _files_of(folder: Path) -> list[str]:
+    """Names of the files that `generate` wrote into a folder."""
+    images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
+    return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
 
 
 def _write(folder: Path, views: int, width: int, height: int, seed: int, points: int, progress: bool) -> None:
@@ -182,7 +193,7 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
             except BaseException:  # Ctrl-C too: do not wait for what has not begun
                 pool.shutdown(cancel_futures=True)
                 raise
-    write_ply(folder / "sparse_pc.ply", *sparse_points(room, path, images, points, seed))
+    write_ply(folder / CLOUD, *sparse_points(room, path, images, points, seed))
     meta = {
         "made_by": MADE_BY,
         "camera_model": "OPENCV",
@@ -196,13 +207,13 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
         "k2": 0.0,
         "p1": 0.0,
         "p2": 0.0,
-        "ply_file_path": "sparse_pc.ply",
+        "ply_file_path": CLOUD,
         "frames": [
             {"file_path": name, "transform_matrix": view.camera_to_world.tolist()}
             for name, view in zip(names, path, strict=True)
         ],
     }
-    (folder / "transforms.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+    (folder / CAPTURE).write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
 
 
 @contextmanager

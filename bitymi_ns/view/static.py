@@ -5,9 +5,12 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from bitymi_ns.bundle.folder import files_of
+from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.files import complete_folder
+from bitymi_ns.trust import Refused, keep
 
-from .page import SINGLE, PageError, Site
+from .page import BUNDLE, SINGLE, PageError, Site, page_files
 
 
 def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
@@ -22,7 +25,7 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
         bytes written.
 
     Raises:
-        PageError: something else is there.
+        PageError: something else is there, or beside an earlier page.
         OSError: the folder cannot be written.
     """
 
@@ -35,6 +38,13 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
             raise PageError(f"{folder} holds something else than an exported page: choose another folder")
         if not overwrite:
             raise PageError(f"{folder} is there already: choose another folder, or add --overwrite")
+        made = {*site.paths, *page_files(), "view.json", SINGLE}
+        if (folder / BUNDLE / MANIFEST).is_file():
+            made |= {f"{BUNDLE}{name}" for name in files_of(folder / BUNDLE)}
+        try:
+            keep(folder, made)
+        except Refused as error:
+            raise PageError(str(error)) from error
 
     with complete_folder(folder, check) as new:
         for path in site.paths:

@@ -112,6 +112,9 @@ def test_the_command_packs_and_verifies(single: bytes, tmp_path: Path, capsys: p
     assert cli.main(["pack", str(tmp_path / "b")]) == 1
     assert "--overwrite" in capsys.readouterr().err
     assert cli.main(["pack", str(tmp_path / "b"), "--overwrite"]) == 0
+    (tmp_path / "mine.zip").write_bytes(b"precious")
+    assert cli.main(["pack", str(tmp_path / "b"), "--output", str(tmp_path / "mine.zip"), "--overwrite"]) == 1
+    assert "is not replaced" in capsys.readouterr().err and (tmp_path / "mine.zip").read_bytes() == b"precious"
 
 
 def test_deflated_parts_are_refused(single: bytes) -> None:

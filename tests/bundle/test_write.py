@@ -133,6 +133,13 @@ def test_an_existing_folder_is_refused_unless_it_is_a_bundle_to_overwrite(surfel
     make(surfels, target, "sh", overwrite=True)
     assert read_bundle(target).scene.view_color == "sh"
     assert names_beside(target) == ["b"]
+    (target / "thesis.tex").write_text("years of work")
+    with pytest.raises(BundleError, match="also holds thesis.tex, which would be lost"):
+        make(surfels, target, overwrite=True)
+    assert (target / "thesis.tex").read_text() == "years of work" and read_bundle(target).scene.view_color == "sh"
+    (target / "thesis.tex").rename(target / "bundle.json")
+    with pytest.raises(BundleError, match="bundle.json cannot be read"):
+        make(surfels, target, overwrite=True)
     home = tmp_path / "home"
     home.mkdir()
     (home / "thesis.tex").write_text("years of work")

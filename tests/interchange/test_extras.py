@@ -123,6 +123,9 @@ def test_what_cannot_be_written_is_refused_before_the_work(bundle: Bundle, tmp_p
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(BundleError, match="other than extras"):
         write_extras(bundle, tmp_path / "mine", overwrite=True)
+    (tmp_path / "mine" / "extras.json").write_text("{}")
+    with pytest.raises(BundleError, match="also holds letter.txt, which would be lost"):
+        write_extras(bundle, tmp_path / "mine", overwrite=True)
     assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
 
 

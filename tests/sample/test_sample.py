@@ -167,6 +167,10 @@ def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
     folder = generate(tmp_path / "room", views=1, width=16, height=12, points=0)
     generate(folder, views=2, width=16, height=12, points=5, overwrite=True)
     assert len(list((folder / "images").iterdir())) == 2
+    (folder / "images/mine.png").touch()
+    with pytest.raises(OSError, match="also holds images/mine.png, which would be lost"):
+        generate(folder, views=1, width=16, height=12, overwrite=True)
+    assert (folder / "images/mine.png").exists()
 
 
 @pytest.mark.parametrize("bad", [{"views": 0}, {"width": 0}, {"height": -5}, {"points": -1}, {"seed": -1}])

@@ -113,6 +113,11 @@ def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, t
     assert (folder / "bundle" / "atlas.ktx2").read_bytes() == (bundle / "atlas.ktx2").read_bytes()
     assert main(["view", str(bundle), "--export", str(folder)]) == 1
     assert "--overwrite" in capsys.readouterr().err
+    for name in ("mine.html", "bundle/mine.txt"):
+        (folder / name).write_text("x")
+        assert main(["view", str(bundle), "--export", str(folder), "--overwrite"]) == 1
+        assert f"also holds {name}, which would be lost" in capsys.readouterr().err and (folder / name).is_file()
+        (folder / name).unlink()
     assert main(["view", str(bundle), "--export", str(folder), "--overwrite"]) == 0
     other = tmp_path / "other"
     other.mkdir()

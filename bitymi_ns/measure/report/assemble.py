@@ -20,6 +20,10 @@ from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
 from bitymi_ns.measure.report.tables import everything_table, quality_tables, summary, training_table
 from bitymi_ns.measure.report.views import compare_views
 
+PAGE = "report.md"
+MARK = b"bitymi report"
+"""In every file of a report."""
+
 
 def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
@@ -53,7 +57,7 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
     measured = f" Measured on: {'; '.join(records.machines)}." if records.machines else ""
     return Content(
         title=title,
-        intro=f"{', '.join(counts)}. Made by bitymi {__version__}.{measured}",
+        intro=f"{', '.join(counts)}. Made by bitymi report {__version__}.{measured}",
         summary=summary(shown),
         quality=quality_tables(shown),
         training=training_table(records.curves),
@@ -70,12 +74,25 @@ def compose(records: Records, title: str, published: bool = False) -> Content:
 
 
 def _check_output(output_dir: Path) -> None:
-    """Refuse a destination that is a file, or whose index.html somebody else made."""
+    """Refuse a destination that is a file, or in which somebody else made files of a report's names."""
     if output_dir.exists() and not output_dir.is_dir():
         raise ReportError(f"{output_dir} is a file; give a folder for the report.")
     page = output_dir / "index.html"
     if page.exists() and GENERATOR not in page.read_bytes()[:4096].decode("utf8", "replace"):
         raise ReportError(f"{page} was not made by bitymi report and will not be replaced; give another folder.")
+    if page.exists() or not output_dir.is_dir():
+        return
+    names = [path for path in output_dir.iterdir() if path.name == PAGE or _is_plot(path)]
+    strange = [path.name for path in names if path.is_dir() or MARK not in path.read_bytes()]
+    if strange:
+        raise ReportError(
+            f"{output_dir} holds {', '.join(sorted(strange))}, which would be replaced and bitymi report has not "
+            "made; give another folder."
+        )
+
+
+def _is_plot(path: Path) -> bool:
+    return path.suffix == ".png" and is_plot_name(path.stem)
 
 
 def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
@@ -91,8 +108,8 @@ def write_aside(files: dict[str, bytes], output_dir: Path) -> None:
         output_dir.mkdir(exist_ok=True)
         for name in sorted(files, key=lambda name: name == "index.html"):
             os.replace(aside / name, output_dir / name)
-        for path in output_dir.glob("*.png"):
-            if is_plot_name(path.stem) and path.name not in files:
+        for path in output_dir.iterdir():
+            if _is_plot(path) and path.name not in files:
                 path.unlink(missing_ok=True)
 
 
@@ -119,7 +136,7 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
         check_writable(output_dir)
     content = compose(collect(list(inputs), output_dir), title, published)
     files = {f"{plot.name}.png": plot.light for plot in content.plots}
-    files["report.md"] = to_report_md(content).encode("utf8")
+    files[PAGE] = to_report_md(content).encode("utf8")
     files["index.html"] = to_page(content).encode("utf8")
     with explained(output_dir, ReportError):
         write_aside(files, output_dir)

@@ -133,7 +133,7 @@ def _png(sheet: Sheet, theme: Theme) -> bytes:
             ncols=max(1, min(len(handles), int(width * 16) // (longest + 7))),
         )  # fmt: skip
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", facecolor=theme.paper, metadata={"Software": None})
+    figure.savefig(buffer, format="png", facecolor=theme.paper, metadata={"Software": "bitymi report"})
     return buffer.getvalue()
 
 

@@ -100,6 +100,20 @@ def test_report_inside_the_folder_that_it_reads(results: Path):
     assert "16 evaluations" in (results / "index.html").read_text("utf8")
 
 
+@pytest.mark.parametrize("name", ["report.md", "psnr_bytes.png"])
+def test_files_of_a_reports_names_are_not_replaced(results: Path, tmp_path: Path, name: str):
+    out = tmp_path / "report"
+    out.mkdir()
+    (out / name).write_text("mine")
+    with pytest.raises(ReportError, match=f"holds {name}, which would be replaced"):
+        build([results / "evals" / "fox"], out)
+    assert (out / name).read_text() == "mine"
+    (out / name).unlink()
+    build([results / "evals" / "fox"], out)
+    (out / "index.html").unlink()  # as a killed report leaves it
+    build([results / "evals" / "fox"], out)
+
+
 def test_broken_files_of_a_folder_are_noted(results: Path, tmp_path: Path):
     (results / "evals" / "fox" / "broken.json").write_text('{"results": {"psnr": 2')
     (results / "renders" / "fox" / "trained" / "eval_img_0000.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
-from bitymi_ns.capture.recognise import is_photograph
+from bitymi_ns.capture.recognise import is_photograph, open_picture
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
 
@@ -106,7 +106,7 @@ def read_photo(folder: Path, name: str) -> Photo:
     """
     path = folder / name
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             exif = read_exif(image)
             orientation = image.getexif().get(0x0112, 1)
             width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
@@ -184,5 +184,5 @@ def sharpness(grey: np.ndarray) -> float:
 
 def upright(photo: Photo) -> Image.Image:
     """The photograph as an upright RGB image of 8 bits."""
-    with Image.open(photo.path) as image:
+    with open_picture(photo.path) as image:
         return ImageOps.exif_transpose(eight_bits(image)).convert("RGB")

@@ -10,6 +10,7 @@ from PIL import Image
 
 from bitymi_ns.capture.masks import counted, in_proportion, mask_of
 from bitymi_ns.capture.photos import COPY, Photo, upright
+from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.progress import Progress
@@ -80,7 +81,7 @@ def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, wo
 
 def _read_mask(path: Path, photo: Photo) -> Image.Image:
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             mask = Image.fromarray(counted(image))
     except Exception as error:
         raise CaptureError(f"the mask {path} cannot be read: save it anew, or remove it") from error

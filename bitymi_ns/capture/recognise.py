@@ -11,12 +11,18 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import pillow_heif
+from PIL import Image
 
 Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
 
 pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+FORMATS_OF_PICTURES = (
+    "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
+)  # fmt: skip
+"""What a photograph or a mask may be, as Pillow names it, whatever its file is called. Of others of Pillow's formats
+one, EPS, is a program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP model usually lies in a capture, the most usual place first."""
@@ -25,6 +31,12 @@ BESIDES = {"masks", "depths", "sparse", "colmap"}
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries that a transforms.json has from nerfstudio alone."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
+
+
+def open_picture(file: Path) -> Image.Image:
+    """A photograph or mask as Pillow opens it; raises what that raises."""
+    Image.init()  # Pillow knows AVIF from a version on
+    return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
 class NotRecognised(ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +29,11 @@ STILL = 0.02
 """Motion over the whole video, in units of the longer side, below which the camera stood still."""
 PER_SECOND = 15
 """Frames looked at per second by their times, because phones film with a rate that varies with the light."""
+TRUSTED = {
+    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo",
+    "protocol_whitelist": "file",
+}
+"""For FFmpeg: a file may be a list of other files and addresses, whatever it is called, which would be read."""
 LOOKED_AT = 60
 """Frames looked at where a video has as many: all of a clip of a second or two."""
 
@@ -158,7 +164,7 @@ def _pace(video: Path) -> tuple[float, float, int]:
 
 def _opened(video: Path) -> av.container.InputContainer:
     try:
-        container = av.open(str(video))
+        container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative one may begin like an address
     except (av.FFmpegError, OSError, ValueError) as error:
         raise CaptureError(
             f"{video} cannot be read as a video ({error.strerror or error}): record or export it again"

@@ -25,7 +25,7 @@ from bitymi_ns.host.colmap import checked_models
 from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.dataset import BitymiDataset, without_blank_views
 from bitymi_ns.host.errors import fail, listed, warn
-from bitymi_ns.host.images import allow_large_photographs, check_orientation, file_has_transparency
+from bitymi_ns.host.images import check_orientation, file_has_transparency, set_up_pillow
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES, Photographs
 from bitymi_ns.host.ply import colours
 from bitymi_ns.host.point_cloud import reporting_time
@@ -106,7 +106,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     ) -> None:
         self._budget = MemoryBudget(PHOTOGRAPH_BYTES)
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
-        allow_large_photographs()
+        set_up_pillow()
         cloud = check_capture(config, images=test_mode != "inference")
         with (
             reporting_input_errors(config),

@@ -10,10 +10,11 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
+from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
 from bitymi_ns.capture.masks import counted, has_transparency
 from bitymi_ns.capture.photos import eight_bits
+from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.host.errors import fail, listed, warn
 
 T = TypeVar("T")
@@ -35,14 +36,16 @@ def of_header(path: Path, look: Callable[[Image.Image], T], otherwise: T) -> T:
         otherwise: the result where there is nothing to read; what is wrong with a file is said where it is read.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             return look(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return otherwise
 
 
-def allow_large_photographs() -> None:
-    """Raise the number of pixels from which PIL takes a file for an attack, which is 179 million."""
+def set_up_pillow() -> None:
+    """Raise the number of pixels from which Pillow takes a file for an attack, which is 179 million; and have it start
+    no Ghostscript, in nerfstudio's readers either, for a file that is PostScript whatever its name says."""
+    EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MOST_PIXELS // 2  # PIL refuses twice as many
 
 
@@ -59,7 +62,7 @@ def check_sizes(paths: Sequence[Path]) -> None:
 
 def _is_too_large(path: Path) -> bool:
     try:
-        with Image.open(path):
+        with open_picture(path):
             return False
     except Image.DecompressionBombError:
         return True
@@ -82,7 +85,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         InputError: it is missing, cannot be read, or has another size.
     """
     try:
-        with Image.open(path) as file:
+        with open_picture(path) as file:
             if stored is not None and file.size != stored:
                 fail(wrong_size(path, file.size, stored))
             if wanted is not None:
@@ -97,7 +100,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 def read_mask(path: Path) -> Image.Image:
     """The mask as one channel of truth values; see `counted`."""
     try:
-        with Image.open(path) as file:
+        with open_picture(path) as file:
             return Image.fromarray(counted(file))
     except FileNotFoundError as error:
         fail(f"the mask {path} is missing", error)

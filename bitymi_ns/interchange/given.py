@@ -19,6 +19,8 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
 CAMERAS = "cameras.json"
+PICTURES = ("JPEG", "PNG", "WEBP")
+"""What a photograph of a bundle may be, as Pillow names it."""
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Size = Annotated[int, Field(ge=1, le=1 << 20)]
 
@@ -86,7 +88,8 @@ def _view(folder: Path, info: Manifest, row: _Row) -> View:
     if name not in info.files:
         raise BundleError(f"{folder / CAMERAS} names the photograph {name}, which is no file of the bundle")
     try:
-        picture = torch.from_numpy(np.array(Image.open(io.BytesIO(_bytes(folder, info, name))).convert("RGB")))
+        stored = Image.open(io.BytesIO(_bytes(folder, info, name)), formats=PICTURES)
+        picture = torch.from_numpy(np.array(stored.convert("RGB")))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise BundleError(f"{folder / name} cannot be read as a picture: {error}") from error
     height, width = picture.shape[:2]

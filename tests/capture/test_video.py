@@ -46,6 +46,20 @@ def numbers(folder: Path) -> list[int]:
     return sorted(int(path.stem.split("_")[1]) for path in folder.iterdir())
 
 
+def test_a_list_of_other_files_is_no_video(tmp_path: Path, wide: np.ndarray) -> None:
+    write_video(tmp_path / "private.mp4", pan(wide, [4] * 6))
+    (tmp_path / "a.mp4").write_text("ffconcat version 1.0\nfile private.mp4\n")
+    with pytest.raises(CaptureError, match="a.mp4 cannot be read as a video"):
+        extract_frames(tmp_path / "a.mp4", tmp_path, None, silent)
+
+
+def test_a_name_that_begins_like_an_address(tmp_path: Path, wide: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "walk.mp4", pan(wide, [16] * 6))
+    (tmp_path / "walk.mp4").rename("subfile:walk.mp4")
+    assert len(numbers(extract_frames(Path("subfile:walk.mp4"), tmp_path, 3, silent))) == 3
+
+
 def test_the_displacement_is_that_of_the_picture(wide: np.ndarray) -> None:
     grey = wide.mean(axis=2)[::2, ::2]
     for shift in (0, 3, 7):

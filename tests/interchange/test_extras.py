@@ -96,6 +96,17 @@ def test_cameras_and_photographs_are_read_from_folder_and_file(with_cameras: Pat
     assert place_of(tmp_path / "scene.bitymi") == tmp_path / "scene.extras"
 
 
+def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> None:
+    row = {"name": "a", "held_out": True, "width": 64, "height": 48, "fx": 50, "fy": 50, "cx": 32, "cy": 24}
+    row |= {"viewmat": torch.eye(4).flatten().tolist(), "photograph": "p.jpg"}
+    postscript = io.BytesIO()
+    Image.new("RGB", (64, 48)).save(postscript, "EPS")
+    files = {"cameras.json": json.dumps({"cameras": [row]}).encode(), "p.jpg": postscript.getvalue()}
+    make(surfels, tmp_path / "b", extra_files=files)
+    with pytest.raises(BundleError, match="p.jpg cannot be read as a picture: cannot identify"):
+        given_with(tmp_path / "b", read_bundle(tmp_path / "b").info)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

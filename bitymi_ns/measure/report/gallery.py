@@ -55,7 +55,7 @@ def open_image(path: Path) -> Image.Image:
         OSError: the file is not an image that can be read.
     """
     try:
-        with Image.open(path) as opened:
+        with Image.open(path, formats=("PNG", "JPEG")) as opened:
             return opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
     except (SyntaxError, ValueError, Image.DecompressionBombError) as error:  # what Pillow raises on broken PNG chunks
         raise OSError(str(error)) from error

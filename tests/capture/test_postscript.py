@@ -1,0 +1,59 @@
+"""PostScript that is called a photograph: opening it would run it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import EpsImagePlugin, Image
+
+from bitymi_ns.capture.photos import read_photo
+from bitymi_ns.capture.prepare import _read_mask
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.host.errors import InputError
+from bitymi_ns.host.images import file_has_transparency, orientation, read_image, read_mask, set_up_pillow
+from bitymi_ns.measure.report.gallery import open_image
+
+
+@pytest.fixture
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file that what stands for Ghostscript leaves."""
+    script = tmp_path / "bin/gs"
+    script.parent.mkdir()
+    script.write_text(f"#!/bin/sh\ntouch {tmp_path / 'ran'}\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", str(script.parent), prepend=":")
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    return tmp_path / "ran"
+
+
+@pytest.fixture
+def disguised(tmp_path: Path) -> Path:
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (64, 48)).save(path, "EPS")
+    return path
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "photograph": lambda path: read_photo(path.parent, path.name),
+    "mask of a photograph": lambda path: _read_mask(path, None),
+    "image": read_image,
+    "mask": read_mask,
+    "picture of a report": open_image,
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_it_is_not_run(reader: str, disguised: Path, ran: Path) -> None:
+    with pytest.raises((CaptureError, InputError, OSError), match="cannot"):
+        READERS[reader](disguised)
+    assert not ran.exists()
+    assert orientation(disguised) == 1 and not file_has_transparency(disguised)
+
+
+def test_nor_by_the_readers_of_nerfstudio(disguised: Path, ran: Path) -> None:
+    set_up_pillow()
+    with Image.open(disguised) as image, pytest.raises(OSError, match="Ghostscript"):
+        image.load()
+    assert not ran.exists()

@@ -4,8 +4,9 @@ are nerfstudio's own commands: ns-train, ns-export, ns-eval)."""
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TextIO
 
 import tyro
 
@@ -14,6 +15,13 @@ from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.cli import BenchRun
 from bitymi_ns.measure.bench.process import BenchError
+from bitymi_ns.trust import printable
+
+
+def say(text: object, to: TextIO | None = None) -> None:
+    """Print a line at once; what in it would control the terminal, as the name of a file may, stands as an escape."""
+    print(printable(str(text)), file=to or sys.stdout, flush=True)
+
 
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
@@ -52,7 +60,7 @@ class Sample:
                 overwrite=self.overwrite,
                 progress=True,
             )
-        print(f"Wrote {self.views} images and {self.points} points to {folder}")
+        say(f"Wrote {self.views} images and {self.points} points to {folder}")
 
 
 @dataclass
@@ -71,17 +79,17 @@ class Sfm:
         from bitymi_ns.progress import rich_progress
 
         with rich_progress() as progress:
-            poses = find_poses(self.source, self.options, progress, lambda text: print(text, file=sys.stderr))
+            poses = find_poses(self.source, self.options, progress, lambda text: say(text, sys.stderr))
             if self.output is not None:
                 with explained(self.output, ValueError):
                     write_capture(poses, self.output, progress)
         for name, why in poses.left_out.items():
-            print(f"left out: {name}: {why}")
-        print(
+            say(f"left out: {name}: {why}")
+        say(
             f"{poses.registered} of {poses.given} photographs have a pose; mean reprojection error "
             f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.md'}"
         )
-        print(f"Wrote {self.output}" if self.output else f"COLMAP model: {poses.model}")
+        say(f"Wrote {self.output}" if self.output else f"COLMAP model: {poses.model}")
 
 
 @dataclass
@@ -107,7 +115,7 @@ class Report:
             page = report.build(list(self.inputs), self.output_dir, title=self.title, published=self.published)
         except report.ReportError as error:
             raise ValueError(str(error)) from error
-        print(f"Wrote {page}")
+        say(f"Wrote {page}")
 
 
 @dataclass
@@ -128,9 +136,9 @@ class Stability:
         if why := missing(BACKENDS[self.backend]):
             raise ValueError(f"the backend '{self.backend}' cannot be used here: {why}")
         with explained(self.output, ValueError):
-            rows = page.write(self.output, BACKENDS[self.backend], lambda text: print(text, file=sys.stderr))
+            rows = page.write(self.output, BACKENDS[self.backend], lambda text: say(text, sys.stderr))
         worse = [row.label for row in rows if "**" in row.verdict]
-        print(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
+        say(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
 
 
 @dataclass
@@ -220,16 +228,18 @@ class Verify:
             from bitymi_ns.host.verify import check_run
 
             checks += check_run(bundle, self.run_config, self.views)
-        table = Table("", "check", "result", title=escape(f"Bundle {self.bundle}"))
+        table = Table("", "check", "result", title=escape(printable(f"Bundle {self.bundle}")))
         for check in checks:
             outcome = "[green]ok[/]" if check.ok else "[bold red]FAILED[/]"
-            table.add_row(outcome, escape(check.name), escape(check.detail) if check.ok else "see below")
+            table.add_row(
+                outcome, escape(printable(check.name)), escape(printable(check.detail)) if check.ok else "see below"
+            )
         Console().print(table)
         failed = [check for check in checks if not check.ok]
         for check in failed:
-            print(f"{check.name}: {check.detail}")
+            say(f"{check.name}: {check.detail}")
         if failed:
-            print(REMEDY)
+            say(REMEDY)
         return 1 if failed else 0
 
 
@@ -257,7 +267,7 @@ class Pack:
             raise ValueError(f"{output} is no bundle and is not replaced: choose another place (--output)")
         with explained(output, ValueError):
             first, size = write_single(folder, output)
-        print(f"Wrote {output}, {size_text(size)}; the surfels are in its first {size_text(first)}.")
+        say(f"Wrote {output}, {size_text(size)}; the surfels are in its first {size_text(first)}.")
         return 0
 
 
@@ -296,11 +306,11 @@ class Extras:
                 overwrite=self.overwrite,
                 progress=progress,
             )
-        print(f"Wrote {output}")
+        say(f"Wrote {output}")
         for each in written.values():
-            print(interchange.described(each))
+            say(interchange.described(each))
         if not given.train:
-            print("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
+            say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
         return 0
 
 
@@ -336,14 +346,14 @@ class View:
         if self.export is not None:
             with explained(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)
-            print(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
+            say(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
             return 0
         server = view.serve(site, self.host, self.port)
         address = view.address_of(server)
         if not view.is_loopback(self.host):
-            print(f"Everyone who can reach this machine sees {self.bundle} now.", file=sys.stderr)
+            say(f"Everyone who can reach this machine sees {self.bundle} now.", sys.stderr)
         try:
-            print(f"Showing {self.bundle} at {address} until Ctrl-C", flush=True)
+            say(f"Showing {self.bundle} at {address} until Ctrl-C")
             if self.open_browser:
                 webbrowser.open(address)
             server.serve_forever()
@@ -375,13 +385,16 @@ def main(args: Sequence[str] | None = None) -> int:
         description="Textured Beta-surfel splatting for nerfstudio: helpers around ns-train, ns-export and ns-eval.",
         args=args,
     )
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a letter gets its number
     try:
         return command.run() or 0
     except (ValueError, OSError, BenchError, KernelsUnavailable) as error:
-        print(f"bitymi: {error}", file=sys.stderr)
+        say(f"bitymi: {error}", sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("bitymi: interrupted, nothing was left half-written", file=sys.stderr)
+        say("bitymi: interrupted, nothing was left half-written", sys.stderr)
         return 130
 
 

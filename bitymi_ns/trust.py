@@ -1,14 +1,21 @@
-"""Files and folders where other people can write, too: links are not followed, their folders are not used, and names
-that a file states stay inside the folder that they belong to."""
+"""Files and folders where other people can write, too: links are not followed, their folders are not used, and what
+their files say stays within bounds: names within a folder, nesting within a depth, text within what can be shown."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
+import re
 import stat
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from typing import Any
+
+DEEPEST = 100
+"""Levels of JSON that are read."""
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 class Refused(PermissionError):
@@ -170,3 +177,41 @@ def leads_inside(name: str) -> bool:
     """Whether a name is that of a file in the folder that it is relative to, or in the folders in that."""
     path = PurePosixPath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
+def json_of(data: str | bytes) -> Any:
+    """The value of JSON that a file of somebody's holds.
+
+    Raises:
+        ValueError: it is no JSON, or is nested so deeply that what works on it would fail.
+    """
+    try:
+        value = json.loads(data)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    level = [value]
+    for _ in range(DEEPEST):
+        level = [
+            child
+            for each in level
+            if isinstance(each, (list, dict))
+            for child in (each.values() if isinstance(each, dict) else each)
+        ]
+        if not level:
+            return value
+    raise ValueError("it is nested too deeply")
+
+
+def printable(text: str) -> str:
+    """A text for a terminal: what in it controls terminals, as a file's name may, or turns the direction of writing, or
+    is no character, stands as an escape."""
+    return _CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
+
+
+def is_text(name: str | os.PathLike[str]) -> bool:
+    """Whether a file's name is UTF-8, without which it cannot be written into most files."""
+    try:
+        os.fspath(name).encode()
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -23,6 +23,19 @@ def test_bad_value_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().err == "bitymi: views must be at least 1, got 0\n"
 
 
+@pytest.mark.parametrize("name", ["a\x1b[2Jb", "\udcff", "\rx"])
+def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    (tmp_path / name).touch()
+    shown = name.encode("unicode_escape").decode()
+    for command in ("sfm", "verify", "report", "view", "pack", "extras"):
+        assert cli.main([command, str(tmp_path / name)]) == 1
+        said = capsys.readouterr()
+        assert shown in said.err + said.out and name not in said.err + said.out
+    small = ["--views", "1", "--width", "16", "--height", "12"]
+    assert cli.main(["sample", "--output-dir", str(tmp_path / f"{name}2"), *small]) == 0
+    assert shown in capsys.readouterr().out
+
+
 def test_unwritable_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert cli.main(["sample", "--output-dir", str(tmp_path / "file" / "room")]) == 1

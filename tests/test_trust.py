@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from bitymi_ns import files
 from bitymi_ns.capture import CaptureError
-from bitymi_ns.capture.cache import content_key, read_from, work_folder
+from bitymi_ns.capture.cache import content_key, read_from, user_cache, work_folder
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
@@ -26,7 +26,7 @@ from bitymi_ns.host.curve import TrainingCurve
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 from bitymi_ns.measure.bench.suites import read_plan
-from bitymi_ns.trust import Refused, inside, is_own, keep, no_links, own_folder
+from bitymi_ns.trust import Refused, inside, is_own, json_of, keep, no_links, own_folder, printable
 
 
 @pytest.fixture
@@ -191,6 +191,27 @@ def test_neither_place_can_be_used(photographs: Path, tmp_path: Path) -> None:
         used(photographs)
 
 
+def test_no_home_is_no_hindrance_where_the_capture_can_be_written(
+    photographs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", no_home)
+    assert used(photographs) == ("capture", [])
+    (photographs / ".bitymi").rename(photographs / "x")
+    (photographs / ".bitymi").symlink_to(photographs / "x")
+    with pytest.raises(CaptureError, match="neither .*/.bitymi nor a cache folder can be .*set XDG_CACHE_HOME"):
+        used(photographs)
+
+
+@pytest.mark.parametrize("cache", ["", "relative/folder"])
+def test_a_cache_that_is_no_absolute_path_is_not_used(cache: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", cache)
+    assert user_cache() == Path.home() / ".cache/bitymi-ns"
+
+
 @pytest.mark.parametrize("name", ["../a.jpg", "a/../../b.jpg", "/etc/passwd", "", ".", "a\0b", ".."])
 def test_names_that_lead_elsewhere(name: str) -> None:
     with pytest.raises(ValueError, match="leads elsewhere"):
@@ -257,6 +278,30 @@ def test_links_under_names_that_were_made_are_named(tmp_path: Path, victim: Path
     (tmp_path / "made/images").symlink_to(tmp_path)
     with pytest.raises(Refused, match="holds a.png, images, which"):
         keep(tmp_path / "made", ["a.png", "images/b.png"])
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[" * 400 + "]" * 400, '{"a":' * 101 + "1" + "}" * 101])
+def test_json_that_is_nested_too_deeply(text: str) -> None:
+    with pytest.raises(ValueError, match="nested too deeply"):
+        json_of(text)
+
+
+def test_json_of_ordinary_depth() -> None:
+    assert json_of(b'{"a": [{"b": [1, [2, []]]}, "x", null]}') == {"a": [{"b": [1, [2, []]]}, "x", None]}
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a\x1b[31mb", "a\\x1b[31mb"),
+        ("\x07\r\x9b2J", "\\x07\\r\\x9b2J"),
+        ("a\u202egpj.exe", "a\\u202egpj.exe"),
+        ("\udcff", "\\udcff"),
+        ("Ä für\tspäter\n日本 👩\u200d🚀\u00a0x", "Ä für\tspäter\n日本 👩\u200d🚀\u00a0x"),
+    ],
+)
+def test_what_controls_a_terminal_is_shown_as_an_escape(text: str, shown: str) -> None:
+    assert printable(text) == shown
 
 
 def test_a_key_is_not_of_how_a_path_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError
-from bitymi_ns.trust import Refused, keep
+from bitymi_ns.trust import Refused, json_of, keep
 
 CONFIG = "config.yml"
 """Configuration for nerfstudio's tools, for which bundle.json does not vouch."""
@@ -47,9 +46,9 @@ def files_of(folder: Path) -> list[str]:
         BundleError: bundle.json cannot be read.
     """
     try:
-        listed = json.loads((folder / MANIFEST).read_bytes())["files"]
+        listed = json_of((folder / MANIFEST).read_bytes())["files"]
         return [MANIFEST, CONFIG, *map(str, listed)]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise BundleError(
             f"{folder / MANIFEST} cannot be read ({error}): it is not known what of {folder} is the bundle. Remove it "
             "yourself, or choose another place"

@@ -14,7 +14,7 @@ from pathlib import Path
 from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, write_file
-from bitymi_ns.trust import Refused, is_own, own_folder
+from bitymi_ns.trust import Refused, is_own, json_of, own_folder
 
 FOLDER = ".bitymi"
 OF = "of.json"
@@ -110,10 +110,10 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
     if not is_own(other):
         return False
     try:
-        of = json.loads((other / OF).read_text("utf8"))
+        of = json_of((other / OF).read_text("utf8"))
         if of["source"] != source or of["contents"] == contents:
             return False
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+    except (OSError, ValueError, LookupError, TypeError):
         return False
     for mark in other.glob(f"{IN_USE}*"):
         try:

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.files import write_file
+from bitymi_ns.trust import json_of
 
 EARTH = 6378137.0
 """Equatorial radius in metres, WGS 84."""
@@ -61,7 +62,7 @@ def write_frame(folder: Path, frame: WorldFrame) -> None:
 def read_frame(folder: Path) -> WorldFrame | None:
     """The frame.json in a folder; None where there is none, or another program's."""
     try:
-        frame = WorldFrame(**json.loads((folder / FILE).read_text("utf8")))
+        frame = WorldFrame(**json_of((folder / FILE).read_text("utf8")))
     except (OSError, ValueError, TypeError):
         return None
     length = frame.metres_per_unit

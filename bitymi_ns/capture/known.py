@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture.cache import content_key, work_folder
+from bitymi_ns.capture.photos import check_names
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError
@@ -75,6 +76,7 @@ def triangulate(
         )
     if len(views) < 2:
         raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
+    check_names(images, [view.name for view in views])
     settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
     key = content_key([(view.name, images / view.name) for view in views], settings)
     with work_folder(images, key, tell) as work:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from bitymi_ns.capture.exif import Exif, read_exif
 from bitymi_ns.capture.recognise import is_photograph, open_picture
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
+from bitymi_ns.trust import is_text
 
 PLAIN_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 """What COLMAP and nerfstudio read as it is."""
@@ -72,6 +75,22 @@ def find_photos(folder: Path) -> list[str]:
     parts = [path.relative_to(folder).parts for path in paths]
     seen = [p for p in parts if not any(part.startswith(".") or part in ("masks", "mask") for part in p[:-1])]
     return sorted(("/".join(p) for p in seen), key=natural)
+
+
+def check_names(folder: Path, names: Sequence[str]) -> None:
+    """Stop at names that COLMAP, and the files that name the photographs, cannot hold.
+
+    Raises:
+        CaptureError: the path to the folder, or a name in it, is not UTF-8.
+    """
+    where = os.path.realpath(folder)
+    wrong = [name for name in (where, *names) if not is_text(name)]
+    if wrong:
+        more = f" and of {len(wrong) - 1} more" if len(wrong) > 1 else ""
+        raise CaptureError(
+            f"in {where}, the name of {wrong[0]}{more} is not UTF-8: rename it (`convmv -r -f latin1 -t utf8 --notest "
+            "FOLDER` does so for names in an older encoding)"
+        )
 
 
 def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:

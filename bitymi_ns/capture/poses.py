@@ -19,7 +19,7 @@ from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, take_place, work_folder
 from bitymi_ns.capture.frame import local_positions, settle, write_frame
 from bitymi_ns.capture.masks import mask_folder
-from bitymi_ns.capture.photos import Photo, find_photos, photo_folder, read_photos
+from bitymi_ns.capture.photos import Photo, check_names, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.selection import blurred, duplicates
@@ -59,6 +59,7 @@ def find_poses(
     options = options or SfmOptions()
     tell = progress or no_progress
     source, folder, names = _what(Path(source))
+    check_names(folder, names)
     masks = mask_folder(folder, source, options.masks) if folder.is_dir() else None
     if masks is not None and source.is_dir():
         below = masks / folder.relative_to(photo_folder(source))

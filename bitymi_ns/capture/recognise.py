@@ -3,7 +3,6 @@ video."""
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,6 +11,8 @@ from typing import Any, Literal, get_args
 
 import pillow_heif
 from PIL import Image
+
+from bitymi_ns.trust import json_of
 
 Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
 
@@ -145,7 +146,7 @@ def _kind_of(file: Path) -> Format:
     A file that cannot be read is taken for nerfstudio's; its reader says what is wrong.
     """
     try:
-        meta = json.loads(file.read_bytes())
+        meta = json_of(file.read_bytes())
     except (OSError, ValueError):
         return "nerfstudio"
     if not isinstance(meta, dict) or meta.keys() & NERFSTUDIOS_OWN:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bitymi_ns.files import write_file
+from bitymi_ns.trust import printable
 
 if TYPE_CHECKING:  # those who read reports need not wait for it
     import pycolmap
@@ -42,7 +43,7 @@ def _page(values: Mapping[str, object]) -> str:
     lines = [
         "# Camera poses",
         "",
-        f"Source: {values['source']}",
+        f"Source: {_cell(values['source'])}",
         "",
         "| | |",
         "|---|---|",
@@ -75,7 +76,7 @@ def _page(values: Mapping[str, object]) -> str:
 
 
 def _cell(text: object) -> str:
-    return str(text).replace("|", "\\|").replace("\n", " ")
+    return printable(str(text)).replace("|", "\\|").replace("\n", " ")
 
 
 def frame_text(values: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 import sys
@@ -33,6 +32,7 @@ from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
 from bitymi_ns.host.poses import check_spread
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
+from bitymi_ns.trust import json_of
 
 
 class Cloud(NamedTuple):
@@ -197,7 +197,7 @@ def declares_box(dataparser: DataParserConfig) -> bool:
         return True
     if isinstance(dataparser, InstantNGPDataParserConfig):
         path = dataparser.data if dataparser.data.suffix == ".json" else dataparser.data / "transforms.json"
-        return "aabb_scale" in json.loads(path.read_bytes())
+        return "aabb_scale" in json_of(path.read_bytes())
     return False
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host.errors import fail, warn
-from bitymi_ns.trust import no_links
+from bitymi_ns.trust import json_of, no_links
 
 FILE = "training_curve.jsonl"
 
@@ -45,7 +45,7 @@ def _points_until(path: Path, steps: int) -> list[str]:
     kept = []
     for line in path.read_text("utf8").splitlines():
         try:
-            if json.loads(line)["step"] <= steps:
+            if json_of(line)["step"] <= steps:
                 kept.append(line)
         except (ValueError, KeyError, TypeError):
             continue  # cut off when the run was killed

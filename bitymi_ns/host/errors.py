@@ -8,6 +8,8 @@ from typing import NoReturn
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
+from bitymi_ns.trust import printable
+
 
 class InputError(SystemExit):
     """Something about the input is wrong. Python prints the message to stderr and exits with status 1.
@@ -17,7 +19,7 @@ class InputError(SystemExit):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(f"bitymi: {message}")
+        super().__init__(printable(f"bitymi: {message}"))
 
     def __str__(self) -> str:
         return str(self.code)
@@ -30,12 +32,12 @@ def fail(message: str, cause: BaseException | None = None) -> NoReturn:
 
 def say(message: str) -> None:
     """Tell the user something, in one line however long it is; brackets in it are no markup."""
-    CONSOLE.print(escape(message), soft_wrap=True)
+    CONSOLE.print(escape(printable(message)), soft_wrap=True)
 
 
 def warn(message: str) -> None:
     """Tell the user about something that goes on without what it should have had."""
-    CONSOLE.print(f"[bold yellow]{escape(message)}", soft_wrap=True)
+    CONSOLE.print(f"[bold yellow]{escape(printable(message))}", soft_wrap=True)
 
 
 def listed(names: Sequence[object], most: int = 3) -> str:

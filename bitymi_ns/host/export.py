@@ -102,6 +102,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
     preview as Gaussian splats), mesh (textured quads). `bitymi extras BUNDLE` does so later."""
     extras_frame: Frame = "scene"
     """Frame of these files: the scene's, or the capture's own."""
+    check_room: bool = True
+    """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
     photographs: bool = False
     """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders; who is given the
     bundle is given them."""
@@ -115,7 +117,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
                     check_extras(self.extras, place_of(self.output_dir), self.overwrite)
-                check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
+                if self.check_room:
+                    check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
                 self._run(bake_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)

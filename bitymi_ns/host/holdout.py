@@ -32,11 +32,17 @@ class Split(NamedTuple):
         return f"Held out for evaluation: {len(self.held_out)} of {len(names)} photographs, {self.rule} ({shown})."
 
 
+def ordinal(number: int) -> str:
+    """1st, 2nd, 3rd, 4th and so on."""
+    ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{ending}"
+
+
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
     """The split of photographs in this order by nerfstudio's rules."""
     numbers = list(range(len(names)))
     if mode == "interval":
-        which = f"every {interval}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(interval, 'th') } by name"
+        which = f"every {ordinal(interval)} by name"
         return Split([i for i in numbers if i % interval], [i for i in numbers if i % interval == 0], which)
     if mode == "all":
         return Split(numbers, numbers, "all")

@@ -17,6 +17,7 @@ from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.colmap_views import Origin, Source
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import THREADS, of_header
+from bitymi_ns.trust import json_of
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
@@ -72,7 +73,7 @@ def read(folder: Path) -> KeptPoses | None:
     if not path.is_file():
         return None
     try:
-        values: dict[str, Any] = json.loads(path.read_text("utf8"))
+        values: dict[str, Any] = json_of(path.read_text("utf8"))
         entries, left_out = dict(values["origin"]), dict(values["left_out"])
         if entries.get("settings") is not None:  # runs of earlier versions do not state them
             entries["settings"] = SfmSettings(**entries["settings"])

@@ -49,7 +49,8 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
         fail(
             f"there may be too little room for {folder}: {size_text(free)} are free, and a bundle of this scene may "
             f"take up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint). Free some "
-            "space, or give an --output-dir on another disk."
+            "space, give an --output-dir on another disk, or try it all the same with --check-room False: if the disk "
+            "gets full, nothing is left behind."
         )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import glob
-import json
 import math
 import os
 import sys
@@ -23,7 +22,7 @@ from bitymi_ns.capture.recognise import PHOTOGRAPHS, is_model
 from bitymi_ns.host.cameras import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.poses import rotations
-from bitymi_ns.trust import leads_inside
+from bitymi_ns.trust import json_of, leads_inside
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")
@@ -79,7 +78,7 @@ def load(path: Path, own_format: bool, announce: bool = True) -> Any:
         InputError: the file cannot be used; the message names the frame.
     """
     try:
-        meta = json.loads(path.read_bytes())
+        meta = json_of(path.read_bytes())
     except FileNotFoundError as error:
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
     except (ValueError, OSError) as error:
@@ -176,7 +175,7 @@ def colmap_points(path: Path) -> Path | None:
     if not is_model(model):
         return None
     try:
-        meta = json.loads(path.read_bytes())
+        meta = json_of(path.read_bytes())
     except (OSError, ValueError):
         return None  # what is wrong is said where it is read
     return None if not isinstance(meta, dict) or "ply_file_path" in meta else model

@@ -14,7 +14,7 @@ from PIL import Image as PILImage
 
 from bitymi_ns.files import complete_folder
 from bitymi_ns.sample.room import Hits, Room
-from bitymi_ns.trust import keep
+from bitymi_ns.trust import json_of, keep
 
 FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])
@@ -161,7 +161,7 @@ def generate(
 def _is_sample(folder: Path) -> bool:
     """Whether the folder is one that `generate` wrote."""
     try:
-        return json.loads((folder / CAPTURE).read_bytes()).get("made_by") == MADE_BY
+        return json_of((folder / CAPTURE).read_bytes()).get("made_by") == MADE_BY
     except (OSError, ValueError, AttributeError):
         return False
 

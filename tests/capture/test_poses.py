@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import fields
@@ -90,6 +91,22 @@ def test_a_result_that_is_damaged_counts_as_none(text: str, tmp_path: Path) -> N
     (tmp_path / "result/sparse/0/cameras.bin").touch()
     (tmp_path / "result/poses.json").write_text(text, "utf8", "surrogateescape")
     assert _finished(tmp_path, tmp_path) is None
+
+
+def test_names_that_are_not_utf8_are_refused_before_the_work(copied: Copy, tmp_path: Path) -> None:
+    folder = copied("cap")
+    (folder / "photo_1.png").rename(os.fsdecode(os.fsencode(folder) + b"/f\xfcr.png"))
+    with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
+        find_poses(folder, progress=never)
+    folder = copied("other").rename(os.fsdecode(os.fsencode(tmp_path) + b"/\xe4"))
+    with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
+        find_poses(folder, progress=never)
+    with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
+        triangulate(folder, [KnownView(f"photo_{i}.png", 9, 9, 9, 9, 5, 5, np.eye(4)[:3]) for i in (1, 2)], never)
+
+
+def never(step: str, done: int, total: int) -> None:
+    raise AssertionError("work was begun")
 
 
 def known_centers(views: list[View]) -> np.ndarray:

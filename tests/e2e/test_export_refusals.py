@@ -89,9 +89,12 @@ def test_a_place_that_will_not_do_is_found_before_the_work(
         run_export(trained, tmp_path / ("b" * 300))
     monkeypatch.setattr(target, "free_bytes", lambda path: 34_500)
     with pytest.raises(
-        InputError, match=r"too little room .*: 34.5 kB are free, .* up to \d.* MB \(a generous estimate"
+        InputError,
+        match=r"too little room .*: 34.5 kB are free, .* up to \d.* MB \(a generous estimate.*--check-room False",
     ):
         run_export(trained, tmp_path / "b")
+    with pytest.raises(TypeError):  # of the work, which is reached
+        run_export(trained, tmp_path / "b", check_room=False)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 

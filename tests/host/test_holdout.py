@@ -19,6 +19,13 @@ def test_every_eighth_by_name() -> None:
     )
 
 
+def test_ordinals() -> None:
+    numbers = (1, 2, 3, 4, 10, 11, 12, 13, 20, 21, 22, 23, 101, 111, 112, 1013)
+    text = "1st 2nd 3rd 4th 10th 11th 12th 13th 20th 21st 22nd 23rd 101st 111th 112th 1013th"
+    assert " ".join(map(holdout.ordinal, numbers)) == text
+    assert "every 21st by name" in holdout.by_mode(NAMES, "interval", 21, 0.9).told(NAMES)
+
+
 def test_the_other_rules() -> None:
     assert holdout.by_mode(NAMES, "all", 8, 0.9).held_out == list(range(20))
     assert len(holdout.by_mode(NAMES, "fraction", 8, 0.9).train) == 18

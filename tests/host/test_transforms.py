@@ -13,8 +13,10 @@ from nerfstudio.data.dataparsers import nerfstudio_dataparser
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from PIL import Image
 
+from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.host import point_cloud
 from bitymi_ns.host.cameras import check_cameras
+from bitymi_ns.host.errors import InputError, say, warn
 from tests.host.captures import expect, images_of, load, load_with, said
 from tests.host.test_cameras import cameras
 
@@ -26,6 +28,21 @@ def test_a_byte_order_mark(capture: Path, encoding: str) -> None:
     assert len(load(capture).train_dataset) == 10
     ngp = InstantNGPDataParserConfig(eval_mode="interval")
     assert len(load_with(capture, ngp).train_dataset) == 10
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": ' + "[" * 500 + "]" * 500 + "}"])
+def test_a_file_that_is_nested_too_deeply(capture: Path, text: str) -> None:
+    (capture / "transforms.json").write_text(text)
+    with expect("transforms.json cannot be read: it is nested too deeply"):
+        load(capture)
+    assert recognise(capture).format == "nerfstudio"
+
+
+def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    say("a\x1b[2Jb [red]")
+    warn("\x9b")
+    assert "a\\x1b[2Jb [red]" in (text := said(capsys)) and "\\x9b" in text and "\x9b" not in text
+    assert str(InputError("\x1b]0;x\x07")) == "bitymi: \\x1b]0;x\\x07"
 
 
 def test_photographs_outside_of_the_folder_are_named(

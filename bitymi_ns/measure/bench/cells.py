@@ -18,7 +18,7 @@ from typing import Any
 from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.machine import commit, machine, versions
 from bitymi_ns.measure.bench.process import BenchError
-from bitymi_ns.trust import no_links
+from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
 NAMES = ("suite", "row")
@@ -76,7 +76,7 @@ class Cells:
             if not line.strip():
                 continue
             try:
-                cell = json.loads(line)
+                cell = json_of(line)
                 self._known[identity(cell["key"])] = {**cell, "value": dict(cell["value"])}
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 where = f"line {number}" if first else "a line that was added"

@@ -18,6 +18,7 @@ from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.bench.progress import Display
 from bitymi_ns.measure.bench.suites import FORMATS, format_bundles, local_scenes, read_plan, standard_scenes, suites
 from bitymi_ns.measure.bench.tables import results_page
+from bitymi_ns.trust import printable
 
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
@@ -123,13 +124,13 @@ class BenchRun:
             say(failure)
         cells.refresh()
         text = results_page(f"Benchmark: {self.plan or self.suite}", matrix, cells, failures)
-        print(text)
+        print(printable(text))
         if self.output is not None:
             self.output.parent.mkdir(parents=True, exist_ok=True)
             with explained(self.output, BenchError):
                 write_file(self.output, text.encode("utf8"))
         if len(cells):
-            print(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}", file=sys.stderr)
+            print(printable(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}"), file=sys.stderr)
         else:
             print("No cell was finished.", file=sys.stderr)
         return FAILED if failures else 0

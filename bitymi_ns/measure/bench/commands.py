@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from bitymi_ns.measure.bench.cells import without_nan
 from bitymi_ns.measure.bench.matrix import Run, Stage
 from bitymi_ns.measure.bench.process import CommandFailed, Cost, tool
+from bitymi_ns.trust import json_of
 
 CURVE = "training_curve.jsonl"
 
@@ -157,7 +157,7 @@ def _format(info: Any) -> str | None:
 
 
 def _evaluation(at: Layout, stage: Stage) -> dict[str, Any]:
-    results = json.loads(at.place("evals", f"{stage.form}.json").read_text("utf8"))["results"]
+    results = json_of(at.place("evals", f"{stage.form}.json").read_text("utf8"))["results"]
     if not isinstance(results, dict) or "psnr" not in results:
         raise ValueError("no psnr in it")
     return {"results": results}
@@ -165,13 +165,13 @@ def _evaluation(at: Layout, stage: Stage) -> dict[str, Any]:
 
 def _pictures(at: Layout, stage: Stage) -> dict[str, Any]:
     folder = at.place("pictures")
-    pictures = json.loads((folder / "pictures.json").read_text("utf8"))["views"]
+    pictures = json_of((folder / "pictures.json").read_text("utf8"))["views"]
     return {"folder": at.relative(folder), "views": len(pictures)}
 
 
 def _knobs(at: Layout, stage: Stage) -> dict[str, Any]:
     lines = at.place("knobs", "knobs.jsonl").read_text("utf8").splitlines()
-    points = [json.loads(line) for line in lines if line.strip()]
+    points = [json_of(line) for line in lines if line.strip()]
     if not points:
         raise ValueError("no line in knobs.jsonl")
     return {"points": points}
@@ -187,7 +187,7 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
     if path.is_file():
         for line in path.read_text("utf8").splitlines():
             try:
-                point = json.loads(line)
+                point = json_of(line)
                 points[point["step"]] = point
             except (ValueError, KeyError, TypeError):
                 continue

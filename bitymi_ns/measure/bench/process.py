@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bitymi_ns.files import Lock
-from bitymi_ns.trust import no_links
+from bitymi_ns.trust import no_links, printable
 
 TAIL = 25
 """Lines of a failed command's log that are shown."""
@@ -117,4 +117,4 @@ def tool(name: str) -> str:
 
 def say(text: str) -> None:
     """Progress on stderr, apart from the tables."""
-    print(f"[{datetime.datetime.now():%H:%M:%S}] {text}", file=sys.stderr, flush=True)
+    print(f"[{datetime.datetime.now():%H:%M:%S}] {printable(text)}", file=sys.stderr, flush=True)

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.engine import missing
 from bitymi_ns.measure.bench.matrix import Stage
+from bitymi_ns.trust import printable
 
 
 class Estimate:
@@ -134,9 +135,11 @@ class Display:
 
     def _show(self, description: str | None, line: str | None = None) -> None:
         left = self.left()
-        text = description if description is not None else ", ".join(map(str, self._running))
+        text = printable(description if description is not None else ", ".join(map(str, self._running)))
         self._progress.update(self._task, description=text, left=left)
         if line is not None:
-            self.console.print(f"{line}{'; ' + left if left else ''}", highlight=False, markup=False, soft_wrap=True)
+            self.console.print(
+                printable(f"{line}{'; ' + left if left else ''}"), highlight=False, markup=False, soft_wrap=True
+            )
         elif not self.console.is_terminal:
-            self.console.print(f"{description} ... ", highlight=False, markup=False, soft_wrap=True)
+            self.console.print(printable(f"{description} ... "), highlight=False, markup=False, soft_wrap=True)

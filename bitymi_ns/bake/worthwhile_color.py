@@ -85,6 +85,21 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
     return found
 
 
+def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
+    """Bytes that `color_choices` holds at once.
+
+    Args:
+        kind: of the view colours.
+        surfels, views: how many there are.
+        most: lean terms of a surfel.
+    """
+    entry = VIEW_COLORS[kind]
+    numbers = range(most + 1) if entry.sites is not None else sorted({0, most})
+    of_surfel = 4 * (4 * (most + 1) + entry.lean_width * sum(numbers))  # errors, bases and terms of every number
+    of_view = 4 + 1 + 1  # weights, whether they are above 0, and the same of the surfels of a number of terms
+    return surfels * (of_surfel + of_view * views)
+
+
 @torch.no_grad()
 def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progress = no_progress) -> ColorChoices:
     """What fewer terms would do to lean view colours, from all that a surfel has down to one colour.
@@ -118,7 +133,7 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
             continue
         done = 0
         centers = centers_of(cameras, error)
-        for at in view_directions(surfels["means"][group], weights[:, group] > 0, centers):
+        for at in view_directions(surfels["means"][group], (weights > 0)[:, group], centers):
             rows = group[at.rows]
             own = {name: surfels[name][rows] for name in ("view_base", "view_span")}
             blind, counts_blind = _blind(surfels["means"][rows], weights[:, rows], centers, scene.near)

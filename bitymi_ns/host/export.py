@@ -197,7 +197,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         if (tune or polish) and model.device.type != "cpu":
             say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
-            state_export(model.scene, views, tune.cache_bytes if tune else 0, len(model.scene) if polish else 0)
+            kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
+            state_export(model.scene, views, kept, learning_surfels, self._is_compact)
         try:
             with rich_progress() as progress:
                 held_out = datamanager.eval_views if self.compare else ()

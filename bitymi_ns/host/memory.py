@@ -12,10 +12,12 @@ import psutil
 import torch
 
 from bitymi_ns.bake.texel_scene import LEAST_KEPT
+from bitymi_ns.bake.worthwhile_color import choice_bytes
 from bitymi_ns.host.errors import say, warn
 from bitymi_ns.host.photographs import PHOTOGRAPH_BYTES
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
@@ -96,7 +98,9 @@ def state_training(
     _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
 
 
-def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0) -> None:
+def state_export(
+    scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
+) -> None:
     """Say what an export will take.
 
     Args:
@@ -104,14 +108,20 @@ def state_export(scene: Scene, cameras: Sequence[Camera], finetune_bytes: float,
         cameras: of the training views, on the CPU.
         finetune_bytes: that the fine-tuning may keep of the views; 0 = there is none.
         learning: surfels that learn after the bake.
+        compact: the bundle's view colours have the terms that the pictures pay for.
     """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)
     if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
         finetune_bytes = 0  # too few views would fit
-    needed = PROGRAM + kept + finetune_bytes + PER_PIXEL * pixels
-    needed += _per_fragment(scene) * fragments + PER_SURFEL * learning
+    needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    kind = scene.config.view_color
+    entry = VIEW_COLORS[kind]
+    terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
+    chosen = choice_bytes(kind, len(scene), len(cameras), terms) if compact else 0
+    seen = 2 * len(cameras) * len(scene)  # of `Visibility`, and of those of its surfels that are drawn
+    needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bitymi_ns.bake.worthwhile_color import color_choices, shown_weights
+from bitymi_ns.bake.worthwhile_color import choice_bytes, color_choices, shown_weights
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
@@ -52,6 +52,20 @@ def test_the_price_decides_from_all_terms_to_none(colored, cameras, kind: str) -
         assert with_colors(scene, colors).render(cameras[0], BACKGROUND).rgb.isfinite().all()
     assert counts == sorted(counts, reverse=True) and counts[-1] == 0
     assert counts[0] <= len(scene.surfels["view_terms"])
+
+
+@pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
+def test_the_bytes_that_are_stated_are_those_that_are_held(colored, cameras, kind: str) -> None:
+    scene = colored(kind)
+    most = int(scene.surfels["view_span"][:, 1].max())
+    choices = color_choices(scene, cameras)
+    held = [choices.error, choices.base, *choices.terms.values()]
+    if VIEW_COLORS[kind].sites is None:  # which keeps as many numbers as surfels have
+        held = [choices.error, choices.base, choices.terms[0], choices.terms[most]]
+    assert choice_bytes(kind, COUNT, 0, most) == sum(values.nbytes for values in held)
+    weights = shown_weights(scene, cameras)
+    of_views = choice_bytes(kind, COUNT, len(cameras), most) - choice_bytes(kind, COUNT, 0, most)
+    assert of_views == weights.nbytes + 2 * (weights > 0).nbytes
 
 
 def test_weights_are_those_of_the_fragments(colored, cameras) -> None:

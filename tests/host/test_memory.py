@@ -88,11 +88,26 @@ def test_surfels_that_learn_in_an_export_take_what_they_take_in_training(
     assert needed[1] - needed[0] == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
 
 
+@pytest.mark.parametrize(("compact", "bytes_each"), [(False, 2), (True, 6)])
+def test_an_export_holds_what_every_view_shows_of_every_surfel(
+    scene: tuple[Scene, Camera],
+    compact: bool,
+    bytes_each: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(memory, "_state", lambda what, needed, *more: stated.append(needed))
+    stated: list[float] = []
+    for views in (30_000, 40_000):  # whose photographs are more than are kept
+        memory.state_export(scene[0], [scene[1]] * views, 0, compact=compact)
+    assert stated[1] - stated[0] == 10_000 * bytes_each * len(scene[0])
+
+
 def test_views_are_counted_where_the_fine_tuning_keeps_them(
     scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
 ) -> None:
     needed = []
-    for views in (10, 10_000_000):
+    for views in (10, 300_000):
         memory.state_export(scene[0], [scene[1]] * views, 2e9)
         needed.append(gigabytes(said(capsys)))
     assert needed[0] - needed[1] == pytest.approx(2.0 - memory.PHOTOGRAPH_BYTES / 1e9, abs=0.11)

@@ -125,6 +125,21 @@ def is_own(folder: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
 
 
+def check_no_links(paths: Iterable[Path]) -> None:
+    """See that none of these, which may be missing, is a link or a hard link: they come out of archives, too.
+
+    Raises:
+        Refused: one is.
+    """
+    for path in paths:
+        try:
+            found = os.lstat(path)
+        except FileNotFoundError:
+            continue
+        if stat.S_ISLNK(found.st_mode) or (stat.S_ISREG(found.st_mode) and found.st_nlink > 1):
+            raise Refused(f"{path} is a link, which is not followed: remove it", path)
+
+
 def strangers(folder: Path, made: Iterable[str]) -> list[str]:
     """What is in a folder that was not made by what wants to replace it: names of files and folders, seen from it.
 

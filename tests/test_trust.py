@@ -23,6 +23,7 @@ from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.types import Poses
 from bitymi_ns.files import reason
 from bitymi_ns.host.curve import TrainingCurve
+from bitymi_ns.host.run_folder import keep_poses_report
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 from bitymi_ns.measure.bench.suites import read_plan
@@ -171,6 +172,28 @@ def test_a_folder_of_others_beside_the_photographs_is_not_used(photographs: Path
     work.parent.symlink_to(tmp_path)
     assert used(photographs)[0] == "cache"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cache", "capture"]
+
+
+@pytest.mark.parametrize("name", ["result", "model", "masks", "images", "links", "database.db", "poses.txt"])
+@pytest.mark.parametrize("plant", [link, no_such, hard_link])
+def test_a_folder_of_an_archive_that_holds_links_is_not_used(
+    name: str, plant: Plant, photographs: Path, victim: Path
+) -> None:
+    used(photographs)
+    plant(photographs / ".bitymi/poses-0" / name, victim)
+    where, said = used(photographs)
+    assert where == "cache" and f"{name} is a link, which is not followed" in said[0]
+
+
+def test_the_poses_of_a_run_are_not_kept_through_a_link(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("run", "report", "documents"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "report/report.json").write_text("{}")
+    (tmp_path / "documents/thesis.tex").write_text("years of work")
+    (tmp_path / "run/poses").symlink_to(tmp_path / "documents")
+    keep_poses_report(tmp_path / "run", tmp_path / "report")
+    assert "poses is a link, which is not followed" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "documents/thesis.tex").read_text() == "years of work"
 
 
 def test_others_may_not_write_into_what_is_made(photographs: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, write_file
-from bitymi_ns.trust import Refused, is_own, json_of, own_folder
+from bitymi_ns.trust import Refused, check_no_links, is_own, json_of, own_folder
 
 FOLDER = ".bitymi"
 OF = "of.json"
@@ -61,6 +61,7 @@ def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
             place.parent.mkdir(parents=True, exist_ok=True)
             own_folder(place, close=True)
             own_folder(folder)
+            check_no_links(folder.iterdir())
             lock = files.Lock(folder / ".lock", tell=lambda text: None)
         except files.Busy as error:
             raise CaptureError(f"poses of {photographs} are being found already: {error}") from error

@@ -11,6 +11,7 @@ from bitymi_ns.capture.report import FILES
 from bitymi_ns.host import kept_poses
 from bitymi_ns.host.colmap_views import Source
 from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.trust import check_no_links
 
 LOCK = ".lock"
 """Name of the file that lies in a run folder while a process trains into it."""
@@ -75,6 +76,7 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
     if report is not None and report.resolve() == (folder / POSES).resolve():
         return  # the run goes on with what it keeps already
     try:
+        check_no_links([folder / POSES])
         with files.complete_folder(folder / POSES, tell=warn) as new:
             for file in there:
                 shutil.copyfile(file, new / file.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,8 @@ def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:
     options.triangulation.complete_max_reproj_error *= pixel
     options.triangulation.merge_max_reproj_error *= pixel
     scratch = Path(job.work) / "triangulated"
-    scratch.mkdir(exist_ok=True)
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
     model = pycolmap.triangulate_points(model, database, job.images, scratch, options=options)
     tell("triangulating", 1, 1)
     if model.num_points3D() < LEAST:

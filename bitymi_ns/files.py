@@ -22,9 +22,8 @@ from typing import BinaryIO
 
 from rich.filesize import decimal
 
-from bitymi_ns.trust import Refused, is_left, no_links
+from bitymi_ns.trust import UNFINISHED, Refused, is_left, no_links
 
-UNFINISHED = ".unfinished"
 Tell = Callable[[str], None]
 """Gets a message for people about something that goes on without what it should have had."""
 

@@ -13,6 +13,8 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+UNFINISHED = ".unfinished"
+"""Ends the name of a file on its way, which begins with a dot: a killed process leaves it."""
 DEEPEST = 100
 """Levels of JSON that are read."""
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -147,7 +149,8 @@ def strangers(folder: Path, made: Iterable[str]) -> list[str]:
         folder: with what it holds.
         made: names of all files that were made, seen from it.
     """
-    files = set(made)
+    named = [PurePosixPath(name) for name in made]
+    files = {str(path) for name in named for path in (name, name.with_name(f".{name.name}{UNFINISHED}"))}
     folders = {str(parent) for name in files for parent in PurePosixPath(name).parents}
     found = []
     for place, below, names in os.walk(folder):

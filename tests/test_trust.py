@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from bitymi_ns import files
 from bitymi_ns.capture import CaptureError
-from bitymi_ns.capture.cache import content_key, read_from, user_cache, work_folder
+from bitymi_ns.capture.cache import content_key, home, read_from, user_cache, work_folder
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
@@ -196,6 +196,15 @@ def test_the_poses_of_a_run_are_not_kept_through_a_link(tmp_path: Path, capsys: 
     assert (tmp_path / "documents/thesis.tex").read_text() == "years of work"
 
 
+def test_a_folder_of_images_has_that_of_its_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "images").mkdir()
+    assert home(tmp_path / "images") == home(tmp_path) == tmp_path / ".bitymi"
+    monkeypatch.chdir(tmp_path / "images")
+    assert home(Path(".")) == tmp_path / ".bitymi"
+    monkeypatch.setattr(os.path, "ismount", lambda path: path == tmp_path / "images")
+    assert home(tmp_path / "images") == tmp_path / "images/.bitymi"
+
+
 def test_others_may_not_write_into_what_is_made(photographs: Path) -> None:
     before = os.umask(0)
     try:
@@ -286,6 +295,7 @@ def test_what_was_not_made_is_named_and_stays(tmp_path: Path, name: str, named: 
     for each in made:
         (tmp_path / each).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / each).touch()
+    (tmp_path / "images/.b.png.unfinished").touch()  # as a killed process leaves it
     keep(tmp_path, made)
     if name.startswith("a.png"):
         (tmp_path / "a.png").unlink()

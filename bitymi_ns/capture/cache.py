@@ -82,9 +82,9 @@ def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
 
 def home(photographs: Path) -> Path:
     """The folder beside photographs or a video for what is found of them; the same one, whether a capture is named or
-    its folder `images`."""
-    folder = photographs if photographs.is_dir() else photographs.parent
-    return (folder.parent if folder.name == "images" else folder) / FOLDER
+    its folder `images`. Beside a mount point it would not stay with the photographs."""
+    folder = Path(os.path.abspath(photographs if photographs.is_dir() else photographs.parent))
+    return (folder.parent if folder.name == "images" and not os.path.ismount(folder) else folder) / FOLDER
 
 
 def take_place(work: Path, photographs: Path, contents: str) -> None:

@@ -14,6 +14,7 @@ from bitymi_ns.bake.statistics import FineTuning, Percentiles
 from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.host.errors import say
 from bitymi_ns.ops import VIEW_COLORS
+from bitymi_ns.trust import printable
 
 
 def decibels(value: float | None) -> str:
@@ -25,7 +26,7 @@ def print_summary(folder: Path, info: Manifest) -> None:
     """What was written, what was left out, and what it cost."""
     statistics = info.statistics
     surfels = statistics.surfels
-    table = Table("", "", title=escape(f"Bundle {folder}"), show_header=False)
+    table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
     table.add_row("Surfels", f"{surfels.trained:,} -> {info.surfels.count:,}")
     left_out = {name: count for name, count in surfels.left_out if count}
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")

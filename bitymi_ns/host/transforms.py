@@ -89,11 +89,11 @@ def load(path: Path, own_format: bool, announce: bool = True) -> Any:
         _distribute(path, meta, announce)
         _check_transform(path, meta)
         _check_lists(path, meta)
-        if announce:
-            _tell_outside(path, meta["frames"])
     elif isinstance(meta, dict):
         _check_other_format(path, meta)
     frames = meta.get("frames") if isinstance(meta, dict) else None
+    if announce and isinstance(frames, list):
+        _tell_outside(path, frames)
     if isinstance(frames, list) and all(isinstance(f, dict) and "transform_matrix" in f for f in frames):
         _correct_poses(path, frames, announce)
         _check_repeated(path, frames)
@@ -120,11 +120,13 @@ def _check_frames(path: Path, meta: Any) -> None:
         )
 
 
-def _tell_outside(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Name photographs that lie elsewhere: nerfstudio reads them there, and what is made of the capture shows them."""
-    outside = [frame["file_path"] for frame in frames if not leads_inside(frame["file_path"])]
+def _tell_outside(path: Path, frames: list[Any]) -> None:
+    """Name pictures that lie elsewhere: nerfstudio reads them there, and what is made of the capture shows them."""
+    keys = ("file_path", "mask_path", "depth_file_path")
+    names = [frame.get(key) for frame in frames if isinstance(frame, dict) for key in keys]
+    outside = [name for name in names if isinstance(name, str) and not leads_inside(name)]
     if outside:
-        warn(f"{path} names photographs outside of its folder, which are read there: {listed(outside)}.")
+        warn(f"{path} names pictures outside of its folder, which are read there: {listed(outside)}.")
 
 
 def _file_name(path: Path, i: int, key: str, name: Any) -> str:

@@ -52,7 +52,7 @@ def test_photographs_outside_of_the_folder_are_named(
     picture.rename(tmp_path / "elsewhere.png")
     edit(capture, lambda meta: meta["frames"][3].update(file_path=str(tmp_path / "elsewhere.png")))
     load(capture)
-    assert f"photographs outside of its folder, which are read there: {tmp_path}/elsewhere.png." in said(capsys)
+    assert f"pictures outside of its folder, which are read there: {tmp_path}/elsewhere.png." in said(capsys)
 
 
 def test_nerfstudios_reader_is_left_as_it_was(capture: Path) -> None:

@@ -94,6 +94,7 @@ def state_training(
     if texels is not None:
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
         needed += PER_TEXEL * (SMALLEST**2 * surfels + most)
+        needed += len(cameras) * surfels  # of `Visibility`, a byte for each that is looked through: at most all
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
     _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
 

@@ -101,6 +101,10 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
     for views in (30_000, 40_000):  # whose photographs are more than are kept
         memory.state_export(scene[0], [scene[1]] * views, 0, compact=compact)
     assert stated[1] - stated[0] == 10_000 * bytes_each * len(scene[0])
+    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    for views in (30_000, 40_000):
+        memory.state_training(scene[0], [scene[1]] * views, 0, options, 1000)
+    assert stated[3] - stated[2] == 10_000 * len(scene[0])
 
 
 def test_views_are_counted_where_the_fine_tuning_keeps_them(

@@ -337,6 +337,12 @@ def test_what_controls_a_terminal_is_shown_as_an_escape(text: str, shown: str) -
     assert printable(text) == shown
 
 
+def test_a_plan_that_is_nested_too_deeply(tmp_path: Path) -> None:
+    (tmp_path / "plan.yaml").write_text("[" * 5000)
+    with pytest.raises(BenchError, match="plan.yaml is nested too deeply"):
+        read_plan(str(tmp_path / "plan.yaml"))
+
+
 def test_a_key_is_not_of_how_a_path_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_text("x")
     monkeypatch.chdir(tmp_path)

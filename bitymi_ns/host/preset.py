@@ -97,7 +97,7 @@ def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[s
         raise PresetError(f"there is no preset file {path}{where}; reinstall bitymi-ns")
     try:
         values = yaml.safe_load(path.read_text("utf8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except yaml.YAMLError as error:
         raise PresetError(f"{path.name}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
         raise PresetError(f"{path.name}: expected a mapping of options, found {type(values).__name__}")

@@ -39,7 +39,9 @@ def _read(path: Path) -> Any:
         return yaml.safe_load(path.read_text("utf8"))
     except OSError as error:
         raise BenchError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except RecursionError as error:
+        raise BenchError(f"{path} is nested too deeply") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise BenchError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
 
 

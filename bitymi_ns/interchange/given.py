@@ -12,13 +12,13 @@ import torch
 from PIL import Image
 from pydantic import BaseModel, Field, ValidationError
 
-from bitymi_ns.bundle import BundleError, archive
+from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import Manifest, check_file_name
-from bitymi_ns.bundle.read import check_bytes
+from bitymi_ns.bundle.parts import CAMERAS, Parts, parts_of
+from bitymi_ns.bundle.read import read_file
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
-CAMERAS = "cameras.json"
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Size = Annotated[int, Field(ge=1, le=1 << 20)]
 
@@ -67,42 +67,29 @@ def given_with(folder: str | Path, info: Manifest) -> Given:
     Raises:
         BundleError: a file is missing, altered or malformed.
     """
-    folder = Path(folder)
     if CAMERAS not in info.files:
         return Given()
-    try:
-        rows = _File.model_validate_json(_bytes(folder, info, CAMERAS)).cameras
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise BundleError(f"{folder / CAMERAS}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    held_out = [_view(folder, info, row) for row in rows if row.held_out and row.photograph is not None]
+    with parts_of(folder) as parts:
+        try:
+            rows = _File.model_validate_json(read_file(parts, info, CAMERAS)).cameras
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"]))
+            raise BundleError(f"{parts.bundle / CAMERAS}: {where}: {first['msg']}") from error
+        held_out = [_view(parts, info, row) for row in rows if row.held_out and row.photograph is not None]
     return Given([row.camera() for row in rows if not row.held_out], held_out)
 
 
-def _view(folder: Path, info: Manifest, row: _Row) -> View:
+def _view(parts: Parts, info: Manifest, row: _Row) -> View:
     """A photograph, which may be smaller than its camera's image."""
     name, camera = row.photograph or "", row.camera()
     check_file_name(name, CAMERAS)
     if name not in info.files:
-        raise BundleError(f"{folder / CAMERAS} names the photograph {name}, which is no file of the bundle")
+        raise BundleError(f"{parts.bundle / CAMERAS} names the photograph {name}, which is no file of the bundle")
     try:
-        picture = torch.from_numpy(np.array(Image.open(io.BytesIO(_bytes(folder, info, name))).convert("RGB")))
+        picture = torch.from_numpy(np.array(Image.open(io.BytesIO(read_file(parts, info, name))).convert("RGB")))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise BundleError(f"{folder / name} cannot be read as a picture: {error}") from error
+        raise BundleError(f"{parts.bundle / name} cannot be read as a picture: {error}") from error
     height, width = picture.shape[:2]
     K = torch.diag(torch.tensor([width / camera.width, height / camera.height, 1.0])) @ camera.K
     return View(Camera(camera.viewmat, K, width, height), picture)
-
-
-def _bytes(folder: Path, info: Manifest, name: str) -> bytes:
-    path = folder / name
-    try:
-        if folder.is_file():
-            with archive.opened(folder, str(folder)) as parts:
-                data = parts.part(name, info.files[name].bytes)
-        else:
-            data = path.read_bytes()
-    except OSError as error:
-        raise BundleError(f"{path} cannot be read: {error}") from error
-    check_bytes(path, info, name, data)
-    return data

@@ -7,6 +7,8 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote, urlsplit
 
+from bitymi_ns.bundle.manifest import BundleError
+
 from .page import POLICY, PageError, Site, media_type
 
 LOOPBACK = "127.0.0.1"
@@ -50,12 +52,12 @@ def serve(site: Site, host: str = LOOPBACK, port: int = 0) -> ThreadingHTTPServe
                 return
             path = unquote(urlsplit(self.path).path)
             name = "index.html" if path == "/" else path[1:]
-            if not path.startswith("/") or name not in site.paths:
+            if not path.startswith("/") or name not in site:
                 self._send(HTTPStatus.NOT_FOUND, b"there is no such file\n", "", body)
                 return
             try:
                 data = site.read(name)
-            except OSError:
+            except (BundleError, OSError, MemoryError):
                 self._send(HTTPStatus.NOT_FOUND, b"the file cannot be read\n", "", body)
                 return
             self._send(HTTPStatus.OK, data, media_type(name), body)
@@ -64,7 +66,7 @@ def serve(site: Site, host: str = LOOPBACK, port: int = 0) -> ThreadingHTTPServe
             name = self.headers.get("Host", "").lower()
             return name.rpartition(":")[0] in LOCAL_NAMES or name in LOCAL_NAMES
 
-        def _send(self, status: HTTPStatus, data: bytes, kind: str, body: bool) -> None:
+        def _send(self, status: HTTPStatus, data: bytes | bytearray, kind: str, body: bool) -> None:
             self.send_response(status)
             self.send_header("Content-Type", kind or "text/plain; charset=utf-8")
             self.send_header("Content-Length", str(len(data)))

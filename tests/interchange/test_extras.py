@@ -109,7 +109,7 @@ def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: byt
     info = read_bundle(tmp_path / "b").info
     with pytest.raises(BundleError, match=message):
         given_with(tmp_path / "b", info)
-    (tmp_path / "b" / "cameras.json").write_bytes(b"[]")
+    (tmp_path / "b" / "cameras.json").write_bytes(text[:-1] + b"?")
     with pytest.raises(BundleError, match="altered"):
         given_with(tmp_path / "b", info)
 

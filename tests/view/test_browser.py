@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import http.server
 import json
-import shutil
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -133,21 +133,21 @@ def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None
 
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "missing", "newer"])
-def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path, tmp_path: Path) -> None:
-    """Damaged after the server has started: nothing but the browser could see it."""
-    copy = shutil.copytree(bundle, tmp_path / "copy")
-    with served(site_of(copy)) as address:
-        table = copy / "surfels.ply"
-        data = table.read_bytes()
-        if damage == "truncated":
-            table.write_bytes(data[:-40])
-        elif damage == "altered":
-            table.write_bytes(data[:-4] + bytes([data[-4] ^ 1]) + data[-3:])
-        elif damage == "missing":
-            table.unlink()
-        else:
-            info = json.loads((copy / "bundle.json").read_text())
-            (copy / "bundle.json").write_text(json.dumps({**info, "version": "9.0"}))
+def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path) -> None:
+    """On a server that sends files as they are: nothing but the browser could see it."""
+    site, name, data = site_of(bundle), "bundle/surfels.ply", (bundle / "surfels.ply").read_bytes()
+    newer = json.dumps({**json.loads((bundle / "bundle.json").read_text()), "version": "9.0"}).encode()
+
+    def missing() -> bytes:
+        raise OSError
+
+    sent: dict[str, dict[str, Callable[[], bytes]]] = {
+        "truncated": {name: lambda: data[:-40]},
+        "altered": {name: lambda: data[:-4] + bytes([data[-4] ^ 1]) + data[-3:]},
+        "missing": {name: missing},
+        "newer": {"bundle/bundle.json": lambda: newer},
+    }
+    with served(Site(site.files, {**site.made, **sent[damage]})) as address:
         found = drive([["goto", address], ["settle"], ["ask", STATE], ["ask", "document.body.innerText"]], SCREEN)
     state, text = found.results[-2:]
     assert state == "error"

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import json
 import shutil
 import signal
 import subprocess
 import sys
+import zipfile
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 
-from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle import BundleError, check_files
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from bitymi_ns.view import PageError, serve, site_of, write_static
+from tests.bundle.damage import amend
 from tests.view.browser import served
 
 
@@ -93,14 +96,73 @@ def test_the_server_listens_on_the_loopback_address_alone(bundle: Path) -> None:
         server.server_close()
 
 
-def test_a_link_out_of_the_bundle_is_not_followed(bundle: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(bundle, tmp_path / "copy")
-    (copy / "surfels.ply").unlink()
-    (copy / "surfels.ply").symlink_to("/etc/passwd")
-    with pytest.raises(PageError, match="leads out of the bundle"):
-        site_of(copy)
+FILE = {"bytes": 25, "sha256": hashlib.sha256(b"<script>alert(1)</script>").hexdigest()}
+
+
+def whole(folder: Path, path: Path) -> None:
+    """A bundle in one file as another program could write it: with all files of the folder."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for file in sorted(folder.iterdir()):
+            archive.write(file, file.name)
+
+
+def test_what_is_no_longer_what_bundle_json_says_is_not_sent_at_any_time(bundle: Path, tmp_path: Path) -> None:
+    copy, elsewhere = shutil.copytree(bundle, tmp_path / "copy"), tmp_path / "elsewhere"
+    (elsewhere / "same").mkdir(parents=True)
+    shutil.copy(copy / "surfels.ply", elsewhere / "same")
+    secret = elsewhere / "secret"
+    secret.write_bytes(bytes((copy / "surfels.ply").stat().st_size))
+    site = site_of(copy)
+    with served(site) as address:
+        assert ask(address, "/bundle/surfels.ply")[0] == 200
+        for target in (secret, elsewhere / "same" / "surfels.ply", Path("/dev/zero"), Path("/etc/passwd")):
+            (copy / "surfels.ply").unlink()
+            (copy / "surfels.ply").symlink_to(target)
+            assert ask(address, "/bundle/surfels.ply")[0] == 404
+            assert main(["view", str(copy), "--export", str(tmp_path / "site")]) == 1
+            assert main(["pack", str(copy), "--output", str(tmp_path / "copy.bitymi")]) == 1
+    with pytest.raises(BundleError, match="leads out of the bundle"):
+        site.read("bundle/surfels.ply")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "elsewhere"]
     with pytest.raises(BundleError, match="not a bundle"):
         site_of(tmp_path)
+
+
+STRANGE = ["a.htm", "a.svg", "a.xhtml", "shell.php", "run.cgi", "index.html", "A.HTM", "photograph-0001.jpg.php", "a"]
+
+
+def test_files_that_the_format_does_not_name_are_not_passed_on_and_that_is_said(
+    bundle: Path, tmp_path: Path, capsys
+) -> None:
+    """Neither served nor exported, in either form, nor packed; what is passed on is a whole bundle again."""
+    strange = shutil.copytree(bundle, tmp_path / "strange")
+    for name in STRANGE:
+        (strange / name).write_text("<script>alert(1)</script>")
+    amend(strange, lambda info: info["files"].update({name: FILE for name in STRANGE}))
+    whole(strange, tmp_path / "whole.bitymi")
+    for source in (strange, tmp_path / "whole.bitymi"):
+        with served(site_of(source)) as address:
+            assert {ask(address, f"/bundle/{name}")[0] for name in STRANGE} == {404}
+            sent = json.loads(ask(address, "/bundle/bundle.json")[2])
+        folder, one, packed = (tmp_path / name for name in ("site", "one", "packed.bitymi"))
+        for command in (
+            ["view", str(source), "--export", str(folder), "--overwrite"],
+            ["view", str(source), "--export", str(one), "--one-file", "--overwrite"],
+            ["pack", str(source), "--output", str(packed), "--overwrite"],
+        ):
+            assert main(command) == 0
+            said = capsys.readouterr().err
+            assert "Left out" in said and "a.htm" in said and "4 more" in said
+        names = {path.name for path in folder.rglob("*")} | {path.name for path in one.rglob("*")}
+        assert names.isdisjoint(set(STRANGE) - {"index.html"}) and not (folder / "bundle" / "index.html").exists()
+        for result in (folder / "bundle", one / "scene.bitymi", packed):
+            found, checks = check_files(result)
+            assert found is not None and all(check.ok for check in checks)
+            assert (
+                found.info.files.keys()
+                == sent["files"].keys()
+                == json.loads((bundle / "bundle.json").read_text())["files"].keys()
+            )
 
 
 def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, tmp_path: Path, capsys) -> None:

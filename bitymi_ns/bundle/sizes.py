@@ -50,7 +50,7 @@ def _check_compact_size(info: Manifest, head: bytes, size: int) -> None:
 
 def _check_texels_size(info: Manifest, head: bytes, size: int) -> None:
     if info.atlas is not None:
-        compact.check_texels_size(info.atlas, size)
+        compact.check_texels_size(info.atlas, size, info.files[COMPACT_SURFELS].bytes)
 
 
 _CHECKS: dict[str, Callable[[Manifest, bytes, int], None]] = {

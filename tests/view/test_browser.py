@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.bundle import read_bundle
+from bitymi_ns.bundle import ktx2, read_bundle
 from bitymi_ns.bundle.single import read_single, write_single
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.view import Site, site_of, write_static
-from tests.bundle.damage import signed
+from tests.bundle.damage import amend, signed
 from tests.view.browser import drive, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 
@@ -171,3 +171,45 @@ def test_an_exported_folder_is_shown_by_a_plain_file_server(bundle: Path, tmp_pa
         server.shutdown()
     assert not found.problems
     assert difference(tmp_path / "p.png", bundle)[0] < MEAN
+
+
+def test_an_atlas_of_more_pages_than_the_device_takes_is_too_large(tmp_path: Path) -> None:
+    bundle = write(tmp_path / "b", "uint8")
+    image = ktx2.parse_ktx2((bundle / "atlas.ktx2").read_bytes())
+    pages = [bytes(page) for page in image.payload] * 300
+    ktx2.write_ktx2(bundle / "atlas.ktx2", pages, "uint8", image.width, image.height, "test")
+    amend(bundle, lambda info: info["atlas"].update(layers=len(pages)))
+    with served(site_of(bundle)) as address:
+        found = drive([["goto", address], ["settle"], ["ask", STATE], ["ask", "document.body.innerText"]], SCREEN)
+    assert found.results[-2] == "error" and not found.problems
+    assert "too large for this device" in found.results[-1] and "300 pages" in found.results[-1]
+
+
+ERRORS = {
+    "refused": (
+        "const made = GPUDevice.prototype.createTexture; GPUDevice.prototype.createTexture = function (what) {"
+        "return made.call(this, { ...what, size: [16, 16, 100000] }); }",
+        "The graphics device reports an error",
+    ),
+    "no memory": (
+        "GPUDevice.prototype.createSampler = function () {"
+        "this.dispatchEvent(new GPUUncapturedErrorEvent('uncapturederror', { error: new GPUOutOfMemoryError('') })); }",
+        "too large for this device",
+    ),
+    "lost": (
+        "Object.defineProperty(GPUDevice.prototype, 'lost', { get: () => new Promise((resolve) =>"
+        "setTimeout(resolve, 3000, { reason: 'unknown', message: 'gone' })) })",
+        "The graphics device was lost",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ERRORS)
+def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> None:
+    """And it stays, whatever the page still does; of a lost device also after the picture was there."""
+    script, said = ERRORS[what]
+    wait = "new Promise((resolve) => setTimeout(resolve, 4000))"
+    with served(site_of(bundle)) as address:
+        steps = [["init", script], ["goto", address], ["settle"], ["ask", wait]]
+        found = drive([*steps, ["ask", STATE], ["ask", "document.getElementById('page').innerText"]], SCREEN)
+    assert found.results[-2] == "error" and said in found.results[-1]

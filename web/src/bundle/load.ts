@@ -34,7 +34,13 @@ export async function readPart(source: Source, info: Manifest, name: string, cam
   return data;
 }
 
-export async function loadBundle(source: Source, info: Manifest, progress: Progress): Promise<Bundle> {
+// `admit` refuses a scene that is too large; nothing is decoded before.
+export async function loadBundle(
+  source: Source,
+  info: Manifest,
+  progress: Progress,
+  admit: (info: Manifest) => Promise<void>,
+): Promise<Bundle> {
   const first = info.compact ? ['surfels.bin'] : ['surfels.ply', ...(info.atlas ? ['atlas.ktx2'] : [])];
   const total = first.reduce((sum, name) => sum + (info.files.get(name)?.bytes ?? 0), 0);
   let done = 0;
@@ -42,7 +48,7 @@ export async function loadBundle(source: Source, info: Manifest, progress: Progr
     readPart(source, info, name, (bytes) => progress((done += bytes), total));
   const views = async (): Promise<string | null> =>
     info.files.has('cameras.json') ? source.text('cameras.json') : null;
-  const [cameras, table, atlas] = await Promise.all([views(), ...first.map(load)]);
+  const [, cameras, table, atlas] = await Promise.all([admit(info), views(), ...first.map(load)]);
   if (!info.compact) {
     const pages = info.atlas ? await parseKtx2(atlas, info.atlas) : null;
     return { info, surfels: readSurfels(table, info), pages, later: null, cameras, source };

@@ -328,7 +328,8 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
             raise BundleError(f"{source} is not a bundle: its format is not {FORMAT!r}")
         stated = info.pop("digest", None)
         version = _version(info.get("version"), source)
-        text, found = strict_json.canonical(info), strict_json.digest(info)
+        text = strict_json.canonical(info)
+        found = strict_json.digest_of(text)
     except BundleError:
         raise
     except ValueError as error:

@@ -24,7 +24,7 @@ from bitymi_ns.bundle.manifest import (
     dump,
 )
 
-MANIFEST_LIMIT = 64 << 20
+MANIFEST_LIMIT = 4 << 20
 """Bytes that a bundle.json may have."""
 DIRECTORY_LIMIT = 4 << 20
 """Bytes that the directory of a bundle in one file may have."""

@@ -213,3 +213,28 @@ def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> N
         steps = [["init", script], ["goto", address], ["settle"], ["ask", wait]]
         found = drive([*steps, ["ask", STATE], ["ask", "document.getElementById('page').innerText"]], SCREEN)
     assert found.results[-2] == "error" and said in found.results[-1]
+
+
+def test_a_page_that_is_opened_as_a_file_says_what_to_do(bundle: Path, tmp_path: Path) -> None:
+    """Browsers load no modules from files."""
+    write_static(site_of(bundle), tmp_path / "site")
+    ask = [["ask", STATE], ["ask", "document.getElementById('page').innerText"]]
+    found = drive([["goto", f"file://{tmp_path}/site/index.html"], ["settle"], *ask], SCREEN)
+    assert found.results[-2] == "error"
+    assert "opened as a file" in found.results[-1] and "web server" in found.results[-1]
+    assert "Loading" not in found.results[-1]
+
+
+@pytest.mark.parametrize("data", [None, b"let let = ;"], ids=["missing", "not understood"])
+def test_a_page_whose_script_does_not_run_says_so(data: bytes | None, bundle: Path) -> None:
+    site = site_of(bundle)
+
+    def read() -> bytes:
+        if data is None:
+            raise OSError
+        return data
+
+    ask = [["ask", STATE], ["ask", "document.getElementById('page').innerText"]]
+    with served(Site(site.files, {**site.made, "index.js": read})) as address:
+        found = drive([["goto", address], ["settle"], *ask], SCREEN)
+    assert found.results[-2] == "error" and "cannot start" in found.results[-1] and "Reload" in found.results[-1]

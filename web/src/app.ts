@@ -278,7 +278,7 @@ export class App {
     image.removeAttribute('src');
     element('photograph-name').textContent = camera.photograph ? 'Photograph' : 'No photograph of this camera';
     if (camera.photograph) {
-      const found = this.bundle.source.address(camera.photograph);
+      const found = this.bundle.photograph(camera.photograph);
       this.photograph = found;
       found.then((address) => this.photograph === found && (image.src = address), showError);
     } else {

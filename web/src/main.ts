@@ -77,6 +77,7 @@ async function main(): Promise<void> {
   }
 }
 
+document.documentElement.dataset.state = 'loading';
 addEventListener('unhandledrejection', ({ reason }) => showError(reason));
 addEventListener('error', ({ error }) => error && showError(error)); // notes of the browser have none
 main().catch(showError);

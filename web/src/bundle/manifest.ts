@@ -116,8 +116,10 @@ class Reader {
     if (!found.every(good)) this.refuse(key, `whole numbers from ${low} to ${high}`);
     return found as number[];
   }
-  entries(): [string, Reader][] {
-    return Object.keys(this.value).map((key) => [key, this.part(key)]);
+  entries(most: number): [string, Reader][] {
+    const keys = Object.keys(this.value);
+    if (keys.length > most) throw new DamagedBundle(`bundle.json: ${this.path} has more than ${most} keys.`);
+    return keys.map((key) => [key, this.part(key)]);
   }
   text(key: string, pattern: RegExp): string {
     const found = this.value[key];
@@ -131,6 +133,7 @@ const MOST_COLUMNS = 64;
 const MOST_NUMBERS = 16; // of a column
 const MOST_BYTES = 7; // of a number: what a double holds exactly
 const MOST_POINTS = 4096;
+const MOST_FILES = 1 << 14;
 const RATES = [1e-12, 1e12]; // pixels per unit of length
 
 function columns(r: Reader): Column[] {
@@ -220,7 +223,7 @@ export function parseManifest(text: string): Manifest {
   const files = new Map(
     root
       .part('files')
-      .entries()
+      .entries(MOST_FILES)
       .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
   const isCompact = version.startsWith('3.');

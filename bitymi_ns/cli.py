@@ -348,7 +348,7 @@ class View:
             return 0
         server = view.serve(site, self.host, self.port)
         address = view.address_of(server)
-        if not view.is_loopback(self.host):
+        if not view.is_loopback(server):
             print(f"Everyone who can reach this machine sees {self.bundle} now.", file=sys.stderr)
         try:
             print(f"Showing {self.bundle} at {address} until Ctrl-C", flush=True)

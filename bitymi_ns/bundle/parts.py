@@ -31,7 +31,11 @@ DIRECTORY_LIMIT = 4 << 20
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
 # The last records of a ZIP: where that of large files is, that of large files itself, and the end.
-_LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQ8x"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
+_LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQQ"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
+
+
+class MissingPart(BundleError):
+    """A bundle has no file of a name."""
 
 
 def is_known(name: str) -> bool:
@@ -65,7 +69,7 @@ def open_regular(path: Path) -> BinaryIO:
             file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
             regular = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise BundleError(f"{path} is missing") from error
+        raise MissingPart(f"{path} is missing") from error
     except OSError as error:
         raise BundleError(f"{path} cannot be read: {error.strerror}") from error
     if not regular:
@@ -86,11 +90,6 @@ class Parts:
             inside: refuse links that lead out of the folder.
         """
         self.bundle, self._archive, self._size, self._inside = bundle, archive, size, inside
-
-    @property
-    def size(self) -> int | None:
-        """Bytes of the one file that the bundle is; None for a folder."""
-        return None if self._archive is None else self._size
 
     @contextmanager
     def opened(self, name: str) -> Iterator[tuple[IO[bytes], int]]:
@@ -125,8 +124,9 @@ class Parts:
         try:
             entry = self._archive.getinfo(name)
         except KeyError as error:
-            raise BundleError(f"{self.bundle} has no {name}") from error
-        if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
+            raise MissingPart(f"{self.bundle} has no {name}") from error
+        encrypted = entry.flag_bits & 1
+        if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size or encrypted:
             raise BundleError(f"{self.bundle}: {name} is not stored as it is")
         if not 0 <= entry.header_offset <= self._size - entry.file_size:
             raise BundleError(f"{self.bundle} is truncated: {name} does not lie in it")
@@ -162,7 +162,7 @@ def parts_of(bundle: str | Path | BinaryIO, source: str | Path | None = None, in
     """
     if isinstance(bundle, (str, Path)):
         path = Path(bundle)
-        if not path.is_file():
+        if not os.path.isfile(path):
             yield Parts(path, None, 0, inside)
             return
         with open_regular(path) as file, parts_of(file, path, inside) as parts:
@@ -181,7 +181,8 @@ def parts_of(bundle: str | Path | BinaryIO, source: str | Path | None = None, in
 
 
 def _check_directory(file: BinaryIO) -> int:
-    """Refuses a file whose directory is larger than it may be, which takes `zipfile` long to read; its size.
+    """Refuses a file whose directory is larger than it may be, which takes `zipfile` long to read, or that begins with
+    something else, which may then be of another type, too; its size.
 
     Raises:
         ValueError: says why.
@@ -190,15 +191,17 @@ def _check_directory(file: BinaryIO) -> int:
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))
     tail = file.read(records).rjust(records, b"\0")
-    end, length, _, comment = _END.unpack(tail[-_END.size :])
+    end, length, begin, comment = _END.unpack(tail[-_END.size :])
     if end != b"PK\5\6" or comment:
         raise ValueError("it is truncated, or something else")
     there, at = _LARGE_AT.unpack(tail[_LARGE.size : -_END.size])
+    behind = _END.size
     if there == b"PK\6\7":
-        large, length = _LARGE.unpack(tail[: _LARGE.size])
-        if large != b"PK\6\6" or at != size - records:
-            raise ValueError("its directory is not where it is said to be")
+        large, length, begin = _LARGE.unpack(tail[: _LARGE.size])
+        behind = records if large == b"PK\6\6" and at == size - records else 0
     if length > DIRECTORY_LIMIT:
         raise ValueError(f"its directory has {length} bytes, at most {DIRECTORY_LIMIT} are read")
+    if begin + length != size - behind:
+        raise ValueError("its directory is not where it is said to be")
     file.seek(0)
     return size

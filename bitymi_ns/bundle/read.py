@@ -30,7 +30,7 @@ from bitymi_ns.bundle.manifest import (
     parse,
     points_of,
 )
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, Parts, parts_of
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, MissingPart, Parts, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
 from bitymi_ns.ops.constants import SUPPORT
@@ -101,9 +101,11 @@ def read_manifest(folder: str | Path) -> Manifest:
 
 def manifest_of(parts: Parts) -> Manifest:
     """The same of a bundle whose files are at hand."""
-    if parts.size is None and not (parts.bundle / MANIFEST).exists():
-        raise BundleError(f"{parts.bundle} is not a bundle: it has no {MANIFEST}")
-    return parse(parts.read(MANIFEST, MANIFEST_LIMIT), str(parts.bundle / MANIFEST))
+    try:
+        data = parts.read(MANIFEST, MANIFEST_LIMIT)
+    except MissingPart as error:
+        raise BundleError(f"{parts.bundle} is not a bundle: it has no {MANIFEST}") from error
+    return parse(data, str(parts.bundle / MANIFEST))
 
 
 def download_bytes(folder: Path, info: Manifest) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 
-def loads(data: bytes) -> Any:
+def loads(data: bytes | bytearray) -> Any:
     """The value of UTF-8 JSON text.
 
     Raises:

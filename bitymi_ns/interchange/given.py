@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from pydantic import BaseModel, Field, ValidationError
 
-from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle import BundleError, strict_json
 from bitymi_ns.bundle.manifest import Manifest, check_file_name
 from bitymi_ns.bundle.parts import CAMERAS, Parts, parts_of
 from bitymi_ns.bundle.read import read_file
@@ -40,8 +40,7 @@ class _Row(BaseModel):
         return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
 
 
-class _File(BaseModel):
-    cameras: list[_Row]
+MOST_CAMERAS = 100_000
 
 
 @dataclass(frozen=True)
@@ -70,14 +69,29 @@ def given_with(folder: str | Path, info: Manifest) -> Given:
     if CAMERAS not in info.files:
         return Given()
     with parts_of(folder) as parts:
-        try:
-            rows = _File.model_validate_json(read_file(parts, info, CAMERAS)).cameras
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise BundleError(f"{parts.bundle / CAMERAS}: {where}: {first['msg']}") from error
+        rows = _rows(parts.bundle / CAMERAS, read_file(parts, info, CAMERAS))
         held_out = [_view(parts, info, row) for row in rows if row.held_out and row.photograph is not None]
     return Given([row.camera() for row in rows if not row.held_out], held_out)
+
+
+def _rows(path: Path, data: bytes | bytearray) -> list[_Row]:
+    """What stands in the file, up to the first row that is wrong, which is refused."""
+    try:
+        value = strict_json.loads(data)
+    except ValueError as error:
+        raise BundleError(f"{path} cannot be read as JSON ({error})") from error
+    found = value.get("cameras") if isinstance(value, dict) else None
+    if not isinstance(found, list) or len(found) > MOST_CAMERAS:
+        raise BundleError(f"{path} must have a list cameras, of at most {MOST_CAMERAS:,}")
+    rows = []
+    for number, row in enumerate(found):
+        try:
+            rows.append(_Row.model_validate(row))
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            where = ".".join(map(str, ("cameras", number, *first["loc"])))
+            raise BundleError(f"{path}: {where}: {first['msg']}") from error
+    return rows
 
 
 def _view(parts: Parts, info: Manifest, row: _Row) -> View:

@@ -127,7 +127,7 @@ def single_site(bundle: Path) -> Site:
 def _title(bundle: Path) -> Callable[[], bytes]:
     """What view.json says of a bundle."""
     place = Path(os.path.realpath(bundle))
-    title = place.stem if place.is_file() else place.parent.name if place.name == "bundle" else place.name
+    title = place.stem if os.path.isfile(place) else place.parent.name if place.name == "bundle" else place.name
     text = json.dumps({"title": title}).encode()
     return lambda: text
 
@@ -141,14 +141,15 @@ class _Shown:
         self._read_manifest()
 
     def _read_manifest(self) -> None:
-        self._as_of = self._stamp()
+        as_of = self._stamp()
         with parts_of(self._bundle, inside=True) as parts:
             self.info: Manifest = manifest_of(parts)
             self._manifest = passed_on(self.info, parts.read(MANIFEST, MANIFEST_LIMIT))
+        self._as_of = as_of
 
     def _stamp(self) -> tuple[int, ...]:
         """Changes when bundle.json, or the one file, is written."""
-        path = self._bundle if self._bundle.is_file() else self._bundle / MANIFEST
+        path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
             found = os.stat(path)
         except OSError:  # which is said when it is read

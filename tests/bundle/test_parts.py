@@ -136,9 +136,25 @@ def test_a_directory_that_lies_elsewhere_than_it_says_is_refused(folder: Path, t
     data = (tmp_path / "b.bitymi").read_bytes()
     moved = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 1, 1, 10, 0)
     moved += struct.pack("<4sLQL", b"PK\6\7", 0, 5, 1)
-    for bad in (data + b"x", data[:-1] + b"\1", data[:-22] + moved + data[-22:], data + data[-22:-1]):
+    # something behind it, a comment, other records, and something before it: a page, another such file
+    more = (data + b"x", data[:-1] + b"\1", data[:-22] + moved + data[-22:], data + data[-22:-1])
+    for bad in (*more, b"<html>" + data, data + data):
         with pytest.raises(BundleError, match="not a bundle in one file|truncated"):
             read_single(io.BytesIO(bad))
+
+
+def test_a_part_that_is_encrypted_is_refused(folder: Path, tmp_path: Path) -> None:
+    write_single(folder, tmp_path / "b.bitymi")
+    data = bytearray((tmp_path / "b.bitymi").read_bytes())
+    data[data.rindex(b"surfels.bin") - 38] |= 1
+    with pytest.raises(BundleError, match="surfels.bin is not stored as it is$"):
+        read_single(io.BytesIO(bytes(data)))
+
+
+def test_a_path_that_none_can_be_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    for path in ("a" * 300, "/dev/null/x", "/proc/1/nothing"):
+        assert main(["view", path]) == 1
+        assert "Errno" not in capsys.readouterr().err
 
 
 def test_two_parts_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:

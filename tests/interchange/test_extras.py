@@ -99,7 +99,10 @@ def test_cameras_and_photographs_are_read_from_folder_and_file(with_cameras: Pat
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"{", "Invalid JSON"),
+        (b"{", "cannot be read as JSON"),
+        (b'{"cameras": 3}', "must have a list cameras"),
+        (b'{"cameras": [' + b"[]," * 300_000 + b"[]]}", "of at most 100,000"),
+        (b'{"cameras": [' + b"[]," * 90_000 + b"[]]}", "cameras.0: "),
         (b'{"cameras": [{"name": "a"}]}', "held_out"),
         (b'{"cameras": [{"name": "a", "held_out": true, "width": 0}]}', "width"),
     ],

@@ -27,10 +27,11 @@ __all__ = [
     "unpack_texels",
 ]
 
-SURFELS_PER_BYTE, TEXELS_PER_BYTE = 4, 256
+SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
 """A file is refused that is said to hold more than so many for each of its bytes, and `SPARE` of them: columns of one
-number take no bytes, and what they hold takes memory. Places alone take three bytes of a surfel that was trained. A
-tile that is flat takes no texels' bytes but those of its surfel, so both files count for texels."""
+number take no bytes, and what they hold takes memory. A trained scene has a surfel for 12 bytes and more, a term for
+more, at most 5 texels for a byte. A tile that is flat takes no bytes but those of its surfel, so both files count for
+texels."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
 MOST_EXPONENT = 12  # of two, in the side of a tile
 _COEFFICIENT_PLANES = 3

@@ -5,7 +5,7 @@ import type { Atlas, CodedTexels } from '../manifest';
 import { SURFEL_WORDS, type Surfels, WORD } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 
-export const TEXELS_PER_BYTE = 256; // of both files; what is said to hold more is refused, and so many beside
+export const TEXELS_PER_BYTE = 64; // of both files; what is said to hold more is refused, and so many beside
 export const SPARE_TEXELS = 1 << 20;
 const MOST_TEXELS = 2 ** 30; // of all pages: four gigabytes
 const BLOCK = 8;

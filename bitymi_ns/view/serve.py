@@ -64,8 +64,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().handle_one_request()
 
     def do_GET(self) -> None:
-        if self.headers.get("Content-Length", "0") != "0" or "Transfer-Encoding" in self.headers:
-            # what follows the header would be read as the next request
+        if not self._is_whole():
             self.send_error(HTTPStatus.BAD_REQUEST)
             return
         if not self.server.is_named(self.headers.get("Host", "")):
@@ -88,6 +87,12 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, data, media_type(name))
 
     do_HEAD = do_GET
+
+    def _is_whole(self) -> bool:
+        """Whether the header is all of the request: what follows is read as the next one. And whether it can be
+        understood in one way only."""
+        bodies = self.headers.get_all("Content-Length", ["0"]) + self.headers.get_all("Transfer-Encoding", [])
+        return set(bodies) == {"0"} and len(self.headers.get_all("Host", [])) < 2 and not self.headers.defects
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Refuses a request that is none of ours, and ends the connection."""

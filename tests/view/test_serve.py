@@ -256,7 +256,11 @@ def test_a_request_that_is_none_is_answered_as_such(bundle: Path, request_line: 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD", "POST"])
 @pytest.mark.parametrize(
-    "header", ["Content-Length: 40", "Transfer-Encoding: chunked", "content-length: 40\r\nContent-Length: 0"]
+    "header",
+    [
+        *("Content-Length: 40", "Transfer-Encoding: chunked", "content-length: 40\r\nContent-Length: 0"),
+        *("Content-Length: 0\r\nContent-Length: 40", "Transfer-Encoding : chunked", "no header", "Host: localhost"),
+    ],
 )
 def test_a_body_is_no_second_request(bundle: Path, method: str, header: str) -> None:
     second = b"GET /index.js HTTP/1.1\r\nHost: localhost\r\n\r\n"

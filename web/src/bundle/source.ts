@@ -26,7 +26,7 @@ async function get(url: string, range?: string): Promise<Response> {
     if (name === 'bundle.json' || name.endsWith('.bitymi')) {
       throw new ViewerError('There is no bundle', `${url} is not there.`, 'Export the scene again with bitymi view.');
     }
-    throw new DamagedBundle(`${name} is missing.`);
+    throw new DamagedBundle(`${name} is missing, or is not what bundle.json says.`);
   }
   return response;
 }
@@ -39,7 +39,7 @@ async function bytesOf(response: Response, name: string, most: number, came: Cam
   while (body) {
     const { done, value } = await body.read();
     if (done) break;
-    if (at + value.length > most) throw new DamagedBundle(`${name} is longer than the ${most} bytes that are stated.`);
+    if (at + value.length > most) throw new DamagedBundle(`${name} has more than ${most} bytes.`);
     parts.push(value);
     at += value.length;
     came(value.length);

@@ -12,8 +12,8 @@ from typing import BinaryIO
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, parse
 from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
 from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
-from bitymi_ns.bundle.sizes import enough_memory
-from bitymi_ns.files import write_file
+from bitymi_ns.bundle.sizes import enough_memory, machine_memory
+from bitymi_ns.files import size_text, write_file
 
 _ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 SUFFIX = ".bitymi"
@@ -60,6 +60,10 @@ def joined(bundle: str | Path) -> tuple[bytes, Written]:
     with parts_of(bundle, inside=True) as parts:
         info = manifest_of(parts)
         names = [name for name in info.files if is_known(name)]
+        needed, there = 2 * sum(info.files[name].bytes for name in names), machine_memory()
+        if needed > there:
+            why = f"one file of it takes {size_text(needed)} of memory to make, this machine has {size_text(there)}"
+            raise BundleError(f"{parts.bundle} cannot be packed: {why}")
         with enough_memory(parts.bundle, info), zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
             for name in [MANIFEST, *sorted(names, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n))]:
                 if name == MANIFEST:

@@ -1,6 +1,7 @@
 """The `bitymi` console script: tyro subcommands, each a thin call into the package (training, baking and evaluation
 are nerfstudio's own commands: ns-train, ns-export, ns-eval)."""
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -243,13 +244,20 @@ class Verify:
         return 1 if failed else 0
 
 
+def _say_left_out(names: Sequence[str]) -> None:
+    """Names the files of a bundle that are not passed on with it."""
+    if names:
+        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        say(f"Left out, because no file of a bundle has such a name: {shown}.", sys.stderr)
+
+
 @dataclass
 class Pack:
     """Write a bundle as one file, its parts in the order of their use; verify and the loaders take it as they take the
     folder."""
 
     bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle."""
+    """Folder of the bundle, or its one file."""
     output: Path | None = None
     """File to write; not given: beside the folder, with its name and .bitymi."""
     overwrite: Flag = False
@@ -259,15 +267,16 @@ class Pack:
         from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
         from bitymi_ns.files import size_text
 
-        folder = self.bundle.resolve()
-        output = self.output or folder.with_name(folder.name + SUFFIX)
+        bundle = Path(os.path.realpath(self.bundle))
+        output = self.output or bundle.with_name(bundle.name + SUFFIX)
         if output.exists() and not self.overwrite:
             raise ValueError(f"{output} is there already: choose another place (--output), or add --overwrite")
         if output.exists() and not is_single(output):
             raise ValueError(f"{output} is no bundle and is not replaced: choose another place (--output)")
         with explained(output, ValueError):
-            first, size = write_single(folder, output)
-        say(f"Wrote {output}, {size_text(size)}; the surfels are in its first {size_text(first)}.")
+            written = write_single(bundle, output)
+        _say_left_out(written.left_out)
+        say(f"Wrote {output}, {size_text(written.bytes)}; the surfels are in its first {size_text(written.first)}.")
         return 0
 
 
@@ -343,6 +352,7 @@ class View:
         if self.one_file and self.export is None:
             raise ValueError("--one-file is for --export: say where to")
         site = view.single_site(self.bundle) if self.one_file else view.site_of(self.bundle)
+        _say_left_out(site.left_out)
         if self.export is not None:
             with explained(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)
@@ -350,7 +360,7 @@ class View:
             return 0
         server = view.serve(site, self.host, self.port)
         address = view.address_of(server)
-        if not view.is_loopback(self.host):
+        if not view.is_loopback(server):
             say(f"Everyone who can reach this machine sees {self.bundle} now.", sys.stderr)
         try:
             say(f"Showing {self.bundle} at {address} until Ctrl-C")
@@ -392,6 +402,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return command.run() or 0
     except (ValueError, OSError, BenchError, KernelsUnavailable) as error:
         say(f"bitymi: {error}", sys.stderr)
+        return 1
+    except MemoryError:
+        say("bitymi: there is not enough memory for this; nothing was left half-written", sys.stderr)
         return 1
     except KeyboardInterrupt:
         say("bitymi: interrupted, nothing was left half-written", sys.stderr)

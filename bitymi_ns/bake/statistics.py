@@ -139,7 +139,9 @@ class FieldLevels(Part):
     levels: Whole | None = None
     kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]
     """The first one and how many."""
-    change_of_each: list[Annotated[NotNegative | None, BeforeValidator(_number)]] | None = None
+    change_of_each: (
+        Annotated[list[Annotated[NotNegative | None, BeforeValidator(_number)]], Field(max_length=64)] | None
+    ) = None
     change: Annotated[NotNegative | None, BeforeValidator(_number)] = None
     """Of all that are left out together."""
     tolerance: NotNegative | None = None
@@ -202,7 +204,7 @@ class FineTuning(Part):
     best_step: Whole | None = None
     psnr_held_in: Gain | None = None
     psnr_held_out: Gain | None = None
-    curve: list[tuple[Whole, Decibels]] | None = None
+    curve: Annotated[list[tuple[Whole, Decibels]], Field(max_length=1 << 16)] | None = None
     """Steps and dB over the views that were set aside."""
     seconds: NotNegative | None = None
     cpu_seconds: NotNegative | None = None

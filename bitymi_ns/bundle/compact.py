@@ -14,7 +14,7 @@ from bitymi_ns.bake.packing import Packing, pack
 from bitymi_ns.bake.streams import StreamError
 from bitymi_ns.bake.surfel_codes import PLACE_BITS, REFERENCE, Codes, Frame, SurfelCodes, term_numbers
 from bitymi_ns.bake.texel_codes import GRADES, TexelCodes, blocks_of
-from bitymi_ns.bundle.manifest import Atlas, Column, Surfels
+from bitymi_ns.bundle.manifest import COMPACT_SURFELS, Atlas, Column, Surfels
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 __all__ = [
@@ -27,8 +27,11 @@ __all__ = [
     "unpack_texels",
 ]
 
-SURFELS_PER_BYTE, TEXELS_PER_BYTE = 256, 4096
-"""A file is refused that is said to hold more than so many for each of its bytes, and `SPARE` of them."""
+SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
+"""A file is refused that is said to hold more than so many for each of its bytes, and `SPARE` of them: columns of one
+number take no bytes, and what they hold takes memory. A trained scene has a surfel for 12 bytes and more, a term for
+more, at most 5 texels for a byte. A tile that is flat takes no bytes but those of its surfel, so both files count for
+texels."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
 MOST_EXPONENT = 12  # of two, in the side of a tile
 _COEFFICIENT_PLANES = 3
@@ -147,15 +150,18 @@ def check_surfels_size(info: Surfels, size: int) -> None:
         raise StreamError(f"{info.count} surfels with {info.terms} terms cannot be in {size} bytes")
 
 
-def check_texels_size(info: Atlas, size: int) -> None:
-    """The same of texels.bin.
+def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
+    """The same of texels.bin, beside a surfels.bin of `surfels` bytes.
 
     Raises:
         StreamError: says why.
     """
     _check_size(info.columns or [], size)
-    if max(info.texels or 0, info.width * info.height * info.layers) > TEXELS_PER_BYTE * size + SPARE_TEXELS:
-        raise StreamError(f"{info.texels} texels cannot be in {size} bytes")
+    if (
+        max(info.texels or 0, info.width * info.height * info.layers)
+        > TEXELS_PER_BYTE * (size + surfels) + SPARE_TEXELS
+    ):
+        raise StreamError(f"{info.texels} texels cannot be in {size} bytes, and {surfels} of {COMPACT_SURFELS}")
 
 
 def _surfel_columns(kind: str) -> tuple[list[str], dict[str, int]]:

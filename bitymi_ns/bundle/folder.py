@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, parts_of
 from bitymi_ns.trust import Refused, json_of, keep
 
 CONFIG = "config.yml"
@@ -46,7 +47,8 @@ def files_of(folder: Path) -> list[str]:
         BundleError: bundle.json cannot be read.
     """
     try:
-        listed = json_of((folder / MANIFEST).read_bytes())["files"]
+        with parts_of(folder) as parts:
+            listed = json_of(bytes(parts.read(MANIFEST, MANIFEST_LIMIT)))["files"]
         return [MANIFEST, CONFIG, *map(str, listed)]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise BundleError(

@@ -246,7 +246,7 @@ class Bounds(Part):
 class FileEntry(Part):
     """Size and hash of a file of the bundle."""
 
-    bytes: Annotated[int, Field(ge=0, le=2**50)]
+    bytes: Annotated[int, Field(ge=0, le=1 << 36)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -263,7 +263,7 @@ class Manifest(Part):
     world: Place
     bounds: Bounds
     statistics: Statistics
-    files: dict[str, FileEntry]
+    files: Annotated[dict[str, FileEntry], Field(max_length=1 << 14)]
     digest: str | None = None
     """SHA-256 of the canonical JSON of everything else."""
 
@@ -328,7 +328,8 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
             raise BundleError(f"{source} is not a bundle: its format is not {FORMAT!r}")
         stated = info.pop("digest", None)
         version = _version(info.get("version"), source)
-        text, found = strict_json.canonical(info), strict_json.digest(info)
+        text = strict_json.canonical(info)
+        found = strict_json.digest_of(text)
     except BundleError:
         raise
     except ValueError as error:

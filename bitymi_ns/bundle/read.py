@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -20,7 +18,7 @@ from bitymi_ns.bake.pages import paged_texels
 from bitymi_ns.bake.quantise import Profile, Range, bc7_blocks, decode_pages
 from bitymi_ns.bake.streams import StreamError
 from bitymi_ns.bake.texel_codes import constants
-from bitymi_ns.bundle import archive, compact, ktx2, ply
+from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.manifest import (
     ATLAS,
     COMPACT_SURFELS,
@@ -28,25 +26,25 @@ from bitymi_ns.bundle.manifest import (
     SURFELS,
     TEXELS,
     BundleError,
-    FileEntry,
     Manifest,
     parse,
     points_of,
 )
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, MissingPart, Parts, parts_of
+from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """What to do about a damaged bundle."""
-MANIFEST_LIMIT = 64 << 20
-"""Bytes that a bundle.json may have."""
+BESIDE_LIMIT = 64 << 20
+"""Bytes that a file beside surfels and texels may have, such as a photograph, to be kept in memory."""
 LARGE_ATLAS = 64 << 20
 """Bytes of decoded texels of a compact bundle from which on a card gets BC7 blocks of them, a quarter of that. Fewer
 are no burden to any card, and blocks cost time, and some of the quality of texels that were not tuned to them."""
 LOAD_PROFILE: Profile = "veryfast"
 """Of the encoder of these blocks: the next faster one loses more than twice as much."""
-_HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
 _CHUNK = 1 << 22
 
 
@@ -79,10 +77,11 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
         BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
             new, or there is too little memory.
     """
-    folder = Path(folder)
-    info = read_manifest(folder)
-    with enough_memory(folder, info):
-        return assemble(folder, info, {name: read_file(folder, info, name, verify) for name in info.files}, decode)
+    with parts_of(folder) as parts:
+        info = manifest_of(parts)
+        with enough_memory(parts.bundle, info):
+            files = {name: read_file(parts, info, name, verify, name in SCENE_FILES) for name in info.files}
+            return assemble(parts.bundle, info, files, decode)
 
 
 def verify_bundle(folder: str | Path) -> Manifest:
@@ -90,25 +89,23 @@ def verify_bundle(folder: str | Path) -> Manifest:
     return read_bundle(folder, verify=True).info
 
 
-def read_manifest(folder: Path) -> Manifest:
+def read_manifest(folder: str | Path) -> Manifest:
     """bundle.json of a bundle, a folder or one file, checked as far as it can be without the other files.
 
     Raises:
         BundleError: it is missing, malformed or altered, or a value is out of range.
     """
-    path = folder / MANIFEST
-    if folder.is_file():
-        with archive.opened(folder, str(folder)) as parts:
-            data = parts.part(MANIFEST, MANIFEST_LIMIT)
-        return parse(data, str(path))
-    if not path.is_file():
-        raise BundleError(f"{folder} is not a bundle: it has no {MANIFEST}")
+    with parts_of(folder) as parts:
+        return manifest_of(parts)
+
+
+def manifest_of(parts: Parts) -> Manifest:
+    """The same of a bundle whose files are at hand."""
     try:
-        if path.stat().st_size > MANIFEST_LIMIT:
-            raise BundleError(f"{path} is too large for a bundle.json")
-        return parse(path.read_bytes(), str(path))
-    except OSError as error:
-        raise BundleError(f"{path} cannot be read: {error}") from error
+        data = parts.read(MANIFEST, MANIFEST_LIMIT)
+    except MissingPart as error:
+        raise BundleError(f"{parts.bundle} is not a bundle: it has no {MANIFEST}") from error
+    return parse(data, str(parts.bundle / MANIFEST))
 
 
 def download_bytes(folder: Path, info: Manifest) -> int:
@@ -118,48 +115,57 @@ def download_bytes(folder: Path, info: Manifest) -> int:
     return (folder / MANIFEST).stat().st_size + sum(entry.bytes for entry in info.files.values())
 
 
-def read_file(folder: Path, info: Manifest, name: str, verify: bool = True) -> bytearray:
-    """The bytes of a file that bundle.json lists: all of those with surfels and texels, none of others.
+def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep: bool = True) -> bytearray:
+    """The bytes of a file that bundle.json lists.
 
     Args:
-        folder: the bundle's folder, or its one file.
+        parts: the bundle.
         info: bundle.json.
         name: one of `info.files`.
         verify: compare the file with its sha256, while it is read.
+        keep: False only checks it, and returns nothing of it.
 
     Raises:
-        BundleError: the file is missing, its size or hash is not the one stated, or its header contradicts its size or
-            bundle.json. What the header says is checked before more than it is read.
+        BundleError: the file is missing, its size or hash is not the one stated, its header contradicts its size or
+            bundle.json, or its contents need more memory than this machine has. The hash alone is found by reading it.
     """
-    path = folder / name
-    check = _CHECKS.get(name)
-    if folder.is_file():
-        with archive.opened(folder, str(folder)) as parts:
-            data = parts.part(name, info.files[name].bytes)
-        check_bytes(path, info, name, data, verify)
-        return bytearray(data if check is not None else b"")
-    try:
-        return _read(path, info.files[name], verify, None if check is None else lambda *head: check(info, *head))
-    except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
-        raise BundleError(f"{path}: {error}") from error
-    except OSError as error:
-        raise BundleError(f"{path} cannot be read: {error}") from error
+    path, entry = parts.bundle / name, info.files[name]
+    with parts.opened(name) as (file, size):
+        if size != entry.bytes:
+            problem = "truncated" if size < entry.bytes else "altered"
+            raise BundleError(f"{path} is {problem}: it has {size} bytes, {entry.bytes} were written")
+        if keep and name not in SCENE_FILES and size > BESIDE_LIMIT:
+            raise BundleError(f"{path} has {size} bytes, at most {BESIDE_LIMIT} are read of such a file")
+        head = file.read(min(size, HEAD)) if keep or verify else b""
+        try:
+            check_head(info, name, head, size)
+        except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
+            raise BundleError(f"{path}: {error}") from error
+        if keep and name in SCENE_FILES:
+            check_memory(parts.bundle, info, name)
+        sha256 = hashlib.sha256() if verify else None
+        data = _whole(file, head, size if keep or verify else 0, keep, path, sha256)
+    if sha256 is not None and sha256.hexdigest() != entry.sha256:
+        raise BundleError(f"{path} is altered: its sha256 is not the one in {MANIFEST}")
+    return data
 
 
-def check_bytes(path: Path, info: Manifest, name: str, data: bytes, verify: bool = True) -> None:
-    """Checks the bytes of a file that bundle.json lists as `read_file` does.
-
-    Raises:
-        BundleError: size, hash or header are not as stated.
-    """
-    entry = info.files[name]
-    if len(data) != entry.bytes or (verify and hashlib.sha256(data).hexdigest() != entry.sha256):
-        raise BundleError(f"{path} is altered: its size or sha256 is not the one in {MANIFEST}")
-    try:
-        if name in _CHECKS:
-            _CHECKS[name](info, data[:_HEAD], len(data))
-    except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
-        raise BundleError(f"{path}: {error}") from error
+def _whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
+    """The `size` bytes of a file of which `head` has been read, none where they are not kept; `sha256` gets them."""
+    data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
+    view = memoryview(data)
+    view[:at] = head
+    if sha256 is not None:
+        sha256.update(head)
+    while at < size:
+        window = view[at : at + _CHUNK] if keep else view[: min(_CHUNK, size - at)]
+        count = file.readinto(window)  # type: ignore[attr-defined]
+        if not count:
+            raise BundleError(f"{path} is truncated: it ended after {at} bytes while it was read")
+        if sha256 is not None:
+            sha256.update(window[:count])
+        at += count
+    return data if keep else bytearray()
 
 
 def assemble(
@@ -282,81 +288,6 @@ def _blocks(texels: Tensor) -> Tensor | None:
             stacklevel=2,
         )
         return None
-
-
-@contextmanager
-def enough_memory(folder: Path, info: Manifest) -> Iterator[None]:
-    """Reports a lack of memory as a BundleError with the size of the files."""
-    try:
-        yield
-    except MemoryError as error:
-        size = sum(entry.bytes for entry in info.files.values())
-        raise BundleError(f"{folder} needs more memory than there is: its files have {size / 1e6:.0f} MB") from error
-
-
-def _read(path: Path, entry: FileEntry, verify: bool, check: Callable[[bytes, int], None] | None = None) -> bytearray:
-    """The file's bytes, kept where there is a `check`, which is called with the head and the size of the file."""
-    if not path.is_file():
-        raise BundleError(f"{path} is missing")
-    with open(path, "rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        if size != entry.bytes:
-            problem = "truncated" if size < entry.bytes else "altered"
-            raise BundleError(f"{path} is {problem}: it has {size} bytes, {entry.bytes} were written")
-        if check is None and not verify:
-            return bytearray()
-        at, sha256 = 0, hashlib.sha256()
-        head = file.read(min(size, _HEAD))
-        if check is not None:
-            check(head, size)
-        file.seek(0)
-        data = bytearray(size if check is not None else min(size, _CHUNK))
-        view = memoryview(data)
-        while at < size:
-            window = view[at : at + _CHUNK] if check is not None else view[: size - at]
-            count = file.readinto(window)  # type: ignore[attr-defined]
-            if not count:
-                raise BundleError(f"{path} is truncated: it ended after {at} bytes while it was read")
-            if verify:
-                sha256.update(window[:count])
-            at += count
-    if verify and sha256.hexdigest() != entry.sha256:
-        raise BundleError(f"{path} is altered: its sha256 is not the one in {MANIFEST}")
-    return data if check is not None else bytearray()
-
-
-def _check_surfels_header(info: Manifest, head: bytes, size: int) -> None:
-    elements = ply.read_header(head, size).elements
-    count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
-    if count != info.surfels.count:
-        raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {info.surfels.count}")
-    if terms != info.surfels.terms:
-        raise ply.PlyError(f"it has {terms} view-colour terms, surfels.terms of {MANIFEST} says {info.surfels.terms}")
-
-
-def _check_atlas_header(info: Manifest, head: bytes, size: int) -> None:
-    header, stated = ktx2.read_header(head, size), info.atlas
-    found = (header.format, header.width, header.height, header.layers)
-    if stated is None or found != (stated.format, stated.width, stated.height, stated.layers):
-        raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
-
-
-def _check_compact_size(info: Manifest, head: bytes, size: int) -> None:
-    compact.check_surfels_size(info.surfels, size)
-
-
-def _check_texels_size(info: Manifest, head: bytes, size: int) -> None:
-    if info.atlas is not None:
-        compact.check_texels_size(info.atlas, size)
-
-
-_CHECKS: dict[str, Callable[[Manifest, bytes, int], None]] = {
-    SURFELS: _check_surfels_header,
-    ATLAS: _check_atlas_header,
-    COMPACT_SURFELS: _check_compact_size,
-    TEXELS: _check_texels_size,
-}
-"""What the size of a file has to fit, before it is read."""
 
 
 def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:

@@ -5,35 +5,53 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from bitymi_ns.bundle.archive import opened
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, parse
-from bitymi_ns.bundle.read import MANIFEST_LIMIT, Bundle, assemble, check_bytes, enough_memory, read_manifest
-from bitymi_ns.files import write_file
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file, read_manifest
+from bitymi_ns.bundle.sizes import enough_memory, machine_memory
+from bitymi_ns.files import size_text, write_file
 
-_ORDER = (MANIFEST, POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
+_ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 SUFFIX = ".bitymi"
 """Of the name of such a file."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_single(folder: str | Path, path: str | Path) -> tuple[int, int]:
-    """Writes the files of a bundle that bundle.json vouches for into one, whole or not at all.
+@dataclass(frozen=True)
+class Written:
+    """What was written.
+
+    Attributes:
+        first: bytes from the start to the end of the surfels.
+        bytes: of the file.
+        left_out: files that the bundle lists and the format does not name, which the file does not have.
+    """
+
+    first: int
+    bytes: int
+    left_out: list[str]
+
+
+def write_single(bundle: str | Path, path: str | Path) -> Written:
+    """Writes the files of a bundle that bundle.json vouches for and the format names into one, whole or not at all.
 
     Nothing is deflated, sizes stand before the parts, and bundle.json comes first: a reader of the beginning knows
     where everything lies, and any part is one range of the file.
 
-    Returns:
-        bytes from the start to the end of the surfels, and of the file.
+    Args:
+        bundle: its folder, or such a file.
+        path: the file to write.
 
     Raises:
-        BundleError: the folder is not a bundle, or a file is missing or altered.
+        BundleError: there is no bundle, a file is missing or altered, or there is too little memory.
     """
-    data, first = _joined(Path(folder))
+    data, written = joined(bundle)
     write_file(Path(path), data)
-    return first, len(data)
+    return written
 
 
 def is_single(path: Path) -> bool:
@@ -45,28 +63,28 @@ def is_single(path: Path) -> bool:
     return path.is_file()
 
 
-def single_bytes(folder: Path) -> bytes:
-    """What `write_single` writes; raises as it does."""
-    return _joined(folder)[0]
-
-
-def _joined(folder: Path) -> tuple[bytes, int]:
-    """The file, and its bytes from the start to the end of the surfels."""
-    info = read_manifest(folder)
-    names, first = [MANIFEST, *info.files], 0
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(names, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
-            try:
-                data = (folder / name).read_bytes()
-            except OSError as error:
-                raise BundleError(f"{folder / name} cannot be read: {error}") from error
-            if name != MANIFEST:
-                check_bytes(folder / name, info, name, data)
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data)
-            if name == info.surfels.file:
-                first = buffer.tell()
-    return buffer.getvalue(), first
+def joined(bundle: str | Path) -> tuple[bytes, Written]:
+    """What `write_single` writes, and what it says of it; raises as it does."""
+    first, buffer = 0, io.BytesIO()
+    with parts_of(bundle, inside=True) as parts:
+        info = manifest_of(parts)
+        names = [name for name in info.files if is_known(name)]
+        needed, there = 2 * sum(info.files[name].bytes for name in names), machine_memory()
+        if needed > there:
+            why = f"one file of it takes {size_text(needed)} of memory to make, this machine has {size_text(there)}"
+            raise BundleError(f"{parts.bundle} cannot be packed: {why}")
+        with enough_memory(parts.bundle, info), zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+            for name in [MANIFEST, *sorted(names, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n))]:
+                if name == MANIFEST:
+                    data: bytes | bytearray = passed_on(info, parts.read(MANIFEST, MANIFEST_LIMIT))
+                else:
+                    data = read_file(parts, info, name)
+                archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+                if name == info.surfels.file:
+                    first = buffer.tell()
+        with enough_memory(parts.bundle, info):
+            whole = buffer.getvalue()
+    return whole, Written(first, len(whole), left_out(info))
 
 
 def read_single(file: BinaryIO, textured: bool = True, verify: bool = True, source: str = "the bundle") -> Bundle:
@@ -81,19 +99,14 @@ def read_single(file: BinaryIO, textured: bool = True, verify: bool = True, sour
     Raises:
         BundleError: the file is damaged, or what is in it.
     """
-    where = Path(source)
-    with opened(file, source) as archive:
-        info = parse(archive.part(MANIFEST, MANIFEST_LIMIT), f"{source}: {MANIFEST}")
+    with parts_of(file, source) as parts:
+        info = parse(parts.read(MANIFEST, MANIFEST_LIMIT), f"{source}: {MANIFEST}")
         if not textured and info.surfels.file != COMPACT_SURFELS:
             raise BundleError(f"{source}: only a compact bundle can be opened without its texels")
         wanted = {info.surfels.file} | ({info.atlas.file} if info.atlas is not None and textured else set())
-        with enough_memory(where, info):
-            files = {}
-            for name in sorted(wanted):
-                data = archive.part(name, info.files[name].bytes)
-                check_bytes(where / name, info, name, data, verify)
-                files[name] = bytearray(data)
-            return assemble(where, info, files, textured=textured)
+        with enough_memory(parts.bundle, info):
+            files = {name: read_file(parts, info, name, verify) for name in sorted(wanted)}
+            return assemble(parts.bundle, info, files, textured=textured)
 
 
 class Ranges(io.RawIOBase):

@@ -20,7 +20,9 @@ from bitymi_ns.bake.packing import Packing
 from bitymi_ns.bake.pages import listed_texels
 from bitymi_ns.bake.plan import Field
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
-from bitymi_ns.bundle.read import Bundle, assemble, enough_memory, read_file, read_manifest
+from bitymi_ns.bundle.parts import Parts, parts_of
+from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
+from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
 from bitymi_ns.bundle.write import World
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -53,26 +55,32 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
     Returns:
         the bundle, None when it cannot be read, and the checks in the order they were made.
     """
-    folder = Path(folder)
     try:
-        info = read_manifest(folder)
+        with parts_of(folder) as parts:
+            return _check_parts(parts)
+    except BundleError as error:  # of one file, which cannot be opened
+        return None, [Check(MANIFEST, False, str(error))]
+
+
+def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
+    try:
+        info = manifest_of(parts)
     except BundleError as error:
         return None, [Check(MANIFEST, False, str(error))]
     signed = "" if info.digest else ", without a digest (of an earlier version)"
     checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{signed}{_real_world(info.world)}")]
     files: dict[str, bytearray] = {}
-    for name, entry in info.files.items():
-        try:
-            with enough_memory(folder, info):
-                files[name] = read_file(folder, info, name)
-            checks.append(Check(name, True, f"{entry.bytes:,} bytes, sha256 as stated"))
-        except BundleError as error:
-            checks.append(Check(name, False, str(error)))
-    if not all(check.ok for check in checks):
-        return None, checks
     try:
-        with enough_memory(folder, info):
-            bundle = assemble(folder, info, files)
+        with enough_memory(parts.bundle, info):
+            for name, entry in info.files.items():
+                try:
+                    files[name] = read_file(parts, info, name, keep=name in SCENE_FILES)
+                    checks.append(Check(name, True, f"{entry.bytes:,} bytes, sha256 as stated"))
+                except BundleError as error:
+                    checks.append(Check(name, False, str(error)))
+            if not all(check.ok for check in checks):
+                return None, checks
+            bundle = assemble(parts.bundle, info, files)
     except BundleError as error:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))

@@ -75,7 +75,10 @@ class BakedModel(SurfelModel):
         return asked
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+        try:
+            drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+        except webgpu.WebGpuUnavailable as error:
+            fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
         if not self._scene.through_webgpu:
             return drawn
         return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})

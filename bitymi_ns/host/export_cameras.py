@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from PIL import Image
 
+from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import as_bytes
 
-CAMERAS = "cameras.json"
 MOST_PIXELS = 1600
 """Longer side of a photograph in a bundle."""
 

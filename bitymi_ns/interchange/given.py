@@ -12,13 +12,13 @@ import torch
 from PIL import Image
 from pydantic import BaseModel, Field, ValidationError
 
-from bitymi_ns.bundle import BundleError, archive
+from bitymi_ns.bundle import BundleError, strict_json
 from bitymi_ns.bundle.manifest import Manifest, check_file_name
-from bitymi_ns.bundle.read import check_bytes
+from bitymi_ns.bundle.parts import CAMERAS, Parts, parts_of
+from bitymi_ns.bundle.read import read_file
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
-CAMERAS = "cameras.json"
 PICTURES = ("JPEG", "PNG", "WEBP")
 """What a photograph of a bundle may be, as Pillow names it."""
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -42,8 +42,7 @@ class _Row(BaseModel):
         return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
 
 
-class _File(BaseModel):
-    cameras: list[_Row]
+MOST_CAMERAS = 100_000
 
 
 @dataclass(frozen=True)
@@ -69,43 +68,45 @@ def given_with(folder: str | Path, info: Manifest) -> Given:
     Raises:
         BundleError: a file is missing, altered or malformed.
     """
-    folder = Path(folder)
     if CAMERAS not in info.files:
         return Given()
-    try:
-        rows = _File.model_validate_json(_bytes(folder, info, CAMERAS)).cameras
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise BundleError(f"{folder / CAMERAS}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    held_out = [_view(folder, info, row) for row in rows if row.held_out and row.photograph is not None]
+    with parts_of(folder) as parts:
+        rows = _rows(parts.bundle / CAMERAS, read_file(parts, info, CAMERAS))
+        held_out = [_view(parts, info, row) for row in rows if row.held_out and row.photograph is not None]
     return Given([row.camera() for row in rows if not row.held_out], held_out)
 
 
-def _view(folder: Path, info: Manifest, row: _Row) -> View:
+def _rows(path: Path, data: bytes | bytearray) -> list[_Row]:
+    """What stands in the file, up to the first row that is wrong, which is refused."""
+    try:
+        value = strict_json.loads(data)
+    except ValueError as error:
+        raise BundleError(f"{path} cannot be read as JSON ({error})") from error
+    found = value.get("cameras") if isinstance(value, dict) else None
+    if not isinstance(found, list) or len(found) > MOST_CAMERAS:
+        raise BundleError(f"{path} must have a list cameras, of at most {MOST_CAMERAS:,}")
+    rows = []
+    for number, row in enumerate(found):
+        try:
+            rows.append(_Row.model_validate(row))
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            where = ".".join(map(str, ("cameras", number, *first["loc"])))
+            raise BundleError(f"{path}: {where}: {first['msg']}") from error
+    return rows
+
+
+def _view(parts: Parts, info: Manifest, row: _Row) -> View:
     """A photograph, which may be smaller than its camera's image."""
     name, camera = row.photograph or "", row.camera()
     check_file_name(name, CAMERAS)
     if name not in info.files:
-        raise BundleError(f"{folder / CAMERAS} names the photograph {name}, which is no file of the bundle")
+        raise BundleError(f"{parts.bundle / CAMERAS} names the photograph {name}, which is no file of the bundle")
     try:
-        stored = Image.open(io.BytesIO(_bytes(folder, info, name)), formats=PICTURES)
+        stored = Image.open(io.BytesIO(read_file(parts, info, name)), formats=PICTURES)
         picture = torch.from_numpy(np.array(stored.convert("RGB")))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise BundleError(f"{folder / name} cannot be read as a picture: {error}") from error
+        raise BundleError(f"{parts.bundle / name} cannot be read as a picture: {error}") from error
     height, width = picture.shape[:2]
     K = torch.diag(torch.tensor([width / camera.width, height / camera.height, 1.0])) @ camera.K
     return View(Camera(camera.viewmat, K, width, height), picture)
-
-
-def _bytes(folder: Path, info: Manifest, name: str) -> bytes:
-    path = folder / name
-    try:
-        if folder.is_file():
-            with archive.opened(folder, str(folder)) as parts:
-                data = parts.part(name, info.files[name].bytes)
-        else:
-            data = path.read_bytes()
-    except OSError as error:
-        raise BundleError(f"{path} cannot be read: {error}") from error
-    check_bytes(path, info, name, data)
-    return data

@@ -1,18 +1,19 @@
-"""What a browser may ask for: the built page, and the files of a bundle that its bundle.json lists; nothing else."""
+"""What a browser may ask for: the built page, and the files of a bundle that the format names; nothing else."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from pathlib import Path
 
-from bitymi_ns.bundle import archive
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
-from bitymi_ns.bundle.read import MANIFEST_LIMIT, read_manifest
-from bitymi_ns.bundle.single import single_bytes
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
+from bitymi_ns.bundle.single import joined
 
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -47,21 +48,27 @@ class Site:
 
     Attributes:
         files: path on the server, without the first slash, to the file.
-        made: the same for what does not lie in a file of its own: to what gives its contents.
+        made: the same for what is checked when it is asked for, or lies in no file: to what gives its contents.
+        left_out: files that the bundle lists, and that are not served.
     """
 
     files: Mapping[str, Path]
-    made: Mapping[str, Callable[[], bytes]]
+    made: Mapping[str, Callable[[], bytes | bytearray]]
+    left_out: Sequence[str] = ()
+
+    def __contains__(self, path: str) -> bool:
+        return path in self.made or path in self.files
 
     @property
     def paths(self) -> list[str]:
         return sorted({*self.files, *self.made})
 
-    def read(self, path: str) -> bytes:
+    def read(self, path: str) -> bytes | bytearray:
         """The contents of one of `paths`.
 
         Raises:
-            OSError: it cannot be read, or no longer.
+            BundleError: a file of the bundle is missing, altered, or a link that leads out of it.
+            OSError: a file of the page cannot be read.
         """
         return self.made[path]() if path in self.made else self.files[path].read_bytes()
 
@@ -88,23 +95,13 @@ def site_of(bundle: Path) -> Site:
     """The page with a bundle, a folder or one file; of the latter the parts are sent as files are.
 
     Raises:
-        PageError: the page was not built, or a file of the bundle lies elsewhere.
+        PageError: the page was not built.
         BundleError: there is no bundle, or its bundle.json is damaged.
     """
-    info = read_manifest(bundle)
-    place = bundle.resolve()
-    files, made = dict(page_files()), {}
-    # a page or a script has no place in a bundle
-    names = [name for name in (MANIFEST, *info.files) if not media_type(name).startswith("text/")]
-    for name in names:
-        path = place / name
-        if place.is_file():
-            made[f"{BUNDLE}{name}"] = partial(_part, place, info, name)
-        elif path.resolve().parent != place:
-            raise PageError(f"{path} is a link that leads out of the bundle: it is not shown")
-        else:
-            files[f"{BUNDLE}{name}"] = path
-    return Site(files, {**made, "view.json": _title(place)})
+    shown = _Shown(Path(os.path.realpath(bundle)))
+    names = [MANIFEST, *(name for name in shown.info.files if is_known(name))]
+    made = {f"{BUNDLE}{name}": partial(shown.read, name) for name in names}
+    return Site(page_files(), {**made, "view.json": _title(bundle)}, left_out(shown.info))
 
 
 def single_site(bundle: Path) -> Site:
@@ -114,35 +111,62 @@ def single_site(bundle: Path) -> Site:
         PageError: the page was not built.
         BundleError: there is no bundle, or it is damaged.
     """
-    read_manifest(bundle)
-    place, files = bundle.resolve(), dict(page_files())
+    info, files = read_manifest(bundle), page_files()
     empty, named = (_ASKS.format(name).encode() for name in ("", SINGLE))
     index = files.pop("index.html").read_bytes()
     if empty not in index:
         raise PageError("the viewer's page is of another version: in a checkout, build it with `make web`")
-    made: dict[str, Callable[[], bytes]] = {"index.html": lambda: index.replace(empty, named)}
-    if place.is_file():
-        files[SINGLE] = place
-    else:
-        made[SINGLE] = partial(single_bytes, place)
-    return Site(files, {**made, "view.json": _title(place)})
+    made: dict[str, Callable[[], bytes | bytearray]] = {
+        "index.html": lambda: index.replace(empty, named),
+        SINGLE: lambda: joined(bundle)[0],
+        "view.json": _title(bundle),
+    }
+    return Site(files, made, left_out(info))
 
 
-def _title(place: Path) -> Callable[[], bytes]:
+def _title(bundle: Path) -> Callable[[], bytes]:
     """What view.json says of a bundle."""
-    title = place.stem if place.is_file() else place.parent.name if place.name == "bundle" else place.name
+    place = Path(os.path.realpath(bundle))
+    title = place.stem if os.path.isfile(place) else place.parent.name if place.name == "bundle" else place.name
     text = json.dumps({"title": title}).encode()
     return lambda: text
 
 
-def _part(file: Path, info: Manifest, name: str) -> bytes:
-    """A part of a bundle in one file.
+class _Shown:
+    """A bundle that is being served. Its files have the sizes and hashes of its bundle.json whenever they are read; a
+    bundle that is exported anew meanwhile is served as it is then."""
 
-    Raises:
-        OSError: the file is no longer what it was.
-    """
-    try:
-        with archive.opened(file, str(file)) as parts:
-            return parts.part(name, MANIFEST_LIMIT if name == MANIFEST else info.files[name].bytes)
-    except BundleError as error:
-        raise OSError(str(error)) from error
+    def __init__(self, bundle: Path) -> None:
+        self._bundle = bundle
+        self._read_manifest()
+
+    def _read_manifest(self) -> None:
+        as_of = self._stamp()
+        with parts_of(self._bundle, inside=True) as parts:
+            self.info: Manifest = manifest_of(parts)
+            self._manifest = passed_on(self.info, parts.read(MANIFEST, MANIFEST_LIMIT))
+        self._as_of = as_of
+
+    def _stamp(self) -> tuple[int, ...]:
+        """Changes when bundle.json, or the one file, is written."""
+        path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
+        try:
+            found = os.stat(path)
+        except OSError:  # which is said when it is read
+            return ()
+        return found.st_ino, found.st_size, found.st_mtime_ns
+
+    def read(self, name: str) -> bytes | bytearray:
+        """A file as it is passed on.
+
+        Raises:
+            BundleError: it is missing, altered, or a link that leads out of the bundle.
+        """
+        if self._stamp() != self._as_of:
+            self._read_manifest()
+        if name == MANIFEST:
+            return self._manifest
+        if name not in self.info.files:
+            raise BundleError(f"{self._bundle} has no {name} any longer")
+        with parts_of(self._bundle, inside=True) as parts:
+            return read_file(parts, self.info, name)

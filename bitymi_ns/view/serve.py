@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import io
+import ipaddress
 import socket
+import time
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote, urlsplit
+
+from bitymi_ns.bundle.manifest import BundleError
 
 from .page import POLICY, PageError, Site, media_type
 
 LOOPBACK = "127.0.0.1"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
+REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0
+"""How long a request may take to come, also the next one of a connection, and a piece of an answer to go."""
+_PIECE = 1 << 20
 _HEADERS = {
     "Content-Security-Policy": POLICY,
     "X-Content-Type-Options": "nosniff",
@@ -21,7 +29,118 @@ _HEADERS = {
 }
 
 
-def serve(site: Site, host: str = LOOPBACK, port: int = 0) -> ThreadingHTTPServer:
+class _Timed(io.RawIOBase):
+    """What comes over a connection until `until`, however slowly."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection, self.until = connection, 0.0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        left = self.until - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._connection.settimeout(left)
+        return self._connection.recv_into(buffer)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers GET and HEAD for what the server's site has."""
+
+    server: _Server
+    server_version, sys_version = "bitymi", ""
+    protocol_version = "HTTP/1.1"
+
+    def setup(self) -> None:
+        super().setup()
+        self.rfile.close()
+        self._timed = _Timed(self.connection)
+        self.rfile = io.BufferedReader(self._timed)
+
+    def handle_one_request(self) -> None:
+        self._timed.until = time.monotonic() + self.server.request_seconds
+        super().handle_one_request()
+
+    def do_GET(self) -> None:
+        if not self._is_whole():
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return
+        if not self.server.is_named(self.headers.get("Host", "")):
+            self._send(HTTPStatus.FORBIDDEN, b"this server answers requests for this machine alone\n")
+            return
+        try:
+            path = unquote(urlsplit(self.path).path)
+        except ValueError:
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return
+        name, site = "index.html" if path == "/" else path[1:], self.server.site
+        if not path.startswith("/") or name not in site:
+            self._send(HTTPStatus.NOT_FOUND, b"there is no such file\n")
+            return
+        try:
+            data = site.read(name)
+        except (BundleError, OSError, MemoryError):
+            self._send(HTTPStatus.NOT_FOUND, b"the file cannot be read\n")
+            return
+        self._send(HTTPStatus.OK, data, media_type(name))
+
+    do_HEAD = do_GET
+
+    def _is_whole(self) -> bool:
+        """Whether the header is all of the request: what follows is read as the next one. And whether it can be
+        understood in one way only."""
+        bodies = self.headers.get_all("Content-Length", ["0"]) + self.headers.get_all("Transfer-Encoding", [])
+        return set(bodies) == {"0"} and len(self.headers.get_all("Host", [])) < 2 and not self.headers.defects
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Refuses a request that is none of ours, and ends the connection."""
+        self.close_connection = True
+        self.request_version = self.protocol_version  # else one that is not understood is answered without a header
+        status = HTTPStatus(code)
+        self._send(status, f"{status.phrase}\n".encode())
+
+    def _send(self, status: HTTPStatus, data: bytes | bytearray, kind: str = "text/plain; charset=utf-8") -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        for header, value in _HEADERS.items():
+            self.send_header(header, value)
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.connection.settimeout(SEND_SECONDS)
+        self.end_headers()
+        view = memoryview(data if self.command != "HEAD" else b"")
+        for at in range(0, len(view), _PIECE):
+            self.connection.settimeout(SEND_SECONDS)
+            self.wfile.write(view[at : at + _PIECE])
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Says nothing."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, site: Site, host: str, port: int, request_seconds: float) -> None:
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self.site, self.request_seconds = site, request_seconds
+        super().__init__((host, port), _Handler)
+        self._names = {*LOCAL_NAMES, host.lower(), _shown(self)}
+
+    def is_named(self, host: str) -> bool:
+        """Whether a request's Host may be asked for: any where others than this machine can ask."""
+        host = host.lower()
+        return not is_loopback(self) or host in self._names or host.rpartition(":")[0] in self._names
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A browser that goes away in the middle of an answer is no error."""
+
+
+def serve(
+    site: Site, host: str = LOOPBACK, port: int = 0, request_seconds: float = REQUEST_SECONDS
+) -> ThreadingHTTPServer:
     """A server that listens and waits for `serve_forever`; `address_of` says where.
 
     Args:
@@ -29,74 +148,30 @@ def serve(site: Site, host: str = LOOPBACK, port: int = 0) -> ThreadingHTTPServe
         host: address to listen at. On a loopback address, requests that name another host are refused: a page of the
             web could otherwise have its own name point here.
         port: 0 = any that is free.
+        request_seconds: after which a request that has not come to its end is left.
 
     Raises:
         PageError: the address cannot be listened at.
     """
-
-    class Handler(BaseHTTPRequestHandler):
-        server_version, sys_version = "bitymi", ""
-        protocol_version = "HTTP/1.1"
-
-        def do_GET(self) -> None:
-            self._answer(True)
-
-        def do_HEAD(self) -> None:
-            self._answer(False)
-
-        def _answer(self, body: bool) -> None:
-            if is_loopback(host) and not self._is_local():
-                self._send(HTTPStatus.FORBIDDEN, b"this server answers requests for this machine alone\n", "", body)
-                return
-            path = unquote(urlsplit(self.path).path)
-            name = "index.html" if path == "/" else path[1:]
-            if not path.startswith("/") or name not in site.paths:
-                self._send(HTTPStatus.NOT_FOUND, b"there is no such file\n", "", body)
-                return
-            try:
-                data = site.read(name)
-            except OSError:
-                self._send(HTTPStatus.NOT_FOUND, b"the file cannot be read\n", "", body)
-                return
-            self._send(HTTPStatus.OK, data, media_type(name), body)
-
-        def _is_local(self) -> bool:
-            name = self.headers.get("Host", "").lower()
-            return name.rpartition(":")[0] in LOCAL_NAMES or name in LOCAL_NAMES
-
-        def _send(self, status: HTTPStatus, data: bytes, kind: str, body: bool) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind or "text/plain; charset=utf-8")
-            self.send_header("Content-Length", str(len(data)))
-            for header, value in _HEADERS.items():
-                self.send_header(header, value)
-            self.end_headers()
-            if body:
-                self.wfile.write(data)
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Says nothing."""
-
-    class Server(ThreadingHTTPServer):
-        address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        daemon_threads = True
-
-        def handle_error(self, request: object, client_address: object) -> None:
-            """A browser that goes away in the middle of an answer is no error."""
-
+    if not 0 <= port <= 0xFFFF:
+        raise PageError(f"the port must be from 0 to 65535, not {port}")
     try:
-        return Server((host, port), Handler)
-    except OSError as error:
-        raise PageError(f"{host} port {port} cannot be listened at: {error.strerror or error}") from error
+        return _Server(site, host, port, request_seconds)
+    except (OSError, ValueError) as error:  # ValueError: a name that none can be
+        why = getattr(error, "strerror", None) or error
+        raise PageError(f"{host} port {port} cannot be listened at: {why}") from error
 
 
-def is_loopback(host: str) -> bool:
-    """Whether nothing but this machine can reach an address."""
-    return host in ("localhost", "::1") or host.startswith("127.")
+def is_loopback(server: ThreadingHTTPServer) -> bool:
+    """Whether nothing but this machine can reach a server: by the address that it has, whatever name it was given."""
+    return ipaddress.ip_address(str(server.server_address[0]).partition("%")[0]).is_loopback
 
 
 def address_of(server: ThreadingHTTPServer) -> str:
     """Where a browser on this machine finds the page."""
-    host, port = server.server_address[:2]
-    shown = LOOPBACK if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in str(host) else host
-    return f"http://{shown}:{port}/"
+    return f"http://{_shown(server)}:{server.server_address[1]}/"
+
+
+def _shown(server: ThreadingHTTPServer) -> str:
+    host = str(server.server_address[0])
+    return LOOPBACK if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from bitymi_ns.bundle.folder import files_of
@@ -26,6 +25,7 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
 
     Raises:
         PageError: something else is there, or beside an earlier page.
+        BundleError: a file of the bundle is missing, altered, or a link that leads out of it.
         OSError: the folder cannot be written.
     """
 
@@ -50,8 +50,5 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
         for path in site.paths:
             to = new / path
             to.parent.mkdir(exist_ok=True)
-            if path in site.made:
-                to.write_bytes(site.read(path))
-            else:
-                shutil.copyfile(site.files[path], to)
+            to.write_bytes(site.read(path))
         return sum(path.stat().st_size for path in new.rglob("*") if path.is_file())

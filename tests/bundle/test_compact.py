@@ -16,11 +16,15 @@ from bitymi_ns.bake.packing import pack
 from bitymi_ns.bake.pages import coverage
 from bitymi_ns.bake.quantise import encode
 from bitymi_ns.bake.texel_codes import pages
-from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, write_bundle
+from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, sizes, write_bundle
+from bitymi_ns.bundle.read import read_manifest
+from bitymi_ns.bundle.sizes import least_memory
+from bitymi_ns.cli import main
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import FINEST, RANGE, make_codes, scene_of, write_compact
 from tests.bundle.damage import amend, signed
+from tests.bundle.test_read import peak
 
 
 @pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
@@ -167,3 +171,39 @@ def test_damage_is_found_by_the_hash(tmp_path: Path) -> None:
     (folder / "texels.bin").write_bytes(data)
     with pytest.raises(BundleError, match="texels.bin is altered"):
         read_bundle(folder)
+
+
+@pytest.mark.parametrize("what", ["count", "terms", "texels", "width"])
+def test_a_small_file_is_not_said_to_hold_what_takes_gigabytes(what: str, tmp_path: Path) -> None:
+    """Whatever its columns say: one of a single number takes no bytes at all."""
+    folder = write_compact(tmp_path / "b", make_codes())
+    size = (folder / "surfels.bin").stat().st_size
+    rows = size + (1 << 12) + 1
+    many = 64 * (size + (folder / "texels.bin").stat().st_size) + (1 << 20) + 1
+    amend(
+        folder,
+        lambda i: i["surfels" if what in ("count", "terms") else "atlas"].update(
+            {what: {"count": rows, "terms": rows, "texels": many, "width": many}[what]}
+        ),
+    )
+
+    def refused() -> None:
+        with pytest.raises(BundleError, match="cannot be in|must be less than"):
+            read_bundle(folder)
+
+    assert peak(refused) < 4 << 20
+
+
+@pytest.mark.parametrize("name", ["surfels.bin", "texels.bin"])
+def test_what_the_machine_has_no_memory_for_is_refused_before_it_is_read(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_compact(tmp_path / "b", make_codes())
+    info = read_manifest(folder)
+    enough = max(least_memory(info, each) for each in ("surfels.bin", "texels.bin"))
+    monkeypatch.setattr(sizes, "machine_memory", lambda: enough)
+    read_bundle(folder)
+    monkeypatch.setattr(sizes, "machine_memory", lambda: least_memory(info, name) - 1)
+    with pytest.raises(BundleError, match="needs more memory than there is: its contents take at least"):
+        read_bundle(folder)
+    assert main(["verify", str(folder)]) == 1

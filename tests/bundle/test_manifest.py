@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from bitymi_ns.bake.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
-from bitymi_ns.bundle import strict_json
+from bitymi_ns.bundle import check_files, strict_json
 from bitymi_ns.bundle.manifest import Atlas, BundleError, describe, dump, parse
+from bitymi_ns.bundle.single import write_single
 from bitymi_ns.ops.view_color import MAX_TERMS
-from tests.bundle.damage import signed
+from tests.bundle.compact_scene import make_codes, write_compact
+from tests.bundle.damage import amend, signed
+from tests.bundle.made import make
 
 INFO = {
     "format": "bitymi-bundle",
@@ -110,3 +117,63 @@ def test_the_limits_keep_colours_below_the_stated_bound():
     with pytest.raises(ValueError):
         Atlas.model_validate({**atlas, "scale": 2.01 * RESIDUAL_LIMIT})
     assert max(lobes, harmonics) + 0.5 + residual + 1.0 < BRIGHTEST
+
+
+def quick(action: Callable[[], object]) -> None:
+    """Runs what takes much longer where the time grows with the square of the size."""
+    begin = time.process_time()
+    action()
+    assert time.process_time() - begin < 2
+
+
+@pytest.mark.parametrize("where", ["at the end", "at the start"])
+def test_a_key_that_is_there_twice_among_many_is_found_at_once(where: str) -> None:
+    keys = [f'"k{k}":0' for k in range(100_000)]
+    keys.insert(len(keys) if where == "at the end" else 1, keys[-1] if where == "at the end" else keys[0])
+
+    def refused() -> None:
+        with pytest.raises(ValueError, match="the key 'k[0-9]+' is there twice"):
+            strict_json.loads(f"{{{','.join(keys)}}}".encode())
+
+    quick(refused)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda info: info["files"].update({f"f{k}": {"bytes": 0, "sha256": "0" * 64} for k in range(30_000)}),
+        lambda info: info["files"].update({f"f{k}": [] for k in range(30_000)}),
+        lambda info: info["statistics"].update({"finetune": {"curve": ["x"] * 200_000}}),
+        lambda info: info["surfels"].update(columns=["x"] * 200_000),
+        lambda info: info["surfels"].update(activations={f"a{k}": 1 for k in range(50_000)}),
+    ],
+    ids=["files", "wrong files", "a curve", "columns", "activations"],
+)
+def test_a_refusal_of_much_takes_no_longer_than_reading_it(surfels, tmp_path: Path, change: Callable[[dict], object]):
+    make(surfels, tmp_path / "b")
+    info = json.loads((tmp_path / "b" / "bundle.json").read_text())
+    change(info)
+    text = signed(info)
+
+    def refused() -> None:
+        with pytest.raises(BundleError) as error:
+            parse(text)
+        assert len(str(error.value)) < 500
+
+    quick(refused)
+
+
+def test_many_files_are_verified_in_a_folder_and_in_one_file(tmp_path: Path) -> None:
+    folder, count = write_compact(tmp_path / "b", make_codes(count=40)), 1000
+    for k in range(count):
+        (folder / f"photograph-{k:05d}.jpg").touch()
+    empty = {"bytes": 0, "sha256": hashlib.sha256(b"").hexdigest()}
+    amend(folder, lambda info: info["files"].update({f"photograph-{k:05d}.jpg": empty for k in range(count)}))
+    quick(lambda: write_single(folder, tmp_path / "b.bitymi"))
+
+    def verified(path: Path) -> None:
+        _, checks = check_files(path)
+        assert len(checks) > count and all(check.ok for check in checks)
+
+    quick(lambda: verified(folder))
+    quick(lambda: verified(tmp_path / "b.bitymi"))

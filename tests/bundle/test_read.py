@@ -19,6 +19,7 @@ from bitymi_ns.bake.quantise import encode
 from bitymi_ns.bundle import check_files, ktx2, read_bundle
 from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle.manifest import BundleError
+from bitymi_ns.bundle.parts import parts_of
 from bitymi_ns.cli import main
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
@@ -126,9 +127,11 @@ def test_a_file_that_shrinks_while_it_is_read_is_truncated(surfels, tmp_path, mo
     info["files"]["preview.png"] = {"bytes": size + 100, "sha256": "0" * 64}
     (folder / "preview.png").write_bytes(bytes(size))
     (folder / "bundle.json").write_bytes(signed(info))
-    monkeypatch.setattr(bundle_read.os, "fstat", larger)
-    with pytest.raises(BundleError, match=f"preview.png is truncated: it ended after {size} bytes"):
-        bundle_read.read_file(folder, bundle_read.read_manifest(folder), "preview.png")
+    monkeypatch.setattr(os, "fstat", larger)
+    with parts_of(folder) as parts:
+        info = bundle_read.manifest_of(parts)
+        with pytest.raises(BundleError, match=f"preview.png is truncated: it ended after {size} bytes"):
+            bundle_read.read_file(parts, info, "preview.png", keep=False)
 
 
 def test_a_lack_of_memory_is_a_sentence(surfels, tmp_path, monkeypatch):

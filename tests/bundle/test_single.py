@@ -12,6 +12,7 @@ import torch
 
 from bitymi_ns import cli
 from bitymi_ns.bundle import BundleError, check_files, read_bundle
+from bitymi_ns.bundle import single as single_module
 from bitymi_ns.bundle.single import Ranges, read_single, write_single
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.made import make
@@ -101,6 +102,15 @@ def test_damage_anywhere_is_refused_or_changes_nothing(single: bytes, tmp_path: 
 def test_an_altered_file_is_not_packed(single: bytes, tmp_path: Path) -> None:
     (tmp_path / "b" / "preview.jpg").write_bytes(bytes(99_999) + b"x")
     with pytest.raises(BundleError, match="preview.jpg is altered"):
+        write_single(tmp_path / "b", tmp_path / "c.bitymi")
+    assert not (tmp_path / "c.bitymi").exists()
+
+
+def test_what_the_machine_has_no_memory_for_is_not_packed(
+    single: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(single_module, "machine_memory", lambda: 150_000)  # the preview has 100,000 bytes
+    with pytest.raises(BundleError, match="cannot be packed: one file of it takes 2.* this machine has 150.0 kB"):
         write_single(tmp_path / "b", tmp_path / "c.bitymi")
     assert not (tmp_path / "c.bitymi").exists()
 

@@ -110,7 +110,10 @@ def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"{", "Invalid JSON"),
+        (b"{", "cannot be read as JSON"),
+        (b'{"cameras": 3}', "must have a list cameras"),
+        (b'{"cameras": [' + b"[]," * 300_000 + b"[]]}", "of at most 100,000"),
+        (b'{"cameras": [' + b"[]," * 90_000 + b"[]]}", "cameras.0: "),
         (b'{"cameras": [{"name": "a"}]}', "held_out"),
         (b'{"cameras": [{"name": "a", "held_out": true, "width": 0}]}', "width"),
     ],
@@ -120,7 +123,7 @@ def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: byt
     info = read_bundle(tmp_path / "b").info
     with pytest.raises(BundleError, match=message):
         given_with(tmp_path / "b", info)
-    (tmp_path / "b" / "cameras.json").write_bytes(b"[]")
+    (tmp_path / "b" / "cameras.json").write_bytes(text[:-1] + b"?")
     with pytest.raises(BundleError, match="altered"):
         given_with(tmp_path / "b", info)
 

@@ -20,7 +20,8 @@ from bitymi_ns.bake.limits import beyond
 from bitymi_ns.bake.streams import StreamError
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, describe, parse
-from bitymi_ns.bundle.read import _CHECKS, assemble
+from bitymi_ns.bundle.read import assemble
+from bitymi_ns.bundle.sizes import check_head
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.damage import signed
 
@@ -46,7 +47,7 @@ def opened(info: dict[str, Any], files: dict[str, bytes], as_bytes: bool = True)
     try:
         manifest = parse(signed(info, files)) if as_bytes else describe(info)
         for name, data in files.items():
-            _CHECKS[name](manifest, data[:1024], len(data))
+            check_head(manifest, name, data[:1024], len(data))
         found = assemble(Path("b"), manifest, {name: bytearray(data) for name, data in files.items()}).scene
     except (BundleError, StreamError) as error:
         assert str(error) and "\n" not in str(error)

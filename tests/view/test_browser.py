@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import http.server
 import json
-import shutil
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.bundle import read_bundle
+from bitymi_ns.bundle import ktx2, read_bundle
 from bitymi_ns.bundle.single import read_single, write_single
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.view import Site, site_of, write_static
-from tests.bundle.damage import signed
+from tests.bundle.damage import amend, signed
 from tests.view.browser import drive, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 
@@ -133,21 +133,21 @@ def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None
 
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "missing", "newer"])
-def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path, tmp_path: Path) -> None:
-    """Damaged after the server has started: nothing but the browser could see it."""
-    copy = shutil.copytree(bundle, tmp_path / "copy")
-    with served(site_of(copy)) as address:
-        table = copy / "surfels.ply"
-        data = table.read_bytes()
-        if damage == "truncated":
-            table.write_bytes(data[:-40])
-        elif damage == "altered":
-            table.write_bytes(data[:-4] + bytes([data[-4] ^ 1]) + data[-3:])
-        elif damage == "missing":
-            table.unlink()
-        else:
-            info = json.loads((copy / "bundle.json").read_text())
-            (copy / "bundle.json").write_text(json.dumps({**info, "version": "9.0"}))
+def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path) -> None:
+    """On a server that sends files as they are: nothing but the browser could see it."""
+    site, name, data = site_of(bundle), "bundle/surfels.ply", (bundle / "surfels.ply").read_bytes()
+    newer = json.dumps({**json.loads((bundle / "bundle.json").read_text()), "version": "9.0"}).encode()
+
+    def missing() -> bytes:
+        raise OSError
+
+    sent: dict[str, dict[str, Callable[[], bytes]]] = {
+        "truncated": {name: lambda: data[:-40]},
+        "altered": {name: lambda: data[:-4] + bytes([data[-4] ^ 1]) + data[-3:]},
+        "missing": {name: missing},
+        "newer": {"bundle/bundle.json": lambda: newer},
+    }
+    with served(Site(site.files, {**site.made, **sent[damage]})) as address:
         found = drive([["goto", address], ["settle"], ["ask", STATE], ["ask", "document.body.innerText"]], SCREEN)
     state, text = found.results[-2:]
     assert state == "error"
@@ -171,3 +171,70 @@ def test_an_exported_folder_is_shown_by_a_plain_file_server(bundle: Path, tmp_pa
         server.shutdown()
     assert not found.problems
     assert difference(tmp_path / "p.png", bundle)[0] < MEAN
+
+
+def test_an_atlas_of_more_pages_than_the_device_takes_is_too_large(tmp_path: Path) -> None:
+    bundle = write(tmp_path / "b", "uint8")
+    image = ktx2.parse_ktx2((bundle / "atlas.ktx2").read_bytes())
+    pages = [bytes(page) for page in image.payload] * 300
+    ktx2.write_ktx2(bundle / "atlas.ktx2", pages, "uint8", image.width, image.height, "test")
+    amend(bundle, lambda info: info["atlas"].update(layers=len(pages)))
+    with served(site_of(bundle)) as address:
+        found = drive([["goto", address], ["settle"], ["ask", STATE], ["ask", "document.body.innerText"]], SCREEN)
+    assert found.results[-2] == "error" and not found.problems
+    assert "too large for this device" in found.results[-1] and "300 pages" in found.results[-1]
+
+
+ERRORS = {
+    "refused": (
+        "const made = GPUDevice.prototype.createTexture; GPUDevice.prototype.createTexture = function (what) {"
+        "return made.call(this, { ...what, size: [16, 16, 100000] }); }",
+        "The graphics device reports an error",
+    ),
+    "no memory": (
+        "GPUDevice.prototype.createSampler = function () {"
+        "this.dispatchEvent(new GPUUncapturedErrorEvent('uncapturederror', { error: new GPUOutOfMemoryError('') })); }",
+        "too large for this device",
+    ),
+    "lost": (
+        "Object.defineProperty(GPUDevice.prototype, 'lost', { get: () => new Promise((resolve) =>"
+        "setTimeout(resolve, 3000, { reason: 'unknown', message: 'gone' })) })",
+        "The graphics device was lost",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ERRORS)
+def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> None:
+    """And it stays, whatever the page still does; of a lost device also after the picture was there."""
+    script, said = ERRORS[what]
+    wait = "new Promise((resolve) => setTimeout(resolve, 4000))"
+    with served(site_of(bundle)) as address:
+        steps = [["init", script], ["goto", address], ["settle"], ["ask", wait]]
+        found = drive([*steps, ["ask", STATE], ["ask", "document.getElementById('page').innerText"]], SCREEN)
+    assert found.results[-2] == "error" and said in found.results[-1]
+
+
+def test_a_page_that_is_opened_as_a_file_says_what_to_do(bundle: Path, tmp_path: Path) -> None:
+    """Browsers load no modules from files."""
+    write_static(site_of(bundle), tmp_path / "site")
+    ask = [["ask", STATE], ["ask", "document.getElementById('page').innerText"]]
+    found = drive([["goto", f"file://{tmp_path}/site/index.html"], ["settle"], *ask], SCREEN)
+    assert found.results[-2] == "error"
+    assert "opened as a file" in found.results[-1] and "web server" in found.results[-1]
+    assert "Loading" not in found.results[-1]
+
+
+@pytest.mark.parametrize("data", [None, b"let let = ;"], ids=["missing", "not understood"])
+def test_a_page_whose_script_does_not_run_says_so(data: bytes | None, bundle: Path) -> None:
+    site = site_of(bundle)
+
+    def read() -> bytes:
+        if data is None:
+            raise OSError
+        return data
+
+    ask = [["ask", STATE], ["ask", "document.getElementById('page').innerText"]]
+    with served(Site(site.files, {**site.made, "index.js": read})) as address:
+        found = drive([["goto", address], ["settle"], *ask], SCREEN)
+    assert found.results[-2] == "error" and "cannot start" in found.results[-1] and "Reload" in found.results[-1]

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import json
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import time
+import zipfile
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from threading import Thread
 from urllib.parse import urlsplit
 
 import pytest
 
-from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle import BundleError, check_files
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
-from bitymi_ns.view import PageError, serve, site_of, write_static
+from bitymi_ns.view import PageError, address_of, is_loopback, serve, site_of, write_static
+from tests.bundle.damage import amend
 from tests.view.browser import served
 
 
@@ -93,14 +100,73 @@ def test_the_server_listens_on_the_loopback_address_alone(bundle: Path) -> None:
         server.server_close()
 
 
-def test_a_link_out_of_the_bundle_is_not_followed(bundle: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(bundle, tmp_path / "copy")
-    (copy / "surfels.ply").unlink()
-    (copy / "surfels.ply").symlink_to("/etc/passwd")
-    with pytest.raises(PageError, match="leads out of the bundle"):
-        site_of(copy)
+FILE = {"bytes": 25, "sha256": hashlib.sha256(b"<script>alert(1)</script>").hexdigest()}
+
+
+def whole(folder: Path, path: Path) -> None:
+    """A bundle in one file as another program could write it: with all files of the folder."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for file in sorted(folder.iterdir()):
+            archive.write(file, file.name)
+
+
+def test_what_is_no_longer_what_bundle_json_says_is_not_sent_at_any_time(bundle: Path, tmp_path: Path) -> None:
+    copy, elsewhere = shutil.copytree(bundle, tmp_path / "copy"), tmp_path / "elsewhere"
+    (elsewhere / "same").mkdir(parents=True)
+    shutil.copy(copy / "surfels.ply", elsewhere / "same")
+    secret = elsewhere / "secret"
+    secret.write_bytes(bytes((copy / "surfels.ply").stat().st_size))
+    site = site_of(copy)
+    with served(site) as address:
+        assert ask(address, "/bundle/surfels.ply")[0] == 200
+        for target in (secret, elsewhere / "same" / "surfels.ply", Path("/dev/zero"), Path("/etc/passwd")):
+            (copy / "surfels.ply").unlink()
+            (copy / "surfels.ply").symlink_to(target)
+            assert ask(address, "/bundle/surfels.ply")[0] == 404
+            assert main(["view", str(copy), "--export", str(tmp_path / "site")]) == 1
+            assert main(["pack", str(copy), "--output", str(tmp_path / "copy.bitymi")]) == 1
+    with pytest.raises(BundleError, match="leads out of the bundle"):
+        site.read("bundle/surfels.ply")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "elsewhere"]
     with pytest.raises(BundleError, match="not a bundle"):
         site_of(tmp_path)
+
+
+STRANGE = ["a.htm", "a.svg", "a.xhtml", "shell.php", "run.cgi", "index.html", "A.HTM", "photograph-0001.jpg.php", "a"]
+
+
+def test_files_that_the_format_does_not_name_are_not_passed_on_and_that_is_said(
+    bundle: Path, tmp_path: Path, capsys
+) -> None:
+    """Neither served nor exported, in either form, nor packed; what is passed on is a whole bundle again."""
+    strange = shutil.copytree(bundle, tmp_path / "strange")
+    for name in STRANGE:
+        (strange / name).write_text("<script>alert(1)</script>")
+    amend(strange, lambda info: info["files"].update({name: FILE for name in STRANGE}))
+    whole(strange, tmp_path / "whole.bitymi")
+    for source in (strange, tmp_path / "whole.bitymi"):
+        with served(site_of(source)) as address:
+            assert {ask(address, f"/bundle/{name}")[0] for name in STRANGE} == {404}
+            sent = json.loads(ask(address, "/bundle/bundle.json")[2])
+        folder, one, packed = (tmp_path / name for name in ("site", "one", "packed.bitymi"))
+        for command in (
+            ["view", str(source), "--export", str(folder), "--overwrite"],
+            ["view", str(source), "--export", str(one), "--one-file", "--overwrite"],
+            ["pack", str(source), "--output", str(packed), "--overwrite"],
+        ):
+            assert main(command) == 0
+            said = capsys.readouterr().err
+            assert "Left out" in said and "a.htm" in said and "4 more" in said
+        names = {path.name for path in folder.rglob("*")} | {path.name for path in one.rglob("*")}
+        assert names.isdisjoint(set(STRANGE) - {"index.html"}) and not (folder / "bundle" / "index.html").exists()
+        for result in (folder / "bundle", one / "scene.bitymi", packed):
+            found, checks = check_files(result)
+            assert found is not None and all(check.ok for check in checks)
+            assert (
+                found.info.files.keys()
+                == sent["files"].keys()
+                == json.loads((bundle / "bundle.json").read_text())["files"].keys()
+            )
 
 
 def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, tmp_path: Path, capsys) -> None:
@@ -155,3 +221,111 @@ def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
             assert process.wait(timeout=60) == 0
         finally:
             process.kill()  # else leaving the block waits for ever
+
+
+def raw(address: str, data: bytes, finish: bool = False) -> bytes:
+    """All that is answered to some bytes, until the server ends the connection."""
+    parts = urlsplit(address)
+    with socket.create_connection((parts.hostname, parts.port), timeout=20) as connection:
+        connection.sendall(data)
+        if finish:
+            connection.shutdown(socket.SHUT_WR)
+        found = b""
+        while piece := connection.recv(1 << 16):
+            found += piece
+        return found
+
+
+@pytest.mark.parametrize(
+    "request_line, status",
+    [
+        ("GET http://[/ HTTP/1.1", 400),
+        ("GET http://[::1/x HTTP/1.1", 400),
+        ("GET / HTTP/9.9.9", 400),
+        ("GET / x HTTP/1.1", 400),
+        ("GET / HTTP/3.0", 505),
+        ("TRACE / HTTP/1.1", 501),
+        ("<b> / HTTP/1.1", 501),
+        ("GET /%ff%00 HTTP/1.1", 404),
+        ("GET /" + "a" * 70_000 + " HTTP/1.1", 414),
+    ],
+)
+def test_a_request_that_is_none_is_answered_as_such(bundle: Path, request_line: str, status: int) -> None:
+    with served(site_of(bundle)) as address:
+        answer = raw(address, f"{request_line}\r\nHost: localhost\r\n\r\n".encode(), finish=True)
+        head, _, body = answer.partition(b"\r\n\r\n")
+        assert head.startswith(f"HTTP/1.1 {status} ".encode()) and answer.count(b"HTTP/1.1") == 1
+        assert b"default-src 'none'" in head and b"text/plain" in head and b"<" not in body
+        assert ask(address, "/")[0] == 200
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD", "POST"])
+@pytest.mark.parametrize(
+    "header",
+    [
+        *("Content-Length: 40", "Transfer-Encoding: chunked", "content-length: 40\r\nContent-Length: 0"),
+        *("Content-Length: 0\r\nContent-Length: 40", "Transfer-Encoding : chunked", "no header", "Host: localhost"),
+    ],
+)
+def test_a_body_is_no_second_request(bundle: Path, method: str, header: str) -> None:
+    second = b"GET /index.js HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with served(site_of(bundle)) as address:
+        answer = raw(address, f"{method} / HTTP/1.1\r\nHost: localhost\r\n{header}\r\n\r\n".encode() + second)
+    assert answer.count(b"HTTP/1.1 ") == 1 and b"HTTP/1.1 200" not in answer
+
+
+@pytest.mark.parametrize("data", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"drip"])
+def test_half_a_request_is_not_waited_for(bundle: Path, data: bytes) -> None:
+    server = serve(site_of(bundle), request_seconds=0.4)
+    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    begin = time.monotonic()
+    try:
+        host, port = server.server_address[:2]
+        with socket.create_connection((host, port), timeout=10) as connection:
+            connection.sendall(data if data != b"drip" else b"GET / HTTP/1.1\r\n")
+            with suppress(ConnectionError):
+                while data == b"drip" and time.monotonic() - begin < 3:
+                    connection.sendall(b"A")
+                    time.sleep(0.05)
+                assert connection.recv(100) == b""
+        assert time.monotonic() - begin < 2.5
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "localhost", "127.1", "::1", "0.0.0.0"])
+def test_every_address_of_this_machine_answers_to_its_name(bundle: Path, host: str) -> None:
+    try:
+        server = serve(site_of(bundle), host)
+    except PageError as error:
+        pytest.skip(str(error))  # no IPv6
+    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    try:
+        address = address_of(server)
+        assert ask(address, "/")[0] == 200
+        assert ask(address, "/", host="evil.example")[0] == (200 if host == "0.0.0.0" else 403)
+        assert is_loopback(server) == (host != "0.0.0.0")
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["--port", "99999"], "the port must be from 0 to 65535, not 99999"),
+        (["--port", "-1"], "the port must be from 0 to 65535, not -1"),
+        (["--host", "192.0.2.1"], "cannot be listened at"),
+        (["--host", "127.0.0.1.5"], "cannot be listened at"),
+        (["--host", "a..b"], "cannot be listened at"),
+        (["--host", "::zz"], "cannot be listened at"),
+    ],
+)
+def test_an_address_that_is_none_is_said(bundle: Path, options: list[str], said: str, capsys) -> None:
+    assert main(["view", str(bundle), "--no-open-browser", *options]) == 1
+    assert said in capsys.readouterr().err

@@ -5,7 +5,7 @@ import type { Look, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import type { Screen } from './render/screen';
 import { element, press, pressed } from './ui/dom';
-import { notify, showError } from './ui/pages';
+import { notify, showError, stopped } from './ui/pages';
 import { endPoster } from './ui/poster';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
@@ -18,6 +18,8 @@ import { length, subtract } from './view/vector';
 const MOVING_LAYERS = 4; // batches while the camera moves, and of a picture that stays
 const STILL_LAYERS = 16;
 const STILL_AFTER = 250; // milliseconds
+
+const unsaved = (): void => notify('This view cannot be saved: there is not enough memory for it.');
 
 export class App {
   private readonly controls: Controls;
@@ -111,6 +113,7 @@ export class App {
   }
 
   private tick(now: number): void {
+    if (stopped()) return;
     requestAnimationFrame((next) => this.tick(next));
     this.controls.advance(now);
     if (this.drawing) return;
@@ -118,11 +121,18 @@ export class App {
     else if (!this.still && now - this.movedAt > STILL_AFTER) void this.frame(true);
   }
 
+  // Width and height of the canvas on the screen, as far as the device draws so many.
+  private pixels(): [number, number] {
+    const { clientWidth, clientHeight } = this.canvas;
+    const most = this.renderer.largestSide / Math.max(clientWidth, clientHeight, 1);
+    const ratio = Math.min(devicePixelRatio, 2, most);
+    return [Math.round(clientWidth * ratio), Math.round(clientHeight * ratio)];
+  }
+
   private async frame(still: boolean): Promise<void> {
     this.drawing = true;
     this.dirty = false;
-    const ratio = Math.min(devicePixelRatio, 2);
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((s) => Math.round(s * ratio));
+    const [width, height] = this.pixels();
     if (width > 0 && height > 0) {
       const chosen = element<HTMLSelectElement>('resolution').value;
       const scale = chosen !== 'auto' ? Number(chosen) : still ? 1 : this.pace.scale;
@@ -164,7 +174,7 @@ export class App {
     on('colors', () => {
       this.held = this.toggle('colors') ? null : this.controls.pose.position;
     });
-    on('screenshot', () => void this.screenshot());
+    on('screenshot', () => void this.screenshot().catch(unsaved));
     on('share', () => void this.share());
     on('theme', () => this.turnTheme());
     on('menu', () => {
@@ -182,7 +192,7 @@ export class App {
     if (e.target instanceof HTMLSelectElement) return;
     if ((e.ctrlKey || e.metaKey) && e.code === 'KeyS') {
       e.preventDefault();
-      void this.screenshot();
+      void this.screenshot().catch(unsaved);
     }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     const id = { o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture' }[e.key];
@@ -268,7 +278,7 @@ export class App {
     image.removeAttribute('src');
     element('photograph-name').textContent = camera.photograph ? 'Photograph' : 'No photograph of this camera';
     if (camera.photograph) {
-      const found = this.bundle.source.address(camera.photograph);
+      const found = this.bundle.photograph(camera.photograph);
       this.photograph = found;
       found.then((address) => this.photograph === found && (image.src = address), showError);
     } else {
@@ -285,8 +295,7 @@ export class App {
   }
 
   private async screenshot(): Promise<void> {
-    const ratio = Math.min(devicePixelRatio, 2);
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((s) => Math.round(s * ratio));
+    const [width, height] = this.pixels();
     const view = View.contain(this.controls.pose, this.lens, width, height);
     const image = await this.renderer.read(view, this.look(true), this.farthest());
     const canvas = new OffscreenCanvas(width, height);

@@ -9,6 +9,18 @@ export class ViewerError extends Error {
   }
 }
 
+// More than the device, or the browser, has memory for.
+export const tooLarge = (detail: string): ViewerError =>
+  new ViewerError('This scene is too large for this device', detail, 'Open it on a device with more memory.');
+
+// What is said of an error of any kind; that of too large an array is a lack of memory.
+export function reasonOf(error: unknown): ViewerError {
+  if (error instanceof ViewerError) return error;
+  if (error instanceof RangeError) return tooLarge('There is not enough memory for it.');
+  const message = error instanceof Error ? error.message : String(error);
+  return new ViewerError('The viewer stopped', message, 'Reload the page to try again.');
+}
+
 const COPY = 'Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas.';
 
 export class DamagedBundle extends ViewerError {

@@ -5,7 +5,8 @@ import { type Bundle, loadBundle, loadManifest } from './bundle/load';
 import { loadPoster } from './bundle/poster';
 import { Folder, SingleFile, type Source } from './bundle/source';
 import { ViewerError } from './errors';
-import { openDevice } from './render/device';
+import { type Graphics, openDevice, watch } from './render/device';
+import { checkRoom } from './render/limits';
 import { Programs } from './render/programs';
 import { Renderer } from './render/renderer';
 import { SceneOnDevice } from './render/scene';
@@ -40,25 +41,27 @@ async function title(): Promise<string> {
 }
 
 // The poster is asked for first, where the first view is the one that it shows.
-async function load(): Promise<Bundle> {
+async function load(opening: Promise<Graphics>): Promise<Bundle> {
   const from = await source();
   const info = await loadManifest(from);
   if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
-  return loadBundle(from, info, showProgress);
+  return loadBundle(from, info, showProgress, async () => {
+    const { deviceMemory } = navigator as { deviceMemory?: number }; // which not all browsers tell
+    checkRoom(info, (await opening).device.limits, deviceMemory);
+  });
 }
 
 async function main(): Promise<void> {
-  const loading = load();
+  const opening = openDevice();
+  const loading = load(opening);
   loading.catch(() => undefined); // until it is waited for
-  const graphics = await openDevice();
+  const graphics = await opening;
   const { device } = graphics;
+  watch(device, showError);
   const programs = new Programs(device);
   const bundle = await loading;
   const scene = new SceneOnDevice(graphics, programs, bundle.info, bundle.surfels, bundle.pages);
   const canvas = element<HTMLCanvasElement>('canvas');
-  void device.lost.then((lost) => {
-    if (lost.reason !== 'destroyed') showError(new Error(`The graphics device was lost: ${lost.message}`));
-  });
   document.title = element('title').textContent = await title();
   showScene();
   const renderer = new Renderer(graphics, programs, scene);
@@ -74,4 +77,7 @@ async function main(): Promise<void> {
   }
 }
 
+document.documentElement.dataset.state = 'loading';
+addEventListener('unhandledrejection', ({ reason }) => showError(reason));
+addEventListener('error', ({ error }) => error && showError(error)); // notes of the browser have none
 main().catch(showError);

@@ -32,6 +32,12 @@ describe('a bundle in one file', () => {
       expect(() => partsOf(file.slice(0, length))).toThrow(DamagedBundle);
     }
   });
+  it('is refused where two parts have one name', () => {
+    const changed = file.slice();
+    const at = new TextDecoder('latin1').decode(file).lastIndexOf('surfels.bin');
+    changed.set(new TextEncoder().encode('bundle.json'), at);
+    expect(() => partsOf(changed)).toThrow(/two parts have one name/);
+  });
   it('is refused, or read within its bounds, whatever byte is changed', () => {
     for (let at = 0; at < file.length; at++) {
       const changed = file.slice();

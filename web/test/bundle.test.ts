@@ -102,6 +102,11 @@ describe('bundle.json', () => {
   });
 });
 
+const changed = (from: string, to: string): ArrayBuffer => {
+  const text = new TextDecoder('latin1').decode(ply([row(0, 0), row(2, 1)], [[1, 2, 3, 4, 5, 6]]));
+  return Uint8Array.from(text.replace(from, to), (c) => c.charCodeAt(0)).buffer;
+};
+
 describe('surfels.ply', () => {
   const info = parseManifest(manifest());
   it('is packed as the shaders read it', () => {
@@ -121,6 +126,10 @@ describe('surfels.ply', () => {
     ['with terms that are not counted', ply([row(0, 0), row(2, 0)], [[1, 2, 3, 4, 5, 6]])],
     ['with a number that is not finite', ply([row(0, 0), row(NaN, 1)], [[1, 2, 3, 4, 5, 6]])],
     ['that is something else', new ArrayBuffer(64)],
+    ['with a count below 0', changed('vertex 2', 'vertex -2')],
+    ['with a count that is no number', changed('vertex 2', 'vertex 2e0')],
+    ['with a property twice', changed('float y', 'float x')],
+    ['with an element twice', changed('element view_term', 'element vertex')],
   ])('%s is refused', (_, data) => {
     expect(() => readSurfels(data, info)).toThrowError(DamagedBundle);
   });

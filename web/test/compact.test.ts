@@ -86,8 +86,26 @@ describe('a Zstandard frame', () => {
   it('is decoded where it has the size that is wanted', () => {
     expect([...frameBytes(frameOf(content), 1000, 'x')]).toEqual([...content]);
   });
+  it('of 2^28 bytes is decoded, in the time that so many bytes take', () => {
+    const [size, block] = [2 ** 28, 2 ** 17];
+    const blocks = Array.from({ length: size / block }, (_, k) => {
+      const head = (block << 3) | 2 | (k + 1 === size / block ? 1 : 0);
+      return [head & 255, (head >> 8) & 255, head >> 16, k & 255];
+    });
+    const frame = Uint8Array.from([0x28, 0xb5, 0x2f, 0xfd, 0xa0, 0, 0, 0, 0x10, ...blocks.flat()]);
+    const data = frameBytes(frame, size, 'x');
+    expect([data.length, data[block], data[size - 1]]).toEqual([size, 1, 255]);
+  });
+  it('of no bytes takes no memory for a window', () => {
+    const frame = [0x28, 0xb5, 0x2f, 0xfd, 0x80, 0xa0, 0, 0, 0, 0, 1, 0, 0]; // a window of a gigabyte
+    expect(frameBytes(Uint8Array.from(frame), 0, 'x').buffer.byteLength).toBe(0);
+  });
   it.each([
     ['of another size', frameOf(content.subarray(1))],
+    [
+      'that does not declare its size',
+      Uint8Array.from([0x28, 0xb5, 0x2f, 0xfd, 0, 0x88, ...frameOf(content).slice(9)]),
+    ],
     ['that ends early', frameOf(content).subarray(0, 500)],
     ['that something follows', Uint8Array.from([...frameOf(content), 0])],
     ['that is none', content],

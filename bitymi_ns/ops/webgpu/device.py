@@ -10,7 +10,10 @@ from typing import Any
 INSTALL = "pip install 'bitymi-ns[webgpu]'"
 OPTIONAL = ("texture-compression-bc", "float32-blendable", "float32-filterable")
 """Features that are used where the device has them."""
-_LIMITS = ("max-texture-dimension-2d", "max-storage-buffer-binding-size", "max-buffer-size")
+_LIMITS = (
+    *("max-texture-dimension-2d", "max-texture-array-layers", "max-storage-buffer-binding-size", "max-buffer-size"),
+    "max-compute-workgroups-per-dimension",
+)
 
 
 class WebGpuUnavailable(RuntimeError):
@@ -63,6 +66,32 @@ def device() -> Any:
         )
     except RuntimeError as error:
         raise WebGpuUnavailable(f"the graphics device {adapter.info['device']} cannot be used: {error}") from error
+
+
+def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int = 1) -> None:
+    """Sees that the device takes something of this size, before it is asked to.
+
+    Args:
+        array_bytes: of the largest buffer.
+        groups: largest number of groups of threads that are started at once.
+        size: width and height of a texture.
+        layers: of it.
+
+    Raises:
+        WebGpuUnavailable: it does not; says what is too large.
+    """
+    found = device().limits
+    wanted = {
+        "max-storage-buffer-binding-size": array_bytes,
+        "max-buffer-size": array_bytes,
+        "max-compute-workgroups-per-dimension": groups,
+        "max-texture-dimension-2d": max(size),
+        "max-texture-array-layers": layers,
+    }
+    for name, needed in wanted.items():
+        if needed > found[name]:
+            what = name.removeprefix("max-").replace("-", " ")
+            raise WebGpuUnavailable(f"the graphics device is too small: {what} is {found[name]}, {needed} are needed")
 
 
 def in_software() -> bool:

@@ -16,7 +16,7 @@ from ..baked_cuda import decoded
 from ..baked_scene import BakedScene
 from ..project import Camera
 from .arrays import arrays
-from .device import device, in_software, library
+from .device import check_room, device, in_software, library
 from .programs import Programs
 
 SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}
@@ -34,13 +34,6 @@ def programs() -> Programs:
     """Compiled for the device of this process."""
     found = device()
     return Programs(found, "rgba32float" if "float32-blendable" in found.features else "rgba16float")
-
-
-def check(made: Any, what: str) -> Any:
-    """`made`, unless the device refused it."""
-    if made is None:
-        raise RuntimeError(f"the graphics device has no room for {what}")
-    return made
 
 
 @dataclass
@@ -70,6 +63,7 @@ class SceneOnDevice:
         packed = arrays(scene)
         self._origin, self._kind = packed.origin, packed.kind
         self.count = len(packed.surfels)
+        check_room(max(packed.surfels.nbytes, packed.terms.nbytes), -(-self.count // 64), (1, 1))
         self._near, self._bound = scene.near, scene.weight_bound
         self._through_pixel = scene.through_pixel
         self._offset, self._scale = scene.offset, scene.scale
@@ -125,6 +119,7 @@ class SceneOnDevice:
         """An array texture of pages [layers, rows of blocks, blocks, ...]."""
         layers, rows, columns = pages.shape[:3]
         size = (columns * block, rows * block, layers)
+        check_room(0, 0, size[:2], layers)
         flags = library().TextureUsage
         texture = self._device.create_texture(
             size=size, format=format, usage=flags.TEXTURE_BINDING | flags.COPY_DST, dimension="2d"
@@ -221,6 +216,7 @@ class SceneOnDevice:
         if self._target is None or self._target.size != (width, height):
             flags, buffers, p = library().TextureUsage, library().BufferUsage, self._programs
             size, texel = (width, height, 1), 16 if p.format == "rgba32float" else 8
+            check_room(0, 0, (width, height))
             sums = self._device.create_texture(
                 size=size, format=p.format, usage=flags.RENDER_ATTACHMENT | flags.COPY_SRC
             )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
 from bitymi_ns.ops.bc7 import decode_bc7
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from bitymi_ns.ops.webgpu import on_device
+from bitymi_ns.ops.webgpu import device, on_device
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import camera_of, front, scene_of, textured
@@ -249,3 +250,23 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     scene.tiles[1, 0] = 10_000
     with pytest.raises(ValueError, match="surfel 1"):
         scene.render(front())
+
+
+@pytest.mark.parametrize(
+    "limit, most, said",
+    [
+        ("max-texture-array-layers", 1, "texture array layers is 1, 2 are needed"),
+        ("max-texture-dimension-2d", 100, "texture dimension 2d is 100, 1600 are needed"),
+        ("max-storage-buffer-binding-size", 500, "storage buffer binding size is 500, 19600 are needed"),
+        ("max-buffer-size", 500, "buffer size is 500, 19600 are needed"),
+        ("max-compute-workgroups-per-dimension", 1, "compute workgroups per dimension is 1, 2 are needed"),
+    ],
+)
+def test_what_the_device_does_not_take_is_said_before_it_is_asked_to(
+    limit: str, most: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = device.device()
+    lower = SimpleNamespace(limits={**found.limits, limit: most}, adapter=found.adapter)
+    monkeypatch.setattr(device, "device", lambda: lower)
+    with pytest.raises(webgpu.WebGpuUnavailable, match=said):
+        replace(textured(100, 0), through_webgpu=True).render(front(16, 16, 3.0))

@@ -11,7 +11,7 @@ export const TAIL = 1 << 14; // bytes from the end, in which the directory is lo
 const END = { signature: 0x06054b50, bytes: 22 };
 const CENTRAL = { signature: 0x02014b50, bytes: 46 };
 const LOCAL = { signature: 0x04034b50, bytes: 30 };
-const LONGEST = 1 << 24; // of a directory
+const LONGEST = 1 << 22; // of a directory
 const NAME = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
 
 const damaged = (what: string): DamagedBundle => new DamagedBundle(`The file is no bundle in one file: ${what}.`);
@@ -52,13 +52,15 @@ export function entriesOf(directory: Uint8Array<ArrayBuffer>, place: number, cou
     at += CENTRAL.bytes + lengths[0] + lengths[1] + lengths[2];
   }
   found.sort((a, b) => a[1] - b[1]);
-  return new Map(
+  const entries = new Map(
     found.map(([name, begin, size], k) => {
       const end = k + 1 < found.length ? found[k + 1][1] : place;
       if (begin + LOCAL.bytes + name.length + size > end) throw damaged(`${name} lies over what follows`);
       return [name, { begin, end, size }];
     }),
   );
+  if (entries.size !== found.length) throw damaged('two parts have one name');
+  return entries;
 }
 
 // A part, without its header.

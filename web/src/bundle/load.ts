@@ -11,16 +11,18 @@ export interface Bundle {
   pages: Pages | null;
   later: (() => Promise<Pages>) | null; // fetches the texels, where a first picture can be drawn without them
   cameras: string | null; // cameras.json
-  source: Source; // of photographs
+  // What an image shows of a photograph that the cameras name.
+  photograph(name: string): Promise<string>;
 }
+
+const MOST_BESIDE = 1 << 26; // bytes of a file that is neither surfels nor texels
 
 export type Progress = (done: number, total: number) => void;
 
 const hex = (bytes: ArrayBuffer): string =>
   [...new Uint8Array(bytes)].map((byte) => byte.toString(16).padStart(2, '0')).join('');
 
-export const loadManifest = async (source: Source): Promise<Manifest> =>
-  parseManifest(await source.text('bundle.json'));
+export const loadManifest = async (source: Source): Promise<Manifest> => parseManifest(await source.manifest());
 
 // A file that bundle.json lists, of the size and with the hash that stand there.
 export async function readPart(source: Source, info: Manifest, name: string, came: Came): Promise<ArrayBuffer> {
@@ -34,23 +36,42 @@ export async function readPart(source: Source, info: Manifest, name: string, cam
   return data;
 }
 
-export async function loadBundle(source: Source, info: Manifest, progress: Progress): Promise<Bundle> {
+// `admit` refuses a scene that is too large; nothing is decoded before.
+export async function loadBundle(
+  source: Source,
+  info: Manifest,
+  progress: Progress,
+  admit: (info: Manifest) => Promise<void>,
+): Promise<Bundle> {
   const first = info.compact ? ['surfels.bin'] : ['surfels.ply', ...(info.atlas ? ['atlas.ktx2'] : [])];
   const total = first.reduce((sum, name) => sum + (info.files.get(name)?.bytes ?? 0), 0);
   let done = 0;
   const load = (name: string): Promise<ArrayBuffer> =>
     readPart(source, info, name, (bytes) => progress((done += bytes), total));
+  const beside = (name: string): Promise<ArrayBuffer> => {
+    const size = info.files.get(name)?.bytes ?? 0;
+    if (size > MOST_BESIDE) throw new DamagedBundle(`${name} has ${size} bytes, at most ${MOST_BESIDE} are read.`);
+    return readPart(source, info, name, () => undefined);
+  };
   const views = async (): Promise<string | null> =>
-    info.files.has('cameras.json') ? source.text('cameras.json') : null;
-  const [cameras, table, atlas] = await Promise.all([views(), ...first.map(load)]);
+    info.files.has('cameras.json') ? new TextDecoder().decode(await beside('cameras.json')) : null;
+  const addresses = new Map<string, Promise<string>>();
+  const photograph = (name: string): Promise<string> => {
+    const made = async (): Promise<string> =>
+      URL.createObjectURL(new Blob([await beside(name)], { type: 'image/jpeg' }));
+    const found = addresses.get(name) ?? made();
+    addresses.set(name, found);
+    return found;
+  };
+  const [, cameras, table, atlas] = await Promise.all([admit(info), views(), ...first.map(load)]);
   if (!info.compact) {
     const pages = info.atlas ? await parseKtx2(atlas, info.atlas) : null;
-    return { info, surfels: readSurfels(table, info), pages, later: null, cameras, source };
+    return { info, surfels: readSurfels(table, info), pages, later: null, cameras, photograph };
   }
   const { Decoder } = await import('./compact/decoder');
   const decoder = new Decoder();
   const surfels = await decoder.surfels(table, info);
   if (!info.atlas) decoder.end();
   const texels = async (of: Atlas): Promise<Pages> => decoder.texels(await load('texels.bin'), of, surfels);
-  return { info, surfels, pages: null, later: info.atlas ? () => texels(info.atlas!) : null, cameras, source };
+  return { info, surfels, pages: null, later: info.atlas ? () => texels(info.atlas!) : null, cameras, photograph };
 }

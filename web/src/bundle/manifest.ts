@@ -22,6 +22,7 @@ export interface CodedTexels {
   pageWidth: number;
   pageRows: number;
   columns: Column[];
+  surfelBytes: number; // of surfels.bin
 }
 
 export interface Atlas {
@@ -115,8 +116,10 @@ class Reader {
     if (!found.every(good)) this.refuse(key, `whole numbers from ${low} to ${high}`);
     return found as number[];
   }
-  entries(): [string, Reader][] {
-    return Object.keys(this.value).map((key) => [key, this.part(key)]);
+  entries(most: number): [string, Reader][] {
+    const keys = Object.keys(this.value);
+    if (keys.length > most) throw new DamagedBundle(`bundle.json: ${this.path} has more than ${most} keys.`);
+    return keys.map((key) => [key, this.part(key)]);
   }
   text(key: string, pattern: RegExp): string {
     const found = this.value[key];
@@ -130,6 +133,7 @@ const MOST_COLUMNS = 64;
 const MOST_NUMBERS = 16; // of a column
 const MOST_BYTES = 7; // of a number: what a double holds exactly
 const MOST_POINTS = 4096;
+const MOST_FILES = 1 << 14;
 const RATES = [1e-12, 1e12]; // pixels per unit of length
 
 function columns(r: Reader): Column[] {
@@ -149,17 +153,18 @@ function compact(r: Reader): CompactSurfels {
   return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r) };
 }
 
-function coded(r: Reader): CodedTexels {
+function coded(r: Reader, surfelBytes: number): CodedTexels {
   return {
     texels: r.whole('texels', 0, 2 ** 50),
     step: r.number('step', 1e-6, 100),
     pageWidth: r.whole('page_width', 1, SIDE),
     pageRows: r.whole('page_rows', 1, SIDE),
     columns: columns(r),
+    surfelBytes,
   };
 }
 
-function atlas(r: Reader, isCompact: boolean): Atlas {
+function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
   const format = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
   return {
     format,
@@ -169,7 +174,7 @@ function atlas(r: Reader, isCompact: boolean): Atlas {
     extent: r.has('extent') ? r.number('extent', 1e-6, 16) : 3,
     offset: r.number('offset', -256, 256),
     scale: r.number('scale', 0, 512),
-    coded: isCompact ? coded(r) : null,
+    coded: isCompact ? coded(r, surfelBytes) : null,
   };
 }
 
@@ -215,7 +220,12 @@ export function parseManifest(text: string): Manifest {
   const render = root.part('render');
   const bounds = root.part('bounds');
   const world = root.has('world') ? root.part('world') : null;
-  const files = root.part('files').entries();
+  const files = new Map(
+    root
+      .part('files')
+      .entries(MOST_FILES)
+      .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
+  );
   const isCompact = version.startsWith('3.');
   return {
     version,
@@ -223,7 +233,7 @@ export function parseManifest(text: string): Manifest {
     viewColor: surfels.choice('view_color', ['sv', 'sh', 'sb', 'sg']),
     terms: surfels.has('terms') || isCompact ? surfels.whole('terms', 0, 2 ** 31) : null,
     compact: isCompact ? compact(surfels) : null,
-    atlas: root.has('atlas') ? atlas(root.part('atlas'), isCompact) : null,
+    atlas: root.has('atlas') ? atlas(root.part('atlas'), isCompact, files.get('surfels.bin')?.bytes ?? 0) : null,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),
     throughPixel: render.has('prefilter') && render.choice('prefilter', ['low_pass', 'pixel']) === 'pixel',
@@ -231,11 +241,6 @@ export function parseManifest(text: string): Manifest {
     background: render.point('background', 1),
     bounds: { min: bounds.point('min', 1e9), max: bounds.point('max', 1e9) },
     up: world?.has('up') ? world.point('up', 2) : null,
-    files: new Map(
-      files.map(([name, r]) => [
-        name,
-        { bytes: r.whole('bytes', 0, 2 ** 50), sha256: r.text('sha256', /^[0-9a-f]{64}$/) },
-      ]),
-    ),
+    files,
   };
 }

@@ -10,6 +10,8 @@ export interface Element {
 
 const HEADER_LIMIT = 1 << 16;
 
+const isType = (word: string): word is 'float' | 'int' => word === 'float' || word === 'int';
+
 export function parsePly(data: ArrayBuffer): Map<string, Element> {
   const head = new TextDecoder('latin1').decode(new Uint8Array(data, 0, Math.min(data.byteLength, HEADER_LIMIT)));
   const end = head.indexOf('end_header\n');
@@ -21,10 +23,10 @@ export function parsePly(data: ArrayBuffer): Map<string, Element> {
   let last: Element | null = null;
   for (const line of lines.slice(2)) {
     const words = line.split(' ');
-    if (words[0] === 'element' && words.length === 3) {
+    if (words[0] === 'element' && words.length === 3 && /^\d{1,10}$/.test(words[2]) && !elements.has(words[1])) {
       last = { count: Number(words[2]), stride: 0, start: 0, columns: new Map() };
       elements.set(words[1], last);
-    } else if (words[0] === 'property' && last && (words[1] === 'float' || words[1] === 'int')) {
+    } else if (words[0] === 'property' && last && isType(words[1]) && !last.columns.has(words[2])) {
       last.columns.set(words[2], { at: last.stride, type: words[1] });
       last.stride += 4;
     } else if (words[0] !== 'comment' && line !== '') {

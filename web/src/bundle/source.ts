@@ -3,13 +3,15 @@ import { DamagedBundle, ViewerError } from '../errors';
 import { type Entry, TAIL, entriesOf, partOf, placeOf } from './archive';
 
 export type Came = (bytes: number) => void;
+const nothing: Came = () => undefined;
+const MANIFEST = 'bundle.json';
+const MOST_MANIFEST = 1 << 22; // bytes
 
 export interface Source {
   // A file of so many bytes.
   read(name: string, size: number, came: Came): Promise<ArrayBuffer>;
-  text(name: string): Promise<string>;
-  // What an image shows.
-  address(name: string): Promise<string>;
+  // bundle.json, whose size is stated nowhere.
+  manifest(): Promise<string>;
 }
 
 async function get(url: string, range?: string): Promise<Response> {
@@ -24,7 +26,7 @@ async function get(url: string, range?: string): Promise<Response> {
     if (name === 'bundle.json' || name.endsWith('.bitymi')) {
       throw new ViewerError('There is no bundle', `${url} is not there.`, 'Export the scene again with bitymi view.');
     }
-    throw new DamagedBundle(`${name} is missing.`);
+    throw new DamagedBundle(`${name} is missing, or is not what bundle.json says.`);
   }
   return response;
 }
@@ -37,7 +39,7 @@ async function bytesOf(response: Response, name: string, most: number, came: Cam
   while (body) {
     const { done, value } = await body.read();
     if (done) break;
-    if (at + value.length > most) throw new DamagedBundle(`${name} is longer than the ${most} bytes that are stated.`);
+    if (at + value.length > most) throw new DamagedBundle(`${name} has more than ${most} bytes.`);
     parts.push(value);
     at += value.length;
     came(value.length);
@@ -60,21 +62,14 @@ export class Folder implements Source {
     return data.buffer;
   }
 
-  async text(name: string): Promise<string> {
-    return (await get(this.url + name)).text();
-  }
-
-  address(name: string): Promise<string> {
-    return Promise.resolve(this.url + name);
+  async manifest(): Promise<string> {
+    return new TextDecoder().decode(await bytesOf(await get(this.url + MANIFEST), MANIFEST, MOST_MANIFEST, nothing));
   }
 }
 
 const LARGEST = 2 ** 32; // of a file without the extension for larger ones
-const nothing: Came = () => undefined;
 
 export class SingleFile implements Source {
-  private readonly addresses = new Map<string, Promise<string>>();
-
   private constructor(
     private readonly url: string,
     private readonly entries: Map<string, Entry>,
@@ -122,15 +117,10 @@ export class SingleFile implements Source {
     return partOf(await bytesOf(response, name, end - begin, came), name, size);
   }
 
-  async text(name: string): Promise<string> {
-    return new TextDecoder().decode(await this.read(name, this.entry(name).size, nothing));
-  }
-
-  address(name: string): Promise<string> {
-    const made = async (): Promise<string> =>
-      URL.createObjectURL(new Blob([await this.read(name, this.entry(name).size, nothing)], { type: 'image/jpeg' }));
-    const found = this.addresses.get(name) ?? made();
-    this.addresses.set(name, found);
-    return found;
+  async manifest(): Promise<string> {
+    const { size } = this.entry(MANIFEST);
+    if (size > MOST_MANIFEST)
+      throw new DamagedBundle(`${MANIFEST} has ${size} bytes, at most ${MOST_MANIFEST} are read.`);
+    return new TextDecoder().decode(await this.read(MANIFEST, size, nothing));
   }
 }

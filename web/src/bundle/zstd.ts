@@ -79,8 +79,8 @@ function checkCompressed(data: Uint8Array, begin: number, size: number): void {
   if (literals + SHORTEST_MATCH * sequences > MOST_IN_BLOCK) throw new Error('a block holds too much');
 }
 
-// The number of bytes that a frame declares; null where it declares none. Throws where its blocks do not fill it.
-function declared(frame: Uint8Array): number | null {
+// The number of bytes that a frame declares. Throws where it declares none, or its blocks do not fill it.
+function declared(frame: Uint8Array): number {
   const bytes = new Bytes(frame, 0, frame.length);
   if (bytes.number(4) !== MAGIC) throw new Error('it is no frame');
   const flags = bytes.number(1);
@@ -88,7 +88,8 @@ function declared(frame: Uint8Array): number | null {
   if (flags & 0b1011) throw new Error('it needs what is not there'); // reserved, dictionary
   if (!single) bytes.skip(1);
   const width = [single, 2, 4, 8][flags >> 6];
-  const size = width ? bytes.number(width) + (width === 2 ? 256 : 0) : null;
+  if (!width) throw new Error('it does not declare its size');
+  const size = bytes.number(width) + (width === 2 ? 256 : 0);
   for (let last = 0; !last;) {
     const head = bytes.number(3);
     last = head & 1;
@@ -106,8 +107,12 @@ function declared(frame: Uint8Array): number | null {
 export function frameBytes(frame: Uint8Array, size: number, name: string): Uint8Array {
   try {
     const found = declared(frame);
-    if (found !== null && found !== size) throw new Error(`it declares ${found} bytes, ${size} are wanted`);
-    return decompress(frame, new Uint8Array(size));
+    if (found !== size) throw new Error(`it declares ${found} bytes, ${size} are wanted`);
+    if (size === 0) return new Uint8Array();
+    // fzstd makes the memory itself: one that it is handed it compares with a number, by way of a text of all of it
+    const data = decompress(frame);
+    if (data.length !== size) throw new Error(`it holds ${data.length} bytes, ${size} are wanted`);
+    return data;
   } catch (error) {
     const why = error instanceof Error ? error.message : String(error);
     throw new DamagedBundle(`${name}: a Zstandard frame is damaged: ${why}.`);

@@ -1,5 +1,5 @@
 // The graphics device.
-import { ViewerError } from '../errors';
+import { ViewerError, tooLarge } from '../errors';
 
 const NEEDS =
   'Chrome and Edge from 113, Safari from 26 and Firefox from 141 have it. Update the browser and the graphics driver, ' +
@@ -20,11 +20,15 @@ export async function openDevice(): Promise<Graphics> {
   if (!adapter) throw new ViewerError('No graphics device', 'WebGPU finds nothing here that could draw.', NEEDS);
   const wanted = ['texture-compression-bc', 'float32-blendable', 'float32-filterable'] as GPUFeatureName[];
   const features = wanted.filter((name) => adapter.features.has(name));
-  const { maxTextureDimension2D, maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
+  const { maxTextureDimension2D, maxTextureArrayLayers, maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
+  const { maxComputeWorkgroupsPerDimension } = adapter.limits;
   const { architecture, device: deviceName, description, vendor } = adapter.info;
   const device = await adapter.requestDevice({
     requiredFeatures: features,
-    requiredLimits: { maxTextureDimension2D, maxStorageBufferBindingSize, maxBufferSize },
+    requiredLimits: {
+      ...{ maxTextureDimension2D, maxTextureArrayLayers, maxStorageBufferBindingSize, maxBufferSize },
+      maxComputeWorkgroupsPerDimension,
+    },
   });
   return {
     device,
@@ -34,4 +38,18 @@ export async function openDevice(): Promise<Graphics> {
     software:
       adapter.info.isFallbackAdapter || /swiftshader|llvmpipe/i.test(`${architecture} ${deviceName} ${description}`),
   };
+}
+
+const DRIVER = 'Reload the page. If it happens again, update the browser and the graphics driver.';
+
+// Has `stop` told what the device says of itself: that it refuses something, has no memory left, or is lost.
+export function watch(device: GPUDevice, stop: (error: unknown) => void): void {
+  device.addEventListener('uncapturederror', ({ error }) => {
+    if (error instanceof GPUOutOfMemoryError) stop(tooLarge('The graphics device has not enough memory for it.'));
+    else stop(new ViewerError('The graphics device reports an error', error.message, DRIVER));
+  });
+  void device.lost.then(({ reason, message }) => {
+    if (reason === 'destroyed') return;
+    stop(new ViewerError('The graphics device was lost', message || 'The browser does not say why.', DRIVER));
+  });
 }

@@ -44,6 +44,11 @@ export class Renderer {
     this.smooth = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
   }
 
+  // Pixels of a side of a picture, at most.
+  get largestSide(): number {
+    return this.graphics.device.limits.maxTextureDimension2D;
+  }
+
   private targetOf(width: number, height: number, samples: number, format: TargetFormat): Target {
     const t = this.target;
     if (t && t.samples === samples && t.width === width && t.height === height && t.format === format) return t;
@@ -68,8 +73,9 @@ export class Renderer {
   private samplingOf(view: View, width: number, height: number, look: Look): Sampling {
     const { photographed } = this.scene.info;
     if (!photographed?.length) return { samples: 1, photoPixel: 1 };
-    const side = this.graphics.device.limits.maxTextureDimension2D;
-    const most = look.fine ? Math.max(1, Math.min(MOST_SAMPLES, Math.floor(side / Math.max(width, height)))) : 1;
+    const most = look.fine
+      ? Math.max(1, Math.min(MOST_SAMPLES, Math.floor(this.largestSide / Math.max(width, height))))
+      : 1;
     return samplingOf(sizeOf(photographed, view), width * height, most, MOST_PIXELS);
   }
 

@@ -3,7 +3,7 @@ import { decodeBc7 } from '../bundle/bc7';
 import { type Pages, blockOf } from '../bundle/ktx2';
 import type { Manifest } from '../bundle/manifest';
 import type { Surfels } from '../bundle/surfels';
-import { ViewerError } from '../errors';
+import { tooLarge } from '../errors';
 import type { Graphics } from './device';
 import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
 
@@ -53,7 +53,6 @@ export class SceneOnDevice {
     this.device = device;
     this.count = surfels.count;
     this.blocks = Math.ceil(Math.max(1, this.count) / BLOCK);
-    this.checkRoom();
     const { STORAGE, UNIFORM, COPY_DST, INDIRECT } = GPUBufferUsage;
     const n = Math.max(1, this.count);
     const stored = this.upload(surfels.words, STORAGE);
@@ -150,20 +149,11 @@ export class SceneOnDevice {
     this.pages = this.boundPages();
   }
 
-  private checkRoom(): void {
-    const { maxStorageBufferBindingSize, maxTextureDimension2D } = this.device.limits;
-    const needed = Math.max(96 * this.count, this.surfels.terms.byteLength);
-    const side = Math.max(this.info.atlas?.width ?? 0, this.info.atlas?.height ?? 0);
-    if (needed > maxStorageBufferBindingSize || side > maxTextureDimension2D) {
-      throw new ViewerError(
-        'This scene is too large for this device',
-        `It has ${this.count.toLocaleString('en')} surfels and an atlas of up to ${side} texels a side.`,
-        'Open it on a device with more graphics memory.',
-      );
-    }
-  }
-
   private empty(size: number, usage: number): GPUBuffer {
+    const { maxBufferSize, maxStorageBufferBindingSize } = this.device.limits;
+    if (size > maxBufferSize || (usage & GPUBufferUsage.STORAGE && size > maxStorageBufferBindingSize)) {
+      throw tooLarge(`It needs ${(size / 1e6).toFixed(0)} MB of graphics memory in one piece.`);
+    }
     return this.device.createBuffer({ size, usage });
   }
   private upload(data: Float32Array | Uint32Array, usage: number): GPUBuffer {

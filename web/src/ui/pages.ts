@@ -1,22 +1,25 @@
 // What stands in the place of the scene: progress, or why there is none.
-import { ViewerError } from '../errors';
+import { reasonOf } from '../errors';
 import { element } from './dom';
 import { endPoster } from './poster';
 
 const megabytes = (bytes: number): string => (bytes / 1e6).toFixed(1);
 
 export function showProgress(done: number, total: number): void {
-  if (document.documentElement.dataset.state === 'error') return;
+  if (stopped()) return;
   element<HTMLProgressElement>('page-progress').value = total ? done / total : 0;
   element('page-text').textContent = `${megabytes(done)} of ${megabytes(total)} MB`;
 }
 
+export const stopped = (): boolean => document.documentElement.dataset.state === 'error';
+
+// The first error is the one that is shown: those that follow mostly follow from it.
 export function showError(error: unknown): void {
-  const known = error instanceof ViewerError;
-  const message = error instanceof Error ? error.message : String(error);
-  element('page-title').textContent = known ? error.title : 'The viewer stopped';
+  if (stopped()) return;
+  const { title, message, advice } = reasonOf(error);
+  element('page-title').textContent = title;
   element('page-text').textContent = message;
-  element('page-advice').textContent = known ? error.advice : 'Reload the page to try again.';
+  element('page-advice').textContent = advice;
   element('page-progress').hidden = true;
   for (const id of ['top', 'panel', 'menu']) element(id).hidden = true;
   element('page').hidden = false;
@@ -25,6 +28,7 @@ export function showError(error: unknown): void {
 }
 
 export function showScene(): void {
+  if (stopped()) return;
   element('page').hidden = true;
   for (const id of ['top', 'panel', 'menu']) element(id).hidden = false;
   document.documentElement.dataset.state = 'ready';

@@ -15,7 +15,7 @@ export async function showPoster(poster: Blob | null): Promise<void> {
   URL.revokeObjectURL(address);
   if (ended) return;
   image.hidden = false;
-  document.documentElement.dataset.state ??= 'poster';
+  if (document.documentElement.dataset.state === 'loading') document.documentElement.dataset.state = 'poster';
 }
 
 // There is a picture of the surfels, or there will be none.

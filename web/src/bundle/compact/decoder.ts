@@ -23,7 +23,7 @@ export class Decoder {
       };
       this.worker.onerror = (event) => {
         clearTimeout(end);
-        reject(new Error(`The decoder stopped: ${event.message}`));
+        reject(new Error(`The decoder stopped: ${event.message || 'its script cannot be loaded'}`));
       };
       this.worker.postMessage(job, [data]);
     });

@@ -5,7 +5,7 @@ import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD, centred, originOf 
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
-export const SURFELS_PER_BYTE = 256; // a file that is said to hold more is refused, and so many beside
+export const SURFELS_PER_BYTE = 1; // a file that is said to hold more is refused, and so many beside
 export const SPARE_SURFELS = 1 << 12;
 const PLACE_BITS = 17;
 const SHARE = 1 / 1024; // of their ranges: what opacities and betas keep from their ends

@@ -5,7 +5,7 @@ import type { Atlas, CodedTexels } from '../manifest';
 import { SURFEL_WORDS, type Surfels, WORD } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 
-export const TEXELS_PER_BYTE = 4096; // a file that is said to hold more is refused, and so many beside
+export const TEXELS_PER_BYTE = 64; // of both files; what is said to hold more is refused, and so many beside
 export const SPARE_TEXELS = 1 << 20;
 const MOST_TEXELS = 2 ** 30; // of all pages: four gigabytes
 const BLOCK = 8;
@@ -139,7 +139,8 @@ class Painter {
 
 function check(data: Uint8Array, atlas: Atlas, coded: CodedTexels, found: number): void {
   const texels = atlas.width * atlas.height * atlas.layers;
-  if (Math.max(coded.texels, texels) > TEXELS_PER_BYTE * data.length + SPARE_TEXELS || texels > MOST_TEXELS) {
+  const most = TEXELS_PER_BYTE * (data.length + coded.surfelBytes) + SPARE_TEXELS;
+  if (Math.max(coded.texels, texels) > most || texels > MOST_TEXELS) {
     throw new DamagedBundle(`${FILE}: ${texels} texels cannot be in ${data.length} bytes.`);
   }
   if (found !== coded.texels) {

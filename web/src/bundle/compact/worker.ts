@@ -1,5 +1,5 @@
 // Decodes what decoder.ts asks for.
-import { ViewerError } from '../../errors';
+import { reasonOf } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, Manifest } from '../manifest';
 import type { Surfels } from '../surfels';
@@ -25,15 +25,6 @@ function run(job: Job): void {
     const pages = readCompactTexels(data, job.atlas, job.surfels);
     answer(pages, pages.layers);
   }
-}
-
-function reasonOf(error: unknown): ViewerError {
-  if (error instanceof ViewerError) return error;
-  if (error instanceof RangeError) {
-    const room = 'There is not enough memory for it.';
-    return new ViewerError('This scene is too large for this device', room, 'Open it on a device with more memory.');
-  }
-  return new ViewerError('The viewer stopped', String(error), 'Reload the page to try again.');
 }
 
 addEventListener('message', ({ data: job }: MessageEvent<Job>) => {

@@ -1,0 +1,207 @@
+"""The files of a bundle, a folder or one file: the one way to open them, and those that the format names."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import struct
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, BinaryIO
+
+from bitymi_ns.bundle.manifest import (
+    ATLAS,
+    COMPACT_SURFELS,
+    MANIFEST,
+    POSTER,
+    SURFELS,
+    TEXELS,
+    BundleError,
+    Manifest,
+    dump,
+)
+
+MANIFEST_LIMIT = 4 << 20
+"""Bytes that a bundle.json may have."""
+DIRECTORY_LIMIT = 4 << 20
+"""Bytes that the directory of a bundle in one file may have."""
+CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
+_PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
+# The last records of a ZIP: where that of large files is, that of large files itself, and the end.
+_LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQQ"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
+
+
+class MissingPart(BundleError):
+    """A bundle has no file of a name."""
+
+
+def is_known(name: str) -> bool:
+    """Whether the format gives a file this name. Others may lie in a bundle; they are not passed on to anybody."""
+    known = (MANIFEST, SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, CAMERAS, *PREVIEWS)
+    return name in known or _PHOTOGRAPH.fullmatch(name) is not None
+
+
+def left_out(info: Manifest) -> list[str]:
+    """The files that a bundle lists and that are not passed on with it."""
+    return [name for name in info.files if not is_known(name)]
+
+
+def passed_on(info: Manifest, data: bytes) -> bytes:
+    """The bundle.json that is passed on: `data`, if all files that it lists are; else one that lists those alone."""
+    if not left_out(info):
+        return data
+    return dump(info.model_copy(update={"files": {name: e for name, e in info.files.items() if is_known(name)}}))
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a file for reading. A pipe or a device is refused before it is opened, also where a link leads to it.
+
+    Raises:
+        BundleError: there is no such file, it is something else, or the system refuses it.
+    """
+    try:
+        regular = stat.S_ISREG(os.stat(path).st_mode)
+        if regular:
+            # should it have become a pipe by now, opening it does not wait for its other end
+            file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+            regular = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise MissingPart(f"{path} is missing") from error
+    except OSError as error:
+        raise BundleError(f"{path} cannot be read: {error.strerror}") from error
+    if not regular:
+        raise BundleError(f"{path} is not a regular file")
+    return file
+
+
+class Parts:
+    """The files of a bundle, by name."""
+
+    def __init__(self, bundle: Path, archive: zipfile.ZipFile | None, size: int, inside: bool) -> None:
+        """See `parts_of`.
+
+        Args:
+            bundle: the folder or the file, also for messages.
+            archive: None for a folder.
+            size: bytes of the one file.
+            inside: refuse links that lead out of the folder.
+        """
+        self.bundle, self._archive, self._size, self._inside = bundle, archive, size, inside
+
+    @contextmanager
+    def opened(self, name: str) -> Iterator[tuple[IO[bytes], int]]:
+        """A file, and how many bytes it has; nothing has been read of it.
+
+        Raises:
+            BundleError: there is no such file, or it is none that can be read.
+        """
+        path = self.bundle / name
+        if self._archive is None:
+            with open_regular(path) as file:
+                if self._inside and os.path.dirname(os.path.realpath(path)) != os.path.realpath(self.bundle):
+                    raise BundleError(f"{path} is a link that leads out of the bundle")
+                try:
+                    yield file, os.fstat(file.fileno()).st_size
+                except OSError as error:
+                    raise BundleError(f"{path} cannot be read: {error.strerror}") from error
+            return
+        entry = self._entry(name)
+        try:
+            part = self._archive.open(entry)
+        except (*_DAMAGE, ValueError) as error:
+            raise BundleError(f"{path} cannot be read: {error}") from error
+        with part:
+            try:
+                yield part, entry.file_size
+            except _DAMAGE as error:
+                raise BundleError(f"{path} cannot be read: {error}") from error
+
+    def _entry(self, name: str) -> zipfile.ZipInfo:
+        assert self._archive is not None
+        try:
+            entry = self._archive.getinfo(name)
+        except KeyError as error:
+            raise MissingPart(f"{self.bundle} has no {name}") from error
+        encrypted = entry.flag_bits & 1
+        if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size or encrypted:
+            raise BundleError(f"{self.bundle}: {name} is not stored as it is")
+        if not 0 <= entry.header_offset <= self._size - entry.file_size:
+            raise BundleError(f"{self.bundle} is truncated: {name} does not lie in it")
+        return entry
+
+    def read(self, name: str, most: int) -> bytes:
+        """All bytes of a file that may have at most so many, which is seen before it is read.
+
+        Raises:
+            BundleError: there is no such file, it is larger, or it cannot be read.
+        """
+        with self.opened(name) as (file, size):
+            if size > most:
+                raise BundleError(f"{self.bundle / name} has {size} bytes, at most {most} are read")
+            return file.read(size)
+
+
+_DAMAGE = (zipfile.BadZipFile, OSError, EOFError, RuntimeError, struct.error)
+"""What `zipfile` says of a file that is not one, or is damaged."""
+
+
+@contextmanager
+def parts_of(bundle: str | Path | BinaryIO, source: str | Path | None = None, inside: bool = False) -> Iterator[Parts]:
+    """The files of a bundle.
+
+    Args:
+        bundle: its folder or its one file; or that file, open and seekable.
+        source: for messages.
+        inside: refuse links that lead out of the folder, because what is read is passed on.
+
+    Raises:
+        BundleError: the one file is damaged.
+    """
+    if isinstance(bundle, (str, Path)):
+        path = Path(bundle)
+        if not os.path.isfile(path):
+            yield Parts(path, None, 0, inside)
+            return
+        with open_regular(path) as file, parts_of(file, path, inside) as parts:
+            yield parts
+        return
+    where = Path(source or "the bundle")
+    try:
+        size = _check_directory(bundle)
+        archive = zipfile.ZipFile(bundle)
+    except (*_DAMAGE, ValueError) as error:
+        raise BundleError(f"{where} is not a bundle in one file: {error}") from error
+    with archive:
+        if len(archive.NameToInfo) != len(archive.filelist):
+            raise BundleError(f"{where} is not a bundle in one file: two parts have one name")
+        yield Parts(where, archive, size, inside)
+
+
+def _check_directory(file: BinaryIO) -> int:
+    """Refuses a file whose directory is larger than it may be, which takes `zipfile` long to read, or that begins with
+    something else, which may then be of another type, too; its size.
+
+    Raises:
+        ValueError: says why.
+    """
+    size = file.seek(0, os.SEEK_END)
+    records = _LARGE.size + _LARGE_AT.size + _END.size
+    file.seek(max(0, size - records))
+    tail = file.read(records).rjust(records, b"\0")
+    end, length, begin, comment = _END.unpack(tail[-_END.size :])
+    if end != b"PK\5\6" or comment:
+        raise ValueError("it is truncated, or something else")
+    there, at = _LARGE_AT.unpack(tail[_LARGE.size : -_END.size])
+    behind = _END.size
+    if there == b"PK\6\7":
+        large, length, begin = _LARGE.unpack(tail[: _LARGE.size])
+        behind = records if large == b"PK\6\6" and at == size - records else 0
+    if length > DIRECTORY_LIMIT:
+        raise ValueError(f"its directory has {length} bytes, at most {DIRECTORY_LIMIT} are read")
+    if begin + length != size - behind:
+        raise ValueError("its directory is not where it is said to be")
+    file.seek(0)
+    return size

@@ -1,0 +1,107 @@
+"""What the size of a bundle's files has to fit before they are read: their headers, bundle.json, and the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+
+from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, Manifest
+from bitymi_ns.bundle.surfel_table import TERMS
+from bitymi_ns.files import size_text
+
+HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
+"""Bytes from the start of a file that `check_head` looks at."""
+_SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
+"""Of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million texels 67
+with their pages."""
+_CONTROL_GROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
+    """Refuses a file of surfels or texels whose beginning contradicts its size or bundle.json; any other is let pass.
+
+    Raises:
+        PlyError, Ktx2Error, StreamError: say why.
+    """
+    if name in _CHECKS:
+        _CHECKS[name](info, head, size)
+
+
+def _check_surfels_header(info: Manifest, head: bytes, size: int) -> None:
+    elements = ply.read_header(head, size).elements
+    count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
+    if count != info.surfels.count:
+        raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {info.surfels.count}")
+    if terms != info.surfels.terms:
+        raise ply.PlyError(f"it has {terms} view-colour terms, surfels.terms of {MANIFEST} says {info.surfels.terms}")
+
+
+def _check_atlas_header(info: Manifest, head: bytes, size: int) -> None:
+    header, stated = ktx2.read_header(head, size), info.atlas
+    found = (header.format, header.width, header.height, header.layers)
+    if stated is None or found != (stated.format, stated.width, stated.height, stated.layers):
+        raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
+
+
+def _check_compact_size(info: Manifest, head: bytes, size: int) -> None:
+    compact.check_surfels_size(info.surfels, size)
+
+
+def _check_texels_size(info: Manifest, head: bytes, size: int) -> None:
+    if info.atlas is not None:
+        compact.check_texels_size(info.atlas, size, info.files[COMPACT_SURFELS].bytes)
+
+
+_CHECKS: dict[str, Callable[[Manifest, bytes, int], None]] = {
+    SURFELS: _check_surfels_header,
+    ATLAS: _check_atlas_header,
+    COMPACT_SURFELS: _check_compact_size,
+    TEXELS: _check_texels_size,
+}
+SCENE_FILES = frozenset(_CHECKS)
+"""The files of which a scene is made."""
+
+
+@contextmanager
+def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
+    """Reports a lack of memory for a bundle's contents as a BundleError with the size of the files."""
+    try:
+        yield
+    except MemoryError as error:
+        size = sum(entry.bytes for name, entry in info.files.items() if name in SCENE_FILES)
+        raise BundleError(f"{bundle} needs more memory than there is: its files have {size / 1e6:.0f} MB") from error
+
+
+def check_memory(bundle: Path, info: Manifest, name: str) -> None:
+    """Refuses a file of surfels or texels whose contents cannot be held on this machine, before they are read.
+
+    Raises:
+        BundleError: says what they take at least.
+    """
+    least, there = least_memory(info, name), machine_memory()
+    if least > there:
+        needs = f"{bundle / name} needs more memory than there is: its contents take at least {size_text(least)}"
+        raise BundleError(f"{needs}, this machine has {size_text(there)}")
+
+
+def least_memory(info: Manifest, name: str) -> int:
+    """Bytes that reading such a file takes at least: itself, what it is decoded to on the way, pages."""
+    surfels, atlas, total = info.surfels, info.atlas, info.files[name].bytes
+    if name == COMPACT_SURFELS:
+        total += _SURFEL_BYTES * surfels.count + _TERM_BYTES * (surfels.terms or 0)
+    elif name in (ATLAS, TEXELS) and atlas is not None:
+        total += 4 * atlas.width * atlas.height * atlas.layers + _TEXEL_BYTES * (atlas.texels or 0)
+    return total
+
+
+def machine_memory() -> int:
+    """Bytes of memory that this machine has, or that its control group may use."""
+    found = [psutil.virtual_memory().total]
+    for path in _CONTROL_GROUPS:
+        with suppress(OSError, ValueError):  # there is none, or it has no limit
+            found.append(int(Path(path).read_text()))
+    return min(found)

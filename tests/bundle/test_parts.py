@@ -1,0 +1,201 @@
+"""How the files of a bundle are opened: whatever stands in their place, nothing is read before it is known to fit."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns.bundle import BundleError, check_files, read_bundle
+from bitymi_ns.bundle.parts import is_known, parts_of
+from bitymi_ns.bundle.single import read_single, write_single
+from bitymi_ns.cli import main
+from tests.bundle.compact_scene import make_codes, write_compact
+from tests.bundle.damage import amend
+from tests.bundle.test_read import peak
+
+PREVIEW = bytes(3000)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_compact(tmp_path / "b", make_codes(count=40), extra_files={"preview.jpg": PREVIEW})
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def sparse(path: Path) -> None:
+    with open(path, "wb") as file:
+        os.truncate(file.fileno(), 1 << 36)
+
+
+def link(target: str) -> Callable[[Path], None]:
+    return lambda path: path.symlink_to(target)
+
+
+def linked_pipe(path: Path) -> None:
+    pipe(path.parent.parent / "pipe")
+    path.symlink_to(path.parent.parent / "pipe")
+
+
+PLACED = {
+    **{"zero": link("/dev/zero"), "pipe": pipe, "linked pipe": linked_pipe, "sparse": sparse, "folder": Path.mkdir},
+    **{"loop": lambda path: path.symlink_to(path), "nothing": link("/nowhere"), "terminal": link("/dev/tty")},
+}
+
+
+@pytest.mark.parametrize("name", ["bundle.json", "surfels.bin", "texels.bin", "preview.jpg"])
+@pytest.mark.parametrize("what", PLACED)
+def test_what_is_no_regular_file_of_the_stated_size_is_refused_by_all_that_read_bundles(
+    what: str, name: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / name).unlink()
+    PLACED[what](folder / name)
+    out, begin = str(folder.parent / "out"), time.perf_counter()
+
+    def refused() -> None:
+        with pytest.raises(BundleError, match=f"{name}"):
+            read_bundle(folder)
+        assert not all(check.ok for check in check_files(folder)[1])
+        commands = [["pack", str(folder), "--output", out], ["view", str(folder), "--export", out]]
+        commands += [["view", str(folder), "--export", out, "--one-file"], ["verify", str(folder)]]
+        for command in commands:
+            assert main(command) == 1
+            shown = "".join(capsys.readouterr())
+            assert "Traceback" not in shown and name in shown
+
+    assert peak(refused) < 16 << 20 and time.perf_counter() - begin < 5
+    assert not os.path.lexists(out)
+
+
+@pytest.mark.parametrize("what", ["zero", "pipe", "linked pipe", "folder", "loop", "nothing"])
+def test_neither_is_a_bundle_in_one_file_anything_but_a_regular_file(what: str, tmp_path: Path) -> None:
+    path = tmp_path / "x" / "b.bitymi"
+    path.parent.mkdir()
+    PLACED[what](path)
+    with pytest.raises(BundleError):
+        read_bundle(path)
+    for command in ("verify", "pack", "view"):
+        assert main([command, str(path)]) == 1
+
+
+def test_a_link_to_a_file_as_it_is_stated_is_read_and_not_passed_on(folder: Path) -> None:
+    """Stores of large files keep links in the place of files."""
+    (folder / "surfels.bin").rename(folder.parent / "blob")
+    (folder / "surfels.bin").symlink_to("../blob")
+    assert len(read_bundle(folder)) == 40
+    with pytest.raises(BundleError, match="leads out of the bundle"):
+        write_single(folder, folder.parent / "b.bitymi")
+
+
+def test_a_large_file_beside_the_scene_is_not_taken_into_memory(folder: Path, tmp_path: Path) -> None:
+    os.truncate(folder / "preview.jpg", 80 << 20)
+    amend(folder)
+
+    def read() -> None:
+        assert len(read_bundle(folder)) == 40
+        with pytest.raises(BundleError, match="at most 67108864 are read"):
+            write_single(folder, tmp_path / "b.bitymi")
+
+    assert peak(read) < 20 << 20
+
+
+def entries(path: Path, count: int, large: bool = False) -> None:
+    """A ZIP whose directory lists so many parts of no bytes."""
+    one = struct.pack("<4s6H3L5H2L", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0)
+    directory = b"".join(one + b"%05x" % (k % 16**5) for k in range(count))
+    end = (b"PK\5\6", 0, 0, min(count, 0xFFFF), min(count, 0xFFFF), len(directory), 0, 0)
+    more = b""
+    if large:
+        more = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, count, count, len(directory), 0)
+        more += struct.pack("<4sLQL", b"PK\6\7", 0, len(directory), 1)
+        end = (*end[:5], 50, 0, 0)
+    path.write_bytes(directory + more + struct.pack("<4s4H2LH", *end))
+
+
+@pytest.mark.parametrize("large", [False, True], ids=["small records", "records of large files"])
+def test_a_directory_of_many_entries_is_refused_before_it_is_read(large: bool, tmp_path: Path) -> None:
+    path, begin = tmp_path / "b.bitymi", time.perf_counter()
+    entries(path, 300_000, large)
+    with pytest.raises(BundleError, match="its directory has 15300000 bytes"):
+        begin = time.perf_counter()
+        read_bundle(path)
+    assert time.perf_counter() - begin < 0.5
+
+
+def test_a_directory_that_lies_elsewhere_than_it_says_is_refused(folder: Path, tmp_path: Path) -> None:
+    write_single(folder, tmp_path / "b.bitymi")
+    data = (tmp_path / "b.bitymi").read_bytes()
+    moved = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 1, 1, 10, 0)
+    moved += struct.pack("<4sLQL", b"PK\6\7", 0, 5, 1)
+    # something behind it, a comment, other records, and something before it: a page, another such file
+    more = (data + b"x", data[:-1] + b"\1", data[:-22] + moved + data[-22:], data + data[-22:-1])
+    for bad in (*more, b"<html>" + data, data + data):
+        with pytest.raises(BundleError, match="not a bundle in one file|truncated"):
+            read_single(io.BytesIO(bad))
+
+
+def test_a_part_that_is_encrypted_is_refused(folder: Path, tmp_path: Path) -> None:
+    write_single(folder, tmp_path / "b.bitymi")
+    data = bytearray((tmp_path / "b.bitymi").read_bytes())
+    data[data.rindex(b"surfels.bin") - 38] |= 1
+    with pytest.raises(BundleError, match="surfels.bin is not stored as it is$"):
+        read_single(io.BytesIO(bytes(data)))
+
+
+def test_a_path_that_none_can_be_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    for path in ("a" * 300, "/dev/null/x", "/proc/1/nothing"):
+        assert main(["view", path]) == 1
+        assert "Errno" not in capsys.readouterr().err
+
+
+def test_two_parts_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "b.bitymi"
+    with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(path, "w") as archive:
+        for name in ("bundle.json", "surfels.bin", "texels.bin", "bundle.json"):
+            archive.write(folder / name, name)
+    with pytest.raises(BundleError, match="two parts have one name"):
+        read_bundle(path)
+
+
+@pytest.mark.parametrize("claimed", [1 << 20, (1 << 32) - 2])
+def test_a_part_that_is_said_to_be_larger_than_the_file_is_refused(claimed: int, folder: Path, tmp_path: Path) -> None:
+    write_single(folder, tmp_path / "b.bitymi")
+    data = bytearray((tmp_path / "b.bitymi").read_bytes())
+    at = data.rindex(b"surfels.bin") - 46
+    data[at + 20 : at + 28] = struct.pack("<2L", claimed, claimed)
+
+    def refused() -> None:
+        with pytest.raises(BundleError, match="does not lie in it"):
+            read_single(io.BytesIO(bytes(data)))
+
+    assert peak(refused) < 4 << 20
+
+
+def test_the_parts_of_one_file_are_the_files_of_the_folder(folder: Path, tmp_path: Path) -> None:
+    write_single(folder, tmp_path / "b.bitymi")
+    with parts_of(folder) as want, parts_of(tmp_path / "b.bitymi") as got:
+        for path in folder.iterdir():
+            assert got.read(path.name, 1 << 20) == want.read(path.name, 1 << 20) == path.read_bytes()
+        with pytest.raises(BundleError, match="at most 10 are read"):
+            got.read("surfels.bin", 10)
+
+
+def test_what_the_format_names() -> None:
+    assert all(map(is_known, ["bundle.json", "surfels.ply", "photograph-0001.jpg", "cameras.json", "poster.webp"]))
+    others = [
+        "photograph-0001.jpg\n",
+        "photograph-1.jpg",
+        "Photograph-0001.jpg",
+        "photograph-0001.jpg.php",
+        "preview.svg",
+    ]
+    assert not any(map(is_known, [*others, "config.yml", "bundle.json/", "../bundle.json", "", "photograph-٠٠٠١.jpg"]))

@@ -65,6 +65,14 @@ def test_the_import_starts_no_threads() -> None:
 
 
 @spinning
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
+def test_a_process_of_one_thread_stays_one() -> None:
+    """Many such processes on a machine of many processors would else have thousands of threads."""
+    _, imported, ready = printed(IMPORT, OMP_NUM_THREADS="1")
+    assert ready == imported
+
+
+@spinning
 def test_threads_do_not_spin_once_the_kernels_are_ready() -> None:
     before, after = processor_time()
     if before < 0.1:

@@ -21,6 +21,27 @@ NUMBERS = 24
 """That a fragment takes in a training step: 7 in the list, 3 of its colour, 8 of their gradients; the rest is slack."""
 FEW = 1 << 23
 """Fragments for which there is always room, so that nobody asks the device for its free memory."""
+LISTS_PER_CHECK = 100
+"""Lists after which the device is asked again. Asking takes as long as a tenth of a training step, and between steps
+only other programs change the answer: torch keeps the memory of a list for the next one."""
+
+
+@dataclass
+class _Room:
+    """What the free memory of a device was last found to hold.
+
+    Attributes:
+        capacity: fragments.
+        largest: list that was compared with it.
+        lists: since then.
+    """
+
+    capacity: int
+    largest: int
+    lists: int = 0
+
+
+_rooms: dict[torch.device, _Room] = {}
 
 
 @dataclass(frozen=True)
@@ -112,9 +133,15 @@ def fragment_capacity(geom: Tensor) -> int:
 
 
 def check_capacity(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
-    """Raises TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for."""
+    """Raises TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for.
+
+    The memory is looked up for a list that is longer than all before, and every `LISTS_PER_CHECK` lists."""
     if most == 0 and geom.device.type == "cuda" and count > FEW:
-        most = fragment_capacity(geom)
+        room = _rooms.get(geom.device)
+        if room is None or count > room.largest or room.lists >= LISTS_PER_CHECK:
+            room = _rooms[geom.device] = _Room(fragment_capacity(geom), count)
+        room.lists += 1
+        most = room.capacity
     if most and count > most:
         raise too_many(geom, projection, count, most, places=True)
 

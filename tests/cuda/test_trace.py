@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -365,3 +366,23 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
     assert fragments.layout.pairs <= 1.25 * int(shown.sum())
     count = int((weights > 0).sum())
     assert abs(fragments.surfel.shape[0] - count) <= (0 if dtype == torch.float64 else 1e-4 * count)
+
+
+def test_free_memory_is_looked_up_for_longer_lists_and_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = SimpleNamespace(device=torch.device("cuda", 7), element_size=lambda: 4)
+    view = SimpleNamespace(camera=SimpleNamespace(width=10, height=10))
+    capacities = iter([3 * trace_cuda.FEW, 4 * trace_cuda.FEW, trace_cuda.FEW])
+    asked = []
+    monkeypatch.setattr(trace_cuda, "_rooms", {})
+    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: asked.append(1) or next(capacities))
+    few = trace_cuda.FEW
+    for count in (few, 2 * few, 2 * few - 1, few + 1):
+        trace_cuda.check_capacity(card, view, count, 0)
+    assert len(asked) == 1
+    trace_cuda.check_capacity(card, view, 3 * few + 1, 0)  # longer than all before, and the memory has grown
+    assert len(asked) == 2
+    for _ in range(trace_cuda.LISTS_PER_CHECK - 1):
+        trace_cuda.check_capacity(card, view, 2 * few, 0)
+    with pytest.raises(ops.TooManyFragments, match=f"there is room for {few:,}"):
+        trace_cuda.check_capacity(card, view, 2 * few, 0)
+    assert len(asked) == 3

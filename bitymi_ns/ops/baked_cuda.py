@@ -140,6 +140,17 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
         )
 
 
+def tiles_of(views: int, width: int, height: int) -> int:
+    """Screen tiles of all views."""
+    return -(-width // 16) * -(-height // 16) * views
+
+
+def slots_per_tile(capacity: int, tiles: int) -> int:
+    """Slots for the pairs of each screen tile: twice the mean of `capacity` pairs, or more while 32 MB hold all, but no
+    more than a block of the device sorts at once. Pairs beyond them are in one list of all tiles."""
+    return max(32, min(1024, max(2 * capacity, 1 << 23) // tiles) // 32 * 32)
+
+
 class Workspace:
     """Working memory of frames on a device; it grows when a frame is prepared that needs more, and stays.
 
@@ -147,7 +158,8 @@ class Workspace:
         device: a CUDA device.
 
     Attributes:
-        capacity: pairs of surfel and tile that fit.
+        capacity: pairs of surfel and screen tile that fit, however they are distributed over the tiles.
+        slots: of a tile; 0 before the first frame.
         memory: [bytes] uint8, None before the first frame.
 
     Raises:
@@ -157,7 +169,7 @@ class Workspace:
     def __init__(self, device: torch.device) -> None:
         require("baked_cuda.Workspace", "cuda", device, ON_CPU)
         self._device = device
-        self.capacity = 0
+        self.capacity = self.slots = 0
         self.memory: Tensor | None = None
 
     def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
@@ -171,26 +183,40 @@ class Workspace:
         if capacity > most:
             raise ValueError(f"the view needs {capacity} pairs of surfel and tile, a frame can have {most}")
         self.capacity = max(self.capacity, capacity) or min(most, 4 * surfels * views)
+        self.slots = slots_per_tile(self.capacity, tiles_of(views, width, height))
         size = {"surfels": surfels, "views": views, "width": width, "height": height, "normals": normals}
         with on_device(device):
-            needed = kernels.baked_memory(**size, capacity=self.capacity)
+            needed = kernels.baked_memory(**size, slots=self.slots, capacity=self.capacity)
         if self.memory is None or self.memory.numel() < needed:
             self.memory = None  # frees the old before the new is taken
             self.memory = torch.empty(needed, dtype=torch.uint8, device=device)
 
+    def counts(self) -> tuple[int, int]:
+        """Pairs of surfel and tile in the latest frame, which had surfels, and how many of them found no slot.
+
+        Waits for the device.
+        """
+        assert self.memory is not None
+        pairs, spilled = self.memory[:16].view(torch.int64).tolist()
+        return pairs, spilled
+
     @property
     def pairs(self) -> int:
         """Pairs of surfel and tile in the latest frame, which had surfels; waits for the device."""
-        assert self.memory is not None
-        return int(self.memory[:8].view(torch.int64))
+        return self.counts()[0]
+
+    @property
+    def complete(self) -> bool:
+        """Whether there was room for all pairs of the latest frame, which had surfels; waits for the device."""
+        return self.counts()[1] <= self.capacity
 
     def frame_fitted(self) -> bool:
         """Whether the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
 
         Waits for the device.
         """
-        pairs = self.pairs
-        fitted = pairs <= self.capacity
+        pairs, spilled = self.counts()
+        fitted = spilled <= self.capacity
         self.capacity = pairs + pairs // 4 + 1
         return fitted
 
@@ -201,7 +227,7 @@ class ListedPairs(NamedTuple):
     Attributes:
         ranges: [tiles, 2] where the list of each screen tile begins and ends, all views one after the other.
         depth: [surfels * views] keys in the order of depth, 2^32 - 1: not visible.
-        pairs: [capacity] row << 8 | mask of the 8 x 4 parts of the tile.
+        pairs: row << 8 | mask of the 8 x 4 parts of the tile, tile by tile.
     """
 
     ranges: Tensor
@@ -215,11 +241,11 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """What the latest frame left in the working memory (`lay_out` of csrc/cuda/baked_bin.cu), on the CPU: for tests and
-    for counting what a frame costs."""
+    """What the latest frame, without normals, left in the working memory (`lay_out` of csrc/cuda/baked_bin.cu), on the
+    CPU: for tests and for counting what a frame costs."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
-    tiles, rows = -(-width // 16) * -(-height // 16) * views, surfels * views
+    tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots
 
     def take(count: int) -> Tensor:
         nonlocal at
@@ -227,10 +253,18 @@ def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, hei
         at += -(-4 * count // 256) * 256
         return values
 
-    ranges = take(2 * tiles).view(tiles, 2)
+    lists = take(8 * tiles).view(tiles, 8).long() & 0xFFFFFFFF
     take(24 * rows)
+    depth = take(rows).long() & 0xFFFFFFFF
+    pairs = take(tiles * slots + workspace.capacity).long() & 0xFFFFFFFF
+    counts, rest = lists[:, 0], lists[:, 1]
+    ends = counts.cumsum(0)
+    begins = ends - counts
+    tile = torch.repeat_interleave(torch.arange(tiles), counts)
+    index = torch.arange(len(tile)) - begins[tile]  # in the tile's list
+    at_slot = index < slots
     return ListedPairs(
-        ranges, take(rows).long() & 0xFFFFFFFF, take(-(-workspace.capacity // 8) * 8).long() & 0xFFFFFFFF
+        torch.stack([begins, ends], dim=1), depth, pairs[index + torch.where(at_slot, tile * slots, rest[tile])]
     )
 
 
@@ -265,8 +299,8 @@ def frame(
 ) -> None:
     """Draws views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
 
-    When more pairs were needed than the workspace has room for, surfels are missing: compare `workspace.pairs` with
-    `workspace.capacity`, `resize` and draw again.
+    When more pairs were needed than the workspace has room for, surfels are missing: ask `workspace.complete`, `resize`
+    and draw again.
 
     Args:
         scene: of `compiled`.
@@ -295,6 +329,7 @@ def frame(
         stages=int(stages),
         photo_pixel=photo_pixel,
         memory=workspace.memory,
+        slots=workspace.slots,
         capacity=workspace.capacity,
     )
 

@@ -96,10 +96,11 @@ void bind_baked(nb::module_& m) {
   bind_operation(m, "baked_frame", &baked_frame);
   m.def(
       "baked_memory",
-      [](int64_t surfels, int views, int width, int height, int64_t capacity, bool normals) {
-        return baked_memory(surfels, {views, width, height, nullptr, nullptr}, capacity, normals);
+      [](int64_t surfels, int views, int width, int height, int slots, int64_t capacity, bool normals) {
+        return baked_memory(surfels, {views, width, height, nullptr, nullptr}, slots, capacity, normals);
       },
-      "surfels"_a, "views"_a, "width"_a, "height"_a, "capacity"_a, "normals"_a, "Bytes of working memory of a frame.");
+      "surfels"_a, "views"_a, "width"_a, "height"_a, "slots"_a, "capacity"_a, "normals"_a,
+      "Bytes of working memory of a frame.");
   m.attr("MOST_ROWS") = kMostRows;
   m.attr("MOST_PAIRS") = kMostPairs;
 }

@@ -2,13 +2,14 @@
 //
 //   prepare   one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
 //             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
-//   bin       pairs of surfel and tile are listed as they are found, numbered within their tile, and moved to their
-//             tile's list; each tile then sorts its own list front to back (ties by the surfel's number).
+//   bin       pairs of surfel and tile are numbered within their tile as they are found, and written to the tile's slot
+//             of this number, or to a list of all tiles where it has no slot; each tile then sorts its own list front
+//             to back (ties by the surfel's number).
 //   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the
 //             8 x 4 parts of the tile that its surfel reaches, so a warp looks at those alone.
 //
-// Nothing is allocated and nothing waits: counts stay on the device. When the pairs do not fit, `total` says how many
-// there are; the image then lacks surfels and the frame is to be drawn again with more capacity.
+// Nothing is allocated and nothing waits: counts stay on the device. Pairs without room are counted; the image then
+// lacks surfels and the frame is to be drawn again with more capacity.
 #pragma once
 
 #include <cstddef>
@@ -92,8 +93,9 @@ enum BakedStage { kPrepare = 1, kBin = 2, kDraw = 4 };
 constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair holds 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 
-// Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64).
-size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals);
+// Bytes of working memory. After a frame its first 16 hold the number of pairs and how many of them found no slot,
+// which must be at most `capacity` (int64).
+size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals);
 
 // A frame of all views: the stages (a sum of BakedStage); one needs what those before it left in `memory`.
 struct BakedDraw {
@@ -103,7 +105,8 @@ struct BakedDraw {
   int stages;
   float photo_pixel;  // side of a photograph's pixel in pixels of the views
   Workspace memory;
-  int64_t capacity;  // pairs that fit
+  int slots;         // of a screen tile, for pairs; a multiple of 32
+  int64_t capacity;  // pairs that find no slot and fit
 
   template <class R>
   void fields(R& r) {
@@ -118,6 +121,7 @@ struct BakedDraw {
     r.number("stages", stages);
     r.number("photo_pixel", photo_pixel);
     r.memory("memory", memory);
+    r.number("slots", slots);
     r.number("capacity", capacity);
   }
 };

@@ -1,9 +1,9 @@
 // Second stage of the baked renderer: every tile's surfels front to back, and the host's side of a frame.
 //
-// No sort runs over all surfels or all pairs, and tiles are found once. A block lists the pairs of its surfels, at a
-// place in the list that it draws from one counter; each pair draws its number within its tile from the tile's counter.
-// Every tile then takes its range of the lists, the pairs move there, and each tile's list is sorted for itself
-// (baked_sort.cu). Where ranges lie and in which order pairs came has no influence on the image.
+// No sort runs over all surfels or all pairs, and tiles are found once. A block lists the pairs of its surfels: each
+// draws its number within its tile from the tile's counter, and is written to the tile's slot of this number. Pairs
+// that find no slot go to one list of all tiles. Each tile's list is then sorted for itself (baked_sort.cu). In which
+// order pairs came has no influence on the image.
 #include <stdexcept>
 #include <string>
 
@@ -17,10 +17,8 @@ namespace {
 constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 constexpr int64_t kLeastBlocks = 1024;  // where there are fewer a block takes fewer surfels,
 constexpr int kLeastOwned = 4;          // but as many as this
-constexpr int kMoved = 4;               // pairs that a thread moves
 constexpr int kLarge = 128;             // tiles from which on a surfel is left to `large_pairs_kernel`
 constexpr int kLargeParts = 16;         // in which such a surfel's rows of tiles are shared out
-constexpr int kLong = 2;                // times the mean of all tiles: a list that is long
 constexpr int kLargeBlocks = 528;       // four for each multiprocessor of a large card
 
 // Sums of the values of the threads before mine.
@@ -74,18 +72,17 @@ __device__ uint32_t first_tile(const BakedFrame& f, uint32_t r, int ty) {
   return r / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x);
 }
 
-__device__ void list_pair(const BakedFrame& f, int64_t at, uint32_t r, uint32_t tile, uint32_t parts) {
+__device__ void list_pair(const BakedFrame& f, uint32_t r, uint32_t tile, uint32_t parts) {
   const BakedMemory& m = f.memory;
-  if (at >= f.capacity) return;
-  const int32_t number = atomicAdd(m.ranges + 2 * int64_t(tile) + 1, 1);
-  m.listed_tile[at] = tile;
-  m.listed_pair[at] = r << 8 | parts;
-  m.listed_number[at] = number;
-}
-
-__device__ int64_t take_places(const BakedFrame& f, int pairs) {
-  return int64_t(
-      atomicAdd(reinterpret_cast<unsigned long long*>(f.memory.total), static_cast<unsigned long long>(pairs)));
+  TileList& list = m.lists[tile];
+  const uint32_t pair = r << 8 | parts;
+  const int number = atomicAdd(&list.count, 1);
+  if (number < f.slots) {
+    m.pairs[int64_t(tile) * f.slots + number] = pair;
+    return;
+  }
+  const int64_t at = add_to(m.spilled_count, 1);
+  if (at < f.capacity) m.spilled[at] = {pair, atomicExch(&list.chains[number % kChains], uint32_t(at + 1))};
 }
 
 // Threads take a surfel each, then a row of tiles each, then a pair each, so that all are busy and neighbours write to
@@ -99,7 +96,6 @@ __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int ow
   __shared__ uint32_t row_id[kThreads], row_tile[kThreads];  // a row's surfel and the tile at its left end
   __shared__ int first_pair[kThreads];                       // pairs before a row's
   __shared__ int sums[kWarps];
-  __shared__ int64_t place;
   const BakedMemory& m = f.memory;
   const int me = threadIdx.x;
   const int64_t first = int64_t(blockIdx.x) * owned, r = first + me;
@@ -126,30 +122,29 @@ __global__ void __launch_bounds__(kThreads, 8) pairs_kernel(BakedFrame f, int ow
       row_tile[me] = first_tile(f, row_id[me], ty) + uint32_t(mine.left);
     }
     first_pair[me] = block_sum_before(width, sums, pairs);
-    if (me == 0 && pairs > 0) place = take_places(f, pairs);
+    if (me == 0 && pairs > 0) add_to(m.total, pairs);
     __syncthreads();
     for (int k = me; k < pairs; k += kThreads) {
       const int of = last_at_most(first_pair, taken, k), right = k - first_pair[of];
-      list_pair(f, place + k, row_id[of], row_tile[of] + uint32_t(right), part_mask(row[of], row[of].left + right));
+      list_pair(f, row_id[of], row_tile[of] + uint32_t(right), part_mask(row[of], row[of].left + right));
     }
     __syncthreads();
   }
 }
 
-// Lists a row of tiles of a surfel without a box, of which lanes take a tile each.
+// Lists a row of tiles of a surfel without a box, of which lanes take a tile each. Returns how many.
 template <class Kernel>
-__device__ void list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
+__device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
   const float* row = f.memory.rows + int64_t(r) * kRow;
   const uint32_t tile = first_tile(f, r, ty);
+  int listed = 0;
   for (int first = 0; first < f.tiles_x; first += kWarp) {
     const int tx = first + lane;
     const uint32_t parts = tx < f.tiles_x ? reached_parts<Kernel>(row, tx, ty) : 0;
-    const unsigned votes = __ballot_sync(kFullMask, parts != 0);
-    int64_t place = 0;
-    if (lane == 0 && votes) place = take_places(f, __popc(votes));
-    place = __shfl_sync(kFullMask, place, 0);
-    if (parts) list_pair(f, place + count_below(votes, lane), r, tile + uint32_t(tx), parts);
+    listed += __popc(__ballot_sync(kFullMask, parts != 0));
+    if (parts) list_pair(f, r, tile + uint32_t(tx), parts);
   }
+  return listed;
 }
 
 // The surfels of many tiles and those without a box, a warp to a share of the rows of tiles of one.
@@ -158,101 +153,59 @@ __global__ void __launch_bounds__(kThreads) large_pairs_kernel(BakedFrame f) {
   const BakedMemory& m = f.memory;
   const int lane = threadIdx.x % kWarp, warps = int(gridDim.x) * kWarps;
   const int64_t shares = int64_t(*m.large_count) * kLargeParts;
+  int64_t listed = 0;
   for (int64_t i = int64_t(blockIdx.x) * kWarps + threadIdx.x / kWarp; i < shares; i += warps) {
     const uint32_t r = m.large[i / kLargeParts];
     const Footprint of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.width, f.height);
     for (int ty = of.top + int(i % kLargeParts); ty <= of.bottom; ty += kLargeParts) {
       if (of.bounds.whole) {
-        list_reached<Kernel>(f, r, ty, lane);
+        listed += list_reached<Kernel>(f, r, ty, lane);
         continue;
       }
       const TileRow row = tile_row(of, ty, f.width);
       const int width = row.right - row.left + 1;
-      if (width <= 0) continue;
-      int64_t place = 0;
-      if (lane == 0) place = take_places(f, width);
-      place = __shfl_sync(kFullMask, place, 0);
       const uint32_t tile = first_tile(f, r, ty);
       for (int k = lane; k < width; k += kWarp)
-        list_pair(f, place + k, r, tile + uint32_t(row.left + k), part_mask(row, row.left + k));
-      __syncwarp();
+        list_pair(f, r, tile + uint32_t(row.left + k), part_mask(row, row.left + k));
+      listed += max_(width, 0);
     }
   }
-}
-
-// From the number of a tile's pairs to where they begin and end. Tiles of long lists are drawn first, so that none of
-// them is left when all others are done.
-__global__ void __launch_bounds__(kThreads) ranges_kernel(BakedFrame f) {
-  const BakedMemory& m = f.memory;
-  const int64_t tile = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int lane = threadIdx.x % kWarp;
-  const bool in = tile < f.tiles;
-  const int count = in ? m.ranges[2 * tile + 1] : 0;
-  const int before = warp_sum_before(count, lane);
-  const bool is_long = in && int64_t(count) * f.tiles > kLong * *m.total;
-  const unsigned longs = __ballot_sync(kFullMask, is_long), others = __ballot_sync(kFullMask, in && !is_long);
-  int32_t begin = 0, first = 0, last = 0;
-  if (lane == kWarp - 1) {
-    begin = atomicAdd(m.given, before + count);
-    if (longs) first = atomicAdd(m.long_tiles, __popc(longs));
-    if (others) last = atomicAdd(m.other_tiles, __popc(others));
-  }
-  begin = __shfl_sync(kFullMask, begin, kWarp - 1) + before;
-  first = __shfl_sync(kFullMask, first, kWarp - 1) + count_below(longs, lane);
-  last = __shfl_sync(kFullMask, last, kWarp - 1) + count_below(others, lane);
-  if (!in) return;
-  m.ranges[2 * tile] = begin, m.ranges[2 * tile + 1] = begin + count;
-  m.order[is_long ? first : f.tiles - 1 - last] = uint32_t(tile);
-}
-
-__global__ void __launch_bounds__(kThreads) places_kernel(BakedFrame f) {
-  const BakedMemory& m = f.memory;
-  const int64_t listed = min_(*m.total, f.capacity);
-  const int64_t from = int64_t(blockIdx.x) * (kThreads * kMoved) + threadIdx.x;
-  uint32_t pair[kMoved];
-  int64_t to[kMoved];
-  BT_UNROLL
-  for (int k = 0; k < kMoved; ++k) {
-    const int64_t at = from + k * kThreads;
-    if (at >= listed) continue;
-    pair[k] = m.listed_pair[at];
-    to[k] = int64_t(m.ranges[2 * int64_t(m.listed_tile[at])]) + m.listed_number[at];
-  }
-  BT_UNROLL
-  for (int k = 0; k < kMoved; ++k)
-    if (from + k * kThreads < listed) m.pairs[to[k]] = pair[k];
+  if (lane == 0 && listed) add_to(m.total, listed);
 }
 
 // Cuts the working memory into its arrays; the bytes needed. With a null base only the bytes count.
 int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   Arena arena(base);
   BakedMemory& m = f.memory;
-  m.total = arena.take<int64_t>(3), m.given = reinterpret_cast<int32_t*>(m.total + 1);
-  m.large_count = m.given + 1, m.long_tiles = m.given + 2, m.other_tiles = m.given + 3;
-  m.ranges = arena.take<int32_t>(2 * f.tiles);
+  m.total = arena.take<int64_t>(5), m.spilled_count = m.total + 1, m.rest_count = m.total + 2;
+  m.large_count = reinterpret_cast<int32_t*>(m.total + 3), m.long_tiles = m.large_count + 1;
+  m.other_tiles = m.large_count + 2;
+  m.lists = arena.take<TileList>(f.tiles);
   m.cleared = arena.used();
   m.rows = arena.take<float>(f.rows * kRow);
   m.normals = normals ? arena.take<float4>(f.rows) : nullptr;
   m.depth = arena.take<uint32_t>(f.rows);
-  m.pairs = arena.take<uint32_t>(f.capacity);
-  m.keys = arena.take<uint64_t>(f.capacity), m.merged = arena.take<uint64_t>(f.capacity);
+  m.pairs = arena.take<uint32_t>(f.tiles * f.slots + f.capacity);
+  m.spilled = arena.take<SpilledPair>(f.capacity);
   m.large = arena.take<uint32_t>(f.rows), m.order = arena.take<uint32_t>(f.tiles);
-  m.listed_tile = reinterpret_cast<uint32_t*>(m.keys), m.listed_pair = reinterpret_cast<uint32_t*>(m.merged);
-  m.listed_number = reinterpret_cast<int32_t*>(m.listed_tile + f.capacity);
   return arena.used();
 }
 
-BakedFrame frame_of(int64_t surfels, const BakedViews& v, int64_t capacity) {
+BakedFrame frame_of(int64_t surfels, const BakedViews& v, int slots, int64_t capacity) {
   BakedFrame f = {};
   f.n = surfels, f.rows = surfels * v.count;
   f.width = v.width, f.height = v.height;
   f.tiles_x = tiles_across(v.width), f.tiles_y = tiles_across(v.height);
   f.tiles = int64_t(f.tiles_x) * f.tiles_y * v.count;
-  f.capacity = ceil_div(max_<int64_t>(capacity, 1), 8) * 8;
+  f.slots = slots, f.capacity = max_<int64_t>(capacity, 1);
+  if (slots < kWarp || slots % kWarp)
+    throw std::invalid_argument("a tile has " + std::to_string(slots) + " slots, it needs a multiple of " +
+                                std::to_string(kWarp));
   if (f.rows > kMostRows)
     throw std::invalid_argument("surfels times views is " + std::to_string(f.rows) + ", at most " +
                                 std::to_string(kMostRows) + " are drawn in one call: draw fewer views at once");
-  if (f.capacity > kMostPairs || f.tiles > kMostPairs || v.count > 65535)
+  // indices of pairs have 32 bits
+  if (f.capacity > kMostPairs || f.tiles > kMostPairs / slots || v.count > 65535)
     throw std::invalid_argument(
         "too many views, pixels or pairs of surfel and tile for one call: draw fewer views at "
         "once, or smaller ones");
@@ -270,19 +223,16 @@ void baked_bin(const BakedFrame& f, Stream stream) {
     const unsigned large = unsigned(min_<int64_t>(kLargeBlocks, ceil_div(f.rows * kLargeParts, kWarps)));
     BT_LAUNCH(large_pairs_kernel<decltype(kernel)>, dim3(large), dim3(kThreads), 0, stream, f);
   });
-  BT_LAUNCH(ranges_kernel, dim3(unsigned(ceil_div(f.tiles, kThreads))), dim3(kThreads), 0, stream, f);
-  const unsigned moves = unsigned(ceil_div(f.capacity, kThreads * kMoved));
-  BT_LAUNCH(places_kernel, dim3(moves), dim3(kThreads), 0, stream, f);
   baked_sort(f, stream);
 }
 
-size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals) {
-  BakedFrame f = frame_of(surfels, views, capacity);
+size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals) {
+  BakedFrame f = frame_of(surfels, views, slots, capacity);
   return lay_out(f, nullptr, normals);
 }
 
 void baked_frame(const BakedDraw& a, Stream stream) {
-  BakedFrame f = frame_of(a.scene->geometry.n, a.views, a.capacity);
+  BakedFrame f = frame_of(a.scene->geometry.n, a.views, a.slots, a.capacity);
   f.through_pixel = a.scene->through_pixel, f.photo_pixel = a.photo_pixel;
   const int64_t needed = lay_out(f, a.memory.at, a.images.normal != nullptr);
   if (a.memory.bytes < needed)

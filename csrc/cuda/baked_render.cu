@@ -30,8 +30,9 @@ struct DrawArgs {
   const float* rows;
   const float4* normals;
   const uint32_t* pairs;
-  const int32_t* ranges;
+  const TileList* lists;
   const uint32_t* order;
+  int slots;
   int width, height, tiles_x, tiles_of_view;
   float near, offset, scale, weight_bound, transmittance_min;
   float sharp;  // of the low pass (core/resize.h)
@@ -196,12 +197,13 @@ __global__ void __launch_bounds__(kThreads, (kMaps || Kernel::kPixel ? 3 : 4) * 
   uint32_t wanted = 0;  // parts that still take light
   for (int j = 0; j < kPixels; ++j) wanted |= __any_sync(kFullMask, p[j].transmittance > 0) ? part[j] : 0;
 
-  int next = a.ranges ? a.ranges[2 * int64_t(tile)] : 0;
-  const int end = a.ranges ? a.ranges[2 * int64_t(tile) + 1] : 0;
+  const int count = a.lists ? a.lists[tile].count : 0;
+  int next = 0;
   int waiting = 0;  // in the queue
   while (wanted) {
-    while (waiting < kWarp && next < end) {
-      const uint32_t pair = next + lane < end ? __ldg(a.pairs + next + lane) : 0u;
+    while (waiting < kWarp && next < count) {
+      const uint32_t from = next < a.slots ? tile * unsigned(a.slots) : a.lists[tile].rest;
+      const uint32_t pair = next + lane < count ? __ldg(a.pairs + (from + unsigned(next + lane))) : 0u;
       const unsigned votes = __ballot_sync(kFullMask, (pair & wanted) != 0);
       if (pair & wanted) queue[waiting + __popc(votes & ((1u << lane) - 1))] = pair;
       waiting += __popc(votes);
@@ -265,8 +267,9 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
   const DrawArgs a = {f.memory.rows,
                       f.memory.normals,
                       f.memory.pairs,
-                      f.rows ? f.memory.ranges : nullptr,
+                      f.rows ? f.memory.lists : nullptr,
                       f.rows ? f.memory.order : nullptr,
+                      f.slots,
                       f.width,
                       f.height,
                       f.tiles_x,

@@ -289,7 +289,11 @@ def test_errors(device: torch.device, cpu) -> None:
     with pytest.raises(ValueError, match="draws .1, 8, 8."):
         BakedRenderer(scene, 8, 8).draw([front(8, 9)])
     with pytest.raises(ValueError, match="16777217, at most 16777216"):
-        module(device).baked_memory(2**24 + 1, 1, 8, 8, 1, False)
+        module(device).baked_memory(2**24 + 1, 1, 8, 8, 32, 1, False)
+    with pytest.raises(ValueError, match="has 33 slots, it needs a multiple of 32"):
+        module(device).baked_memory(1, 1, 8, 8, 33, 1, False)
+    with pytest.raises(ValueError, match="too many views, pixels or pairs"):
+        module(device).baked_memory(1, 1, 2**20, 2**20, 32, 1, False)
     with pytest.raises(ValueError, match="a frame can have"):
         BakedRenderer(scene, 8, 8)._resize(2**40)
     if device.type == "cpu":

@@ -257,7 +257,7 @@ def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, hei
     take(24 * rows)
     depth = take(rows).long() & 0xFFFFFFFF
     pairs = take(tiles * slots + workspace.capacity).long() & 0xFFFFFFFF
-    counts, rest = lists[:, 0], lists[:, 1]
+    counts, rest = torch.where(lists[:, 0] > slots, lists[:, 1], lists[:, 0]), lists[:, 2]
     ends = counts.cumsum(0)
     begins = ends - counts
     tile = torch.repeat_interleave(torch.arange(tiles), counts)

@@ -3,10 +3,10 @@
 //   prepare   one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
 //             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
 //   bin       pairs of surfel and tile are numbered within their tile as they are found, and written to the tile's slot
-//             of this number, or to a list of all tiles where it has no slot; each tile then sorts its own list front
-//             to back (ties by the surfel's number).
-//   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the
-//             8 x 4 parts of the tile that its surfel reaches, so a warp looks at those alone.
+//             of this number, or to a list of all tiles where it has no slot.
+//   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's number);
+//             then one warp per 8 x 8 pixels, two per thread. A pair carries the mask of the 8 x 4 parts of the tile
+//             that its surfel reaches, so a warp looks at those alone.
 //
 // Nothing is allocated and nothing waits: counts stay on the device. Pairs without room are counted; the image then
 // lacks surfels and the frame is to be drawn again with more capacity.

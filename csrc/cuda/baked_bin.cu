@@ -1,9 +1,9 @@
-// Second stage of the baked renderer: every tile's surfels front to back, and the host's side of a frame.
+// Second stage of the baked renderer: every tile's surfels, and the host's side of a frame.
 //
 // No sort runs over all surfels or all pairs, and tiles are found once. A block lists the pairs of its surfels: each
 // draws its number within its tile from the tile's counter, and is written to the tile's slot of this number. Pairs
-// that find no slot go to one list of all tiles. Each tile's list is then sorted for itself (baked_sort.cu). In which
-// order pairs came has no influence on the image.
+// that find no slot go to one list of all tiles. Each tile's list is sorted where the tile is drawn (baked_sort.h). In
+// which order pairs came has no influence on the image.
 #include <stdexcept>
 #include <string>
 
@@ -20,6 +20,8 @@ constexpr int kLeastOwned = 4;          // but as many as this
 constexpr int kLarge = 128;             // tiles from which on a surfel is left to `large_pairs_kernel`
 constexpr int kLargeParts = 16;         // in which such a surfel's rows of tiles are shared out
 constexpr int kLargeBlocks = 528;       // four for each multiprocessor of a large card
+constexpr int kLong = 2;                // times the mean for which there is room: a list that is long,
+constexpr int kLeastLong = 128;         // but not with fewer pairs than this
 
 // Sums of the values of the threads before mine.
 __device__ int warp_sum_before(int value, int lane) {
@@ -77,6 +79,10 @@ __device__ void list_pair(const BakedFrame& f, uint32_t r, uint32_t tile, uint32
   TileList& list = m.lists[tile];
   const uint32_t pair = r << 8 | parts;
   const int number = atomicAdd(&list.count, 1);
+  if (number == f.long_from) {
+    const int32_t at = atomicAdd(m.long_count, 1);
+    m.long_tiles[at] = tile, list.long_index = uint32_t(at + 1);
+  }
   if (number < f.slots) {
     m.pairs[int64_t(tile) * f.slots + number] = pair;
     return;
@@ -149,7 +155,7 @@ __device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
 
 // The surfels of many tiles and those without a box, a warp to a share of the rows of tiles of one.
 template <class Kernel>
-__global__ void __launch_bounds__(kThreads) large_pairs_kernel(BakedFrame f) {
+__global__ void __launch_bounds__(kThreads, 4) large_pairs_kernel(BakedFrame f) {
   const BakedMemory& m = f.memory;
   const int lane = threadIdx.x % kWarp, warps = int(gridDim.x) * kWarps;
   const int64_t shares = int64_t(*m.large_count) * kLargeParts;
@@ -177,9 +183,8 @@ __global__ void __launch_bounds__(kThreads) large_pairs_kernel(BakedFrame f) {
 int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   Arena arena(base);
   BakedMemory& m = f.memory;
-  m.total = arena.take<int64_t>(5), m.spilled_count = m.total + 1, m.rest_count = m.total + 2;
-  m.large_count = reinterpret_cast<int32_t*>(m.total + 3), m.long_tiles = m.large_count + 1;
-  m.other_tiles = m.large_count + 2;
+  m.total = arena.take<int64_t>(4), m.spilled_count = m.total + 1, m.rest_count = m.total + 2;
+  m.large_count = reinterpret_cast<int32_t*>(m.total + 3), m.long_count = m.large_count + 1;
   m.lists = arena.take<TileList>(f.tiles);
   m.cleared = arena.used();
   m.rows = arena.take<float>(f.rows * kRow);
@@ -187,7 +192,7 @@ int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   m.depth = arena.take<uint32_t>(f.rows);
   m.pairs = arena.take<uint32_t>(f.tiles * f.slots + f.capacity);
   m.spilled = arena.take<SpilledPair>(f.capacity);
-  m.large = arena.take<uint32_t>(f.rows), m.order = arena.take<uint32_t>(f.tiles);
+  m.large = arena.take<uint32_t>(f.rows), m.long_tiles = arena.take<uint32_t>(f.tiles);
   return arena.used();
 }
 
@@ -201,6 +206,7 @@ BakedFrame frame_of(int64_t surfels, const BakedViews& v, int slots, int64_t cap
   if (slots < kWarp || slots % kWarp)
     throw std::invalid_argument("a tile has " + std::to_string(slots) + " slots, it needs a multiple of " +
                                 std::to_string(kWarp));
+  f.long_from = int(max_<int64_t>(kLong * f.capacity / max_<int64_t>(f.tiles, 1), kLeastLong));
   if (f.rows > kMostRows)
     throw std::invalid_argument("surfels times views is " + std::to_string(f.rows) + ", at most " +
                                 std::to_string(kMostRows) + " are drawn in one call: draw fewer views at once");
@@ -223,7 +229,6 @@ void baked_bin(const BakedFrame& f, Stream stream) {
     const unsigned large = unsigned(min_<int64_t>(kLargeBlocks, ceil_div(f.rows * kLargeParts, kWarps)));
     BT_LAUNCH(large_pairs_kernel<decltype(kernel)>, dim3(large), dim3(kThreads), 0, stream, f);
   });
-  baked_sort(f, stream);
 }
 
 size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals) {

@@ -28,11 +28,13 @@ static_assert(kRow == 24 && kR2 == 12);
 constexpr float kNearCuts = -1;  // without PixelKernel, which compares all rows that it does not filter
 
 // A screen tile's list: its first pairs are in slots of its own, the others as they come in one list of all tiles,
-// where each names the one before it. Six chains, because following one is waiting for memory at every step.
-constexpr int kChains = 6;
+// where each names the one before it. Four chains, because following one is waiting for memory at every step.
+constexpr int kChains = 4;
 struct alignas(16) TileList {
-  int32_t count;  // pairs; after the sort: that are listed, which are fewer where the working memory was too small
-  uint32_t rest;  // after the sort: from there on in `pairs` it stands as a whole, but for its slots
+  int32_t count;             // pairs
+  int32_t listed;            // where they are more than slots: those that are listed once that is done, before that 0
+  uint32_t rest;             // likewise from where on in `pairs` the list stands as a whole, but for its slots
+  uint32_t long_index;       // in long_tiles plus one, 0: the list is not long
   uint32_t chains[kChains];  // the last pair's index in `spilled` plus one, 0: none
 };
 static_assert(sizeof(TileList) == 32);
@@ -41,25 +43,26 @@ struct alignas(8) SpilledPair {
 };
 
 struct BakedMemory {
-  int64_t* total;                     // pairs of surfel and tile
-  int64_t* spilled_count;             // of these, those that found no slot
-  int64_t* rest_count;                // of these, those that tiles have moved behind the slots
-  int32_t* large_count;               // surfels of many tiles
-  int32_t *long_tiles, *other_tiles;  // tiles whose list is long, and others
-  TileList* lists;                    // [tiles]
-  int64_t cleared;                    // bytes from `total` on that a frame begins with as zeros: all above
-  float* rows;                        // [rows, kRow]
-  float4* normals;                    // [rows], null: not wanted
-  uint32_t* depth;                    // [rows] keys in the order of depth
-  uint32_t* pairs;                    // [tiles * slots + capacity] row << 8 | mask
-  SpilledPair* spilled;               // [capacity]
-  uint32_t* large;                    // [rows] surfels of many tiles
-  uint32_t* order;                    // [tiles] in which they are drawn
+  int64_t* total;          // pairs of surfel and tile
+  int64_t* spilled_count;  // of these, those that found no slot
+  int64_t* rest_count;     // of these, those that tiles have moved behind the slots
+  int32_t* large_count;    // surfels of many tiles
+  int32_t* long_count;     // tiles whose list is long
+  TileList* lists;         // [tiles]
+  int64_t cleared;         // bytes from `total` on that a frame begins with as zeros: all above
+  float* rows;             // [rows, kRow]
+  float4* normals;         // [rows], null: not wanted
+  uint32_t* depth;         // [rows] keys in the order of depth
+  uint32_t* pairs;         // [tiles * slots + capacity] row << 8 | mask
+  SpilledPair* spilled;    // [capacity]
+  uint32_t* large;         // [rows] surfels of many tiles
+  uint32_t* long_tiles;    // [tiles] those whose list is long
 };
 
 struct BakedFrame {
   int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs that find no slot
   int slots;                  // of a tile
+  int long_from;              // pairs beyond which its list is long
   int width, height, tiles_x, tiles_y;
   int64_t tiles;       // of all views
   bool through_pixel;  // as in BakedScene
@@ -69,7 +72,6 @@ struct BakedFrame {
 
 void baked_prepare(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
 void baked_bin(const BakedFrame& frame, Stream stream);
-void baked_sort(const BakedFrame& frame, Stream stream);  // the end of baked_bin
 void baked_draw(const BakedScene& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
 
 __device__ inline int64_t add_to(int64_t* count, int64_t more) {  // what it was before

@@ -159,6 +159,9 @@ def test_pairs_without_a_slot_are_listed_like_the_others(
         renderer = BakedRenderer(scene, width, height, views, images=("rgb", "overdraw"))
         images = {name: image.clone() for name, image in renderer.draw(cameras).items()}
         found.append((images, lists_of(renderer, count, width, height, views), renderer.workspace.counts()))
+        renderer.run(Stage.DRAW)  # of lists that are sorted
+        for name, image in images.items():
+            assert torch.equal(image, renderer.images[name])
     (all_images, all_lists, counts), (images, lists, spilled_counts) = found
     assert counts[1] == 0 and 0 < spilled_counts[1] < spilled_counts[0] == counts[0]
     for rows, same in zip(all_lists, lists, strict=True):

@@ -46,8 +46,8 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
-TIMED = ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")
-"""What `measured` times, in the order of the columns from "prepare ms" on."""
+TIMED = ("list", "draw", "frame", "graph", "packed", "alone", "early")
+"""What `measured` times, in the order of the columns from "list ms" on."""
 HEADER = (
     "scene",
     "size",
@@ -55,8 +55,7 @@ HEADER = (
     "pairs/tile",
     "of discs across the camera's plane",
     "fragments/pixel",
-    "prepare ms",
-    "bin ms",
+    "list ms",
     "draw ms",
     "frame ms",
     "graph ms",
@@ -132,7 +131,7 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
 
 def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
     """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of each column of the
-    table from `prepare` to `packed, waited for` ("alone") and of the frame whose pixels end early ("early"); and by how
+    table from `list` to `packed, waited for` ("alone") and of the frame whose pixels end early ("early"); and by how
     many 8-bit steps this differs at most."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
@@ -151,8 +150,7 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
         sums["per_tile"] += counts.per_tile
         sums["across"] += counts.across
         cases: list[tuple[str, Callable[[], object]]] = [
-            ("prepare", lambda frame=frame: frame.run(Stage.PREPARE)),
-            ("bin", lambda frame=frame: frame.run(Stage.BIN)),
+            ("list", lambda frame=frame: frame.run(Stage.LIST)),
             ("draw", lambda frame=frame: frame.run(Stage.DRAW)),
             ("frame", frame.run),
             ("graph", recorded.run),

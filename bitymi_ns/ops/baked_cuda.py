@@ -25,10 +25,9 @@ ON_CPU = "move the scene there, or draw with `baked.draw`"
 class Stage(IntFlag):
     """Stages of a frame, for timing them apart; each needs what the ones before it left in the working memory."""
 
-    PREPARE = 1
-    BIN = 2
-    DRAW = 4
-    ALL = 7
+    LIST = 1
+    DRAW = 2
+    ALL = 3
 
 
 def draws_blocks(device: torch.device) -> bool:
@@ -241,8 +240,8 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """What the latest frame, without normals, left in the working memory (`lay_out` of csrc/cuda/baked_bin.cu), on the
-    CPU: for tests and for counting what a frame costs."""
+    """What the latest frame, without normals, left in the working memory (`lay_out` of csrc/cuda/baked_frame.cu), on
+    the CPU: for tests and for counting what a frame costs."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
     tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots

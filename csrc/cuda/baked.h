@@ -1,9 +1,9 @@
 // The forward-only renderer of a baked scene on the device.
 //
-//   prepare   one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
-//             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
-//   bin       pairs of surfel and tile are numbered within their tile as they are found, and written to the tile's slot
-//             of this number, or to a list of all tiles where it has no slot.
+//   list      one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
+//             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later. Pairs of surfel
+//             and tile are numbered within their tile as they are found, and written to the tile's slot of this number,
+//             or to a list of all tiles where it has no slot.
 //   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's number);
 //             then one warp per 8 x 8 pixels, two per thread. A pair carries the mask of the 8 x 4 parts of the tile
 //             that its surfel reaches, so a warp looks at those alone.
@@ -88,7 +88,7 @@ struct BakedImages {
   }
 };
 
-enum BakedStage { kPrepare = 1, kBin = 2, kDraw = 4 };
+enum BakedStage { kList = 1, kDraw = 2 };
 
 constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair holds 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;

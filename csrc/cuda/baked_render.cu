@@ -1,4 +1,4 @@
-// Third stage of the baked renderer: the images.
+// Second stage of the baked renderer: the images.
 //
 // The block of a tile sorts the tile's list. From there on a warp draws 8 x 8 pixels, two per thread (four rows apart),
 // and works for itself: no barrier of the block, no waiting for pixels elsewhere in the tile. It takes the tile's list

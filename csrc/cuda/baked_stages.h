@@ -70,8 +70,7 @@ struct BakedFrame {
   BakedMemory memory;
 };
 
-void baked_prepare(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
-void baked_bin(const BakedFrame& frame, Stream stream);
+void baked_list(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
 void baked_draw(const BakedScene& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
 
 __device__ inline int64_t add_to(int64_t* count, int64_t more) {  // what it was before

@@ -189,8 +189,7 @@ def test_many_tiles(device: torch.device) -> None:
         renderer._resize(2_000)
         renderer._viewmats.copy_(case.viewmat)
         renderer._Ks.copy_(case.K)
-        renderer.run(Stage.PREPARE)
-        renderer.run(Stage.BIN)
+        renderer.run(Stage.LIST)
         assert 100 < renderer.workspace.pairs <= renderer.workspace.capacity
         all_ranges = listed_pairs(renderer.workspace, 30, 1, width, 20).ranges
         ranges.append(all_ranges.diff(dim=-1).view(2, -(-width // 16)))

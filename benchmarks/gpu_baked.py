@@ -9,7 +9,7 @@ without, with n surfels of which v are visible, b pairs of surfel and tile, f fr
   draw      100 b + 12 p bytes; 60 f operations: planes 12, kernel 12, blending 12, texel and colour 24. The bytes are
             read from the second-level cache, which the rows fit in; each of a tile's four warps reads its own.
 
-On a card 3840 x 2160 is drawn in any case. "frame" is the three stages launched by the host, "graph" the same as a CUDA
+On a card 3840 x 2160 is drawn in any case. "frame" is the two stages launched by the host, "graph" the same as a CUDA
 graph, "packed" that with 8 bits per channel instead of floats, "waited for" the time of a program that waits for
 each frame. "ends at 1/512" is the packed graph where a pixel takes no more light at that transmittance instead of 1e-4,
 which may change it by half an 8-bit step of the brightest colour; "differs" is by how much it does.

@@ -43,6 +43,38 @@ def decoded(blocks: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(pages))
 
 
+class Sheet(NamedTuple):
+    """How the pages of an atlas are put together to one texture: below each other, then beside.
+
+    Attributes:
+        down: pages below each other.
+        width, height: from the corner of a page to that of the next, in texels of the atlas.
+    """
+
+    down: int
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, pages: int, height: int, width: int) -> Sheet:
+        """Of so many pages of so many texels: up to 2^14 rows, which textures of any kind have, and where coordinates
+        keep the texture unit's fractions of a texel."""
+        height, width = -(-height // 4) * 4, -(-width // 4) * 4  # corners on the grid of the coarsest level
+        return cls(max(1, min(pages, 2**14 // height)), width, height)
+
+    def joined(self, pages: Tensor, texels: int) -> Tensor:
+        """Pages [pages, rows, columns, channels] as one [rows, columns, channels]; those of a level, or of blocks, with
+        `texels` texels of the atlas along a side of theirs."""
+        height, width = self.height // texels, self.width // texels
+        count, rows, columns, channels = pages.shape
+        beside = max(1, -(-count // self.down))
+        if beside == 1 and (rows, columns) == (height, width):
+            return pages.reshape(count * height, width, channels)
+        sheet = pages.new_zeros(beside, self.down, height, width, channels)
+        sheet.view(-1, height, width, channels)[:count, :rows, :columns] = pages
+        return sheet.permute(1, 2, 0, 3, 4).reshape(self.down * height, beside * width, channels)
+
+
 class AtlasTexture:
     """The pages of an atlas in the memory of a device, as its texture unit reads them.
 
@@ -51,12 +83,17 @@ class AtlasTexture:
             [layers, height / 4, width / 4, 16] uint8. On the CPU.
         blocks: `texels` are BC7 blocks; decoded, with a warning, where the device draws no such textures.
         device: where the surfels are.
+        sheet: of the atlas whose level these are; None: they are the atlas.
+        level: which one.
 
     Raises:
-        RuntimeError: the device has too little memory, refuses textures of this size, or is no CUDA device.
+        ValueError: there are more texels than a texture has.
+        RuntimeError: the device has too little memory, or is no CUDA device.
     """
 
-    def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
+    def __init__(
+        self, texels: Tensor, blocks: bool, device: torch.device, sheet: Sheet | None = None, level: int = 0
+    ) -> None:
         require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
         texels = texels.detach().cpu()
         if blocks and not draws_blocks(device):
@@ -65,29 +102,29 @@ class AtlasTexture:
                 f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory",
                 stacklevel=2,
             )
-        layers, height, width = texels.shape[:3]
+        side = 4 if blocks else 1  # of what a texel of `texels` stands for
+        count, height, width = texels.shape[:3]
+        self.sheet = sheet or Sheet.of(count, side * height, side * width)
         if blocks:
-            name, height, width = "bc7", 4 * height, 4 * width
+            name = "bc7"
         elif texels.dtype == torch.uint8:
             name = "uint8"
         else:
             name, texels = "half", texels.half()
-        data = texels.contiguous().view(torch.uint8)
+        joined = self.sheet.joined(texels, side << level)
+        size = {"height": side * joined.shape[0], "width": side * joined.shape[1]}
         with on_device(device):
-            self.texture = module(device).AtlasTexture(
-                format=name, layers=layers, height=height, width=width, texels=data
-            )
-        # handles are 64 bits without a sign
-        self.pages = torch.tensor([h - (1 << 64) if h >> 63 else h for h in self.texture.handles], device=device)
+            self.texture = module(device).AtlasTexture(format=name, texels=joined.view(torch.uint8), **size)
 
 
-def coarser(scene: BakedScene, device: torch.device) -> dict[str, AtlasTexture]:
+def coarser(scene: BakedScene, device: torch.device, sheet: Sheet) -> dict[str, AtlasTexture]:
     """The levels of an atlas as textures, by name; those of blocks are bytes."""
     texels = scene.atlas
     if texels is None:
         assert scene.blocks is not None
         texels = decoded(scene.blocks)
-    return {name: AtlasTexture(pages, False, device) for name, pages, _ in tile_levels(texels, scene.tiles.cpu())}
+    levels = enumerate(tile_levels(texels, scene.tiles.cpu()), start=1)
+    return {name: AtlasTexture(pages, False, device, sheet, level) for level, (name, pages, _) in levels}
 
 
 def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
@@ -122,10 +159,11 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
     if texels is not None:
         is_blocks = texels is scene.blocks
         kept = scene.cache.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
-        atlas = {"texture": kept.texture, "pages": kept.pages}
+        atlas = {"texture": kept.texture, "pages_down": kept.sheet.down}
+        atlas |= {"page_width": kept.sheet.width, "page_height": kept.sheet.height}
         if photo_pixel < 1.0:
-            for name, level in scene.cache.coarser(lambda: coarser(scene, device)).items():
-                atlas |= {name: level.texture, f"{name}_pages": level.pages}
+            for name, level in scene.cache.coarser(lambda: coarser(scene, device, kept.sheet)).items():
+                atlas[name] = level.texture
     with on_device(device):
         return module(device).BakedScene(
             **{name: p[name] for name in GEOMETRY},

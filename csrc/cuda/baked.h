@@ -31,13 +31,11 @@ struct BakedScene : BakedResidual {
   ViewColorArrays<const float> colors;
   LeanColors<float> lean;  // in place of those where lean.base is not null
   int64_t lean_terms;
-  const int32_t* tiles;   // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
-  const uint64_t* pages;  // [page_count] a texture per page of the atlas, null: none
-  int64_t page_count;
-  const AtlasTexture* texture;  // whose pages they are; Python keeps it
-  // likewise the levels of the tiles (core/texel.h), for views smaller than the photographs; null: none
-  const uint64_t* coarser[kTileLevels - 1];
-  const AtlasTexture* coarser_texture[kTileLevels - 1];
+  const int32_t* tiles;  // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
+  // The atlas, and the levels of its tiles (core/texel.h) for views smaller than the photographs; null: none. On the
+  // host; Python keeps them.
+  const AtlasTexture* levels[kTileLevels];
+  int pages_down, page_width, page_height;  // pages lie below each other, so many of them, then beside
   float near;
   bool through_pixel;  // chooses between the kernels of core/surfel.h
 
@@ -50,12 +48,15 @@ struct BakedScene : BakedResidual {
     else
       colors.fields(r, n);
     r.array("tiles", tiles, 5 * n);
-    if (r.given("pages")) r.rows("pages", pages, page_count, 1);
-    r.maybe_object("texture", texture);
-    r.maybe("half_pages", coarser[0], page_count);
-    r.maybe("quarter_pages", coarser[1], page_count);
-    r.maybe_object("half", coarser_texture[0]);
-    r.maybe_object("quarter", coarser_texture[1]);
+    r.maybe_object("texture", levels[0]);
+    r.maybe_object("half", levels[1]);
+    r.maybe_object("quarter", levels[2]);
+    pages_down = 1, page_width = page_height = 0;
+    if (levels[0]) {
+      r.number("pages_down", pages_down);
+      r.number("page_width", page_width);
+      r.number("page_height", page_height);
+    }
     BakedResidual::fields(r, n);
     r.number("near", near);
     r.number("through_pixel", through_pixel);

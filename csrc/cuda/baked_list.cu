@@ -32,17 +32,16 @@ __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float>
 __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color, float photo_pixel, float* row) {
   const int32_t* tile = s.tiles + 5 * i;
   int level = 0;
-  if (s.pages && tile[3] != 0 && photo_pixel < 1) {
+  if (s.levels[0] && tile[3] != 0 && photo_pixel < 1) {
     level = tile_level(row, tile[3], tile[4], s.extent ? s.extent[i] : float(kSupport), photo_pixel);
     if (level == kTileLevels && !s.mean_residual) level = 0;
-    while (level && level < kTileLevels && !(s.coarser[level - 1] && has_level(tile, level))) --level;
+    while (level && level < kTileLevels && !(s.levels[level] && has_level(tile, level))) --level;
   }
   float scale = 0, place[4] = {0, 0, 0, 0};
-  uint64_t page = 0;
-  if (s.pages && tile[3] != 0 && level < kTileLevels) {
+  if (s.levels[0] && tile[3] != 0 && level < kTileLevels) {
     scale = 0.5f / (s.extent ? s.extent[i] : float(kSupport));
-    page = (level ? s.coarser[level - 1] : s.pages)[tile[2]];
-    place[0] = float(tile[0] >> level) + 0.5f, place[1] = float(tile[1] >> level) + 0.5f;
+    const int x = tile[0] + tile[2] / s.pages_down * s.page_width, y = tile[1] + tile[2] % s.pages_down * s.page_height;
+    place[0] = float(x >> level) + 0.5f, place[1] = float(y >> level) + 0.5f;
     place[2] = float((tile[3] >> level) - 1), place[3] = float((tile[4] >> level) - 1);
   } else if (s.mean_residual) {
     const Vec3<float> flat = load3(s.mean_residual + 3 * i);
@@ -52,7 +51,7 @@ __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color,
     }
   }
   row[kTexelScale] = scale;
-  memcpy(row + kPage, &page, sizeof page);
+  row[kLevel] = float(level), row[kLevel + 1] = 0;
   for (int k = 0; k < 4; ++k) row[kTileX + k] = place[k];
 }
 

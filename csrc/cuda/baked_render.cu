@@ -30,6 +30,7 @@ constexpr int kLook = 8;             // rows between looks whether all pixels ar
 
 struct DrawArgs {
   BakedFrame frame;
+  uint64_t atlas[kTileLevels];
   float near, offset, scale, weight_bound, transmittance_min;
   float sharp;  // of the low pass (core/resize.h)
   BakedImages images;
@@ -51,7 +52,7 @@ struct Row {
 
 // Adds a row's fragments to the thread's pixels, with weight 0 to those that do not take it. The texels of all are on
 // their way before one is used.
-template <bool kMaps>
+template <bool kMaps, bool kLevels>
 __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
                                     const float (&weight)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
                                     Pixel (&p)[kPixels]) {
@@ -65,15 +66,21 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
   if (any && c.y != 0) {
     const float4 t = s.rest[1];
     if (c.y > 0) {
-      uint64_t page;
-      const float handle[2] = {c.z, c.w};
-      memcpy(&page, handle, sizeof page);
       float4 texel[kPixels];
-      BT_UNROLL
-      for (int j = 0; j < kPixels; ++j)
-        if (textured[j])
-          texel[j] = fetch_texel(page, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
-                                 t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
+      const auto fetch = [&](uint64_t atlas) {
+        BT_UNROLL
+        for (int j = 0; j < kPixels; ++j)
+          if (textured[j])
+            texel[j] = fetch_texel(atlas, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
+                                   t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
+      };
+      // by name, not by index: see AtlasTexture
+      if (!kLevels || c.z == 0)
+        fetch(a.atlas[0]);
+      else if (c.z == 1)
+        fetch(a.atlas[1]);
+      else
+        fetch(a.atlas[2]);
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j)
         if (textured[j])
@@ -103,7 +110,7 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 // A row under the thread's pixels, of which the first is dx, dy from the projected centre. Both are worked on together,
 // so that one does not wait for the other's steps. Unless kAll the low pass does not show, and no pixel of the disc
 // lies before the near plane; PixelKernel is for the rows that it filters alone.
-template <bool kMaps, class Kernel, bool kAll>
+template <bool kMaps, bool kLevels, class Kernel, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];
   FastFloat y[kPixels];
@@ -139,7 +146,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
     taken[j] = v.takes;
     any |= taken[j];
   }
-  if (any) add<kMaps>(a, s, taken, weight, f, p);
+  if (any) add<kMaps, kLevels>(a, s, taken, weight, f, p);
 }
 
 // Rounded as the image of floats would be: the product for itself.
@@ -189,6 +196,7 @@ template <bool kMaps, class Kernel>
 __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
+  constexpr bool kLevels = Kernel::kPixel || Kernel::kResized;  // those of smaller views are among these
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const BakedFrame& f = a.frame;
   const unsigned tile = f.rows ? tile_of_block(f.memory, blockIdx.x) : blockIdx.x;
@@ -251,11 +259,11 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(
                        kMaps ? queue[k] >> 8 : 0};
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
         if (filtered<Kernel>(s.g))
-          blend<kMaps, Kernel, true>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, Kernel, true>(a, s, dx, dy, p);
         else if (Kernel::kPixel || s.blur2 != 0)
-          blend<kMaps, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
         else
-          blend<kMaps, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
       }
     }
     wanted = 0;
@@ -275,7 +283,10 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(
 
 void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame& f, Stream stream) {
   if (!f.tiles) return;
+  static_assert(kTileLevels == 3);
+  const auto handle = [&](int level) { return s.levels[level] ? s.levels[level]->handle() : 0; };
   const DrawArgs a = {f,
+                      {handle(0), handle(1), handle(2)},
                       s.near,
                       s.offset,
                       s.scale,

@@ -19,8 +19,8 @@ enum RowColumn {
                     // also says how high the low pass is: 1/255 is left of it there
   kRed,             // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
-  kPage,                   // handle of the texture, 64 bits
-  kTileX = kPage + 2,      // centre of the tile's first texel, two; or three: the colour with the constant residual
+  kLevel,                  // of the tile; the column after it is free
+  kTileX = kLevel + 2,     // centre of the tile's first texel, two; or three: the colour with the constant residual
   kSpanX = kTileX + 2,     // texels of the tile less one, two
   kRow = kSpanX + 2
 };

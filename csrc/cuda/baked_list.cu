@@ -58,7 +58,7 @@ __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color,
 // A block takes `owned` surfels. Those of many tiles, or without a box, are only noted: the block with most of them
 // would be what a frame waits for.
 template <class Kernel>
-__global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 7 : 9)
+__global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blocks(9, kListThreads))
     list_kernel(BakedScene s, BakedViews v, BakedFrame f, int owned) {
   __shared__ int seen_count;
   __shared__ int seen_list[kListThreads];

@@ -190,7 +190,8 @@ __device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
 
 // Blocks per multiprocessor: as many as registers allow that the loop over pairs needs without the sort.
 template <bool kMaps, class Kernel>
-constexpr int kBlocks = kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9);
+constexpr int kBlocks =
+    bounded_blocks(kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9), kThreads);
 
 template <bool kMaps, class Kernel>
 __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(DrawArgs a) {

@@ -9,7 +9,7 @@ without, with n surfels of which v are visible, b pairs of surfel and tile, f fr
   draw      100 b + 12 p bytes; 60 f operations: planes 12, kernel 12, blending 12, texel and colour 24. The bytes are
             read from the second-level cache, which the rows fit in; each of a tile's four warps reads its own.
 
-On a card 3840 x 2160 is drawn in any case. "frame" is the three stages launched by the host, "graph" the same as a CUDA
+On a card 3840 x 2160 is drawn in any case. "frame" is the two stages launched by the host, "graph" the same as a CUDA
 graph, "packed" that with 8 bits per channel instead of floats, "waited for" the time of a program that waits for
 each frame. "ends at 1/512" is the packed graph where a pixel takes no more light at that transmittance instead of 1e-4,
 which may change it by half an 8-bit step of the brightest colour; "differs" is by how much it does.
@@ -46,8 +46,8 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
-TIMED = ("prepare", "bin", "draw", "frame", "graph", "packed", "alone", "early")
-"""What `measured` times, in the order of the columns from "prepare ms" on."""
+TIMED = ("list", "draw", "frame", "graph", "packed", "alone", "early")
+"""What `measured` times, in the order of the columns from "list ms" on."""
 HEADER = (
     "scene",
     "size",
@@ -55,8 +55,7 @@ HEADER = (
     "pairs/tile",
     "of discs across the camera's plane",
     "fragments/pixel",
-    "prepare ms",
-    "bin ms",
+    "list ms",
     "draw ms",
     "frame ms",
     "graph ms",
@@ -132,7 +131,7 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
 
 def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
     """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of each column of the
-    table from `prepare` to `packed, waited for` ("alone") and of the frame whose pixels end early ("early"); and by how
+    table from `list` to `packed, waited for` ("alone") and of the frame whose pixels end early ("early"); and by how
     many 8-bit steps this differs at most."""
     width, height = cameras[0].width, cameras[0].height
     card = options.device.type == "cuda"
@@ -151,8 +150,7 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
         sums["per_tile"] += counts.per_tile
         sums["across"] += counts.across
         cases: list[tuple[str, Callable[[], object]]] = [
-            ("prepare", lambda frame=frame: frame.run(Stage.PREPARE)),
-            ("bin", lambda frame=frame: frame.run(Stage.BIN)),
+            ("list", lambda frame=frame: frame.run(Stage.LIST)),
             ("draw", lambda frame=frame: frame.run(Stage.DRAW)),
             ("frame", frame.run),
             ("graph", recorded.run),

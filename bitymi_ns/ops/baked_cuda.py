@@ -25,10 +25,9 @@ ON_CPU = "move the scene there, or draw with `baked.draw`"
 class Stage(IntFlag):
     """Stages of a frame, for timing them apart; each needs what the ones before it left in the working memory."""
 
-    PREPARE = 1
-    BIN = 2
-    DRAW = 4
-    ALL = 7
+    LIST = 1
+    DRAW = 2
+    ALL = 3
 
 
 def draws_blocks(device: torch.device) -> bool:
@@ -44,6 +43,38 @@ def decoded(blocks: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(pages))
 
 
+class Sheet(NamedTuple):
+    """How the pages of an atlas are put together to one texture: below each other, then beside.
+
+    Attributes:
+        down: pages below each other.
+        width, height: from the corner of a page to that of the next, in texels of the atlas.
+    """
+
+    down: int
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, pages: int, height: int, width: int) -> Sheet:
+        """Of so many pages of so many texels: up to 2^14 rows, which textures of any kind have, and where coordinates
+        keep the texture unit's fractions of a texel."""
+        height, width = -(-height // 4) * 4, -(-width // 4) * 4  # corners on the grid of the coarsest level
+        return cls(max(1, min(pages, 2**14 // height)), width, height)
+
+    def joined(self, pages: Tensor, texels: int) -> Tensor:
+        """Pages [pages, rows, columns, channels] as one [rows, columns, channels]; those of a level, or of blocks, with
+        `texels` texels of the atlas along a side of theirs."""
+        height, width = self.height // texels, self.width // texels
+        count, rows, columns, channels = pages.shape
+        beside = max(1, -(-count // self.down))
+        if beside == 1 and (rows, columns) == (height, width):
+            return pages.reshape(count * height, width, channels)
+        sheet = pages.new_zeros(beside, self.down, height, width, channels)
+        sheet.view(-1, height, width, channels)[:count, :rows, :columns] = pages
+        return sheet.permute(1, 2, 0, 3, 4).reshape(self.down * height, beside * width, channels)
+
+
 class AtlasTexture:
     """The pages of an atlas in the memory of a device, as its texture unit reads them.
 
@@ -52,12 +83,17 @@ class AtlasTexture:
             [layers, height / 4, width / 4, 16] uint8. On the CPU.
         blocks: `texels` are BC7 blocks; decoded, with a warning, where the device draws no such textures.
         device: where the surfels are.
+        sheet: of the atlas whose level these are; None: they are the atlas.
+        level: which one.
 
     Raises:
-        RuntimeError: the device has too little memory, refuses textures of this size, or is no CUDA device.
+        ValueError: there are more texels than a texture has.
+        RuntimeError: the device has too little memory, or is no CUDA device.
     """
 
-    def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
+    def __init__(
+        self, texels: Tensor, blocks: bool, device: torch.device, sheet: Sheet | None = None, level: int = 0
+    ) -> None:
         require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
         texels = texels.detach().cpu()
         if blocks and not draws_blocks(device):
@@ -66,29 +102,29 @@ class AtlasTexture:
                 f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory",
                 stacklevel=2,
             )
-        layers, height, width = texels.shape[:3]
+        side = 4 if blocks else 1  # of what a texel of `texels` stands for
+        count, height, width = texels.shape[:3]
+        self.sheet = sheet or Sheet.of(count, side * height, side * width)
         if blocks:
-            name, height, width = "bc7", 4 * height, 4 * width
+            name = "bc7"
         elif texels.dtype == torch.uint8:
             name = "uint8"
         else:
             name, texels = "half", texels.half()
-        data = texels.contiguous().view(torch.uint8)
+        joined = self.sheet.joined(texels, side << level)
+        size = {"height": side * joined.shape[0], "width": side * joined.shape[1]}
         with on_device(device):
-            self.texture = module(device).AtlasTexture(
-                format=name, layers=layers, height=height, width=width, texels=data
-            )
-        # handles are 64 bits without a sign
-        self.pages = torch.tensor([h - (1 << 64) if h >> 63 else h for h in self.texture.handles], device=device)
+            self.texture = module(device).AtlasTexture(format=name, texels=joined.view(torch.uint8), **size)
 
 
-def coarser(scene: BakedScene, device: torch.device) -> dict[str, AtlasTexture]:
+def coarser(scene: BakedScene, device: torch.device, sheet: Sheet) -> dict[str, AtlasTexture]:
     """The levels of an atlas as textures, by name; those of blocks are bytes."""
     texels = scene.atlas
     if texels is None:
         assert scene.blocks is not None
         texels = decoded(scene.blocks)
-    return {name: AtlasTexture(pages, False, device) for name, pages, _ in tile_levels(texels, scene.tiles.cpu())}
+    levels = enumerate(tile_levels(texels, scene.tiles.cpu()), start=1)
+    return {name: AtlasTexture(pages, False, device, sheet, level) for level, (name, pages, _) in levels}
 
 
 def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
@@ -123,10 +159,11 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
     if texels is not None:
         is_blocks = texels is scene.blocks
         kept = scene.cache.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
-        atlas = {"texture": kept.texture, "pages": kept.pages}
+        atlas = {"texture": kept.texture, "pages_down": kept.sheet.down}
+        atlas |= {"page_width": kept.sheet.width, "page_height": kept.sheet.height}
         if photo_pixel < 1.0:
-            for name, level in scene.cache.coarser(lambda: coarser(scene, device)).items():
-                atlas |= {name: level.texture, f"{name}_pages": level.pages}
+            for name, level in scene.cache.coarser(lambda: coarser(scene, device, kept.sheet)).items():
+                atlas[name] = level.texture
     with on_device(device):
         return module(device).BakedScene(
             **{name: p[name] for name in GEOMETRY},
@@ -140,6 +177,17 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
         )
 
 
+def tiles_of(views: int, width: int, height: int) -> int:
+    """Screen tiles of all views."""
+    return -(-width // 16) * -(-height // 16) * views
+
+
+def slots_per_tile(capacity: int, tiles: int) -> int:
+    """Slots for the pairs of each screen tile: twice the mean of `capacity` pairs, or more while 32 MB hold all, but no
+    more than a block of the device sorts at once. Pairs beyond them are in one list of all tiles."""
+    return max(32, min(1024, max(2 * capacity, 1 << 23) // tiles) // 32 * 32)
+
+
 class Workspace:
     """Working memory of frames on a device; it grows when a frame is prepared that needs more, and stays.
 
@@ -147,7 +195,8 @@ class Workspace:
         device: a CUDA device.
 
     Attributes:
-        capacity: pairs of surfel and tile that fit.
+        capacity: pairs of surfel and screen tile that fit, however they are distributed over the tiles.
+        slots: of a tile; 0 before the first frame.
         memory: [bytes] uint8, None before the first frame.
 
     Raises:
@@ -157,7 +206,7 @@ class Workspace:
     def __init__(self, device: torch.device) -> None:
         require("baked_cuda.Workspace", "cuda", device, ON_CPU)
         self._device = device
-        self.capacity = 0
+        self.capacity = self.slots = 0
         self.memory: Tensor | None = None
 
     def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
@@ -171,26 +220,40 @@ class Workspace:
         if capacity > most:
             raise ValueError(f"the view needs {capacity} pairs of surfel and tile, a frame can have {most}")
         self.capacity = max(self.capacity, capacity) or min(most, 4 * surfels * views)
+        self.slots = slots_per_tile(self.capacity, tiles_of(views, width, height))
         size = {"surfels": surfels, "views": views, "width": width, "height": height, "normals": normals}
         with on_device(device):
-            needed = kernels.baked_memory(**size, capacity=self.capacity)
+            needed = kernels.baked_memory(**size, slots=self.slots, capacity=self.capacity)
         if self.memory is None or self.memory.numel() < needed:
             self.memory = None  # frees the old before the new is taken
             self.memory = torch.empty(needed, dtype=torch.uint8, device=device)
 
+    def counts(self) -> tuple[int, int]:
+        """Pairs of surfel and tile in the latest frame, which had surfels, and how many of them found no slot.
+
+        Waits for the device.
+        """
+        assert self.memory is not None
+        pairs, spilled = self.memory[:16].view(torch.int64).tolist()
+        return pairs, spilled
+
     @property
     def pairs(self) -> int:
         """Pairs of surfel and tile in the latest frame, which had surfels; waits for the device."""
-        assert self.memory is not None
-        return int(self.memory[:8].view(torch.int64))
+        return self.counts()[0]
+
+    @property
+    def complete(self) -> bool:
+        """Whether there was room for all pairs of the latest frame, which had surfels; waits for the device."""
+        return self.counts()[1] <= self.capacity
 
     def frame_fitted(self) -> bool:
         """Whether the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
 
         Waits for the device.
         """
-        pairs = self.pairs
-        fitted = pairs <= self.capacity
+        pairs, spilled = self.counts()
+        fitted = spilled <= self.capacity
         self.capacity = pairs + pairs // 4 + 1
         return fitted
 
@@ -201,7 +264,7 @@ class ListedPairs(NamedTuple):
     Attributes:
         ranges: [tiles, 2] where the list of each screen tile begins and ends, all views one after the other.
         depth: [surfels * views] keys in the order of depth, 2^32 - 1: not visible.
-        pairs: [capacity] row << 8 | mask of the 8 x 4 parts of the tile.
+        pairs: row << 8 | mask of the 8 x 4 parts of the tile, tile by tile.
     """
 
     ranges: Tensor
@@ -215,11 +278,11 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """What the latest frame left in the working memory (`lay_out` of csrc/cuda/baked_bin.cu), on the CPU: for tests and
-    for counting what a frame costs."""
+    """What the latest frame, without normals, left in the working memory (`lay_out` of csrc/cuda/baked_frame.cu), on
+    the CPU: for tests and for counting what a frame costs."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
-    tiles, rows = -(-width // 16) * -(-height // 16) * views, surfels * views
+    tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots
 
     def take(count: int) -> Tensor:
         nonlocal at
@@ -227,10 +290,18 @@ def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, hei
         at += -(-4 * count // 256) * 256
         return values
 
-    ranges = take(2 * tiles).view(tiles, 2)
+    lists = take(8 * tiles).view(tiles, 8).long() & 0xFFFFFFFF
     take(24 * rows)
+    depth = take(rows).long() & 0xFFFFFFFF
+    pairs = take(tiles * slots + workspace.capacity).long() & 0xFFFFFFFF
+    counts, rest = torch.where(lists[:, 0] > slots, lists[:, 1], lists[:, 0]), lists[:, 2]
+    ends = counts.cumsum(0)
+    begins = ends - counts
+    tile = torch.repeat_interleave(torch.arange(tiles), counts)
+    index = torch.arange(len(tile)) - begins[tile]  # in the tile's list
+    at_slot = index < slots
     return ListedPairs(
-        ranges, take(rows).long() & 0xFFFFFFFF, take(-(-workspace.capacity // 8) * 8).long() & 0xFFFFFFFF
+        torch.stack([begins, ends], dim=1), depth, pairs[index + torch.where(at_slot, tile * slots, rest[tile])]
     )
 
 
@@ -265,8 +336,8 @@ def frame(
 ) -> None:
     """Draws views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
 
-    When more pairs were needed than the workspace has room for, surfels are missing: compare `workspace.pairs` with
-    `workspace.capacity`, `resize` and draw again.
+    When more pairs were needed than the workspace has room for, surfels are missing: ask `workspace.complete`, `resize`
+    and draw again.
 
     Args:
         scene: of `compiled`.
@@ -295,6 +366,7 @@ def frame(
         stages=int(stages),
         photo_pixel=photo_pixel,
         memory=workspace.memory,
+        slots=workspace.slots,
         capacity=workspace.capacity,
     )
 

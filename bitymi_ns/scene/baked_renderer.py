@@ -109,7 +109,7 @@ class BakedRenderer:
 
     def complete(self) -> bool:
         """Whether the working memory was large enough for the latest frame; waits for it."""
-        return self._surfels == 0 or self.workspace.pairs <= self.workspace.capacity
+        return self._surfels == 0 or self.workspace.complete
 
     def _draw(self, stages: Stage) -> None:
         frame(self._scene, self._viewmats, self._Ks, self._background, self.images, self.workspace, stages)

@@ -67,39 +67,36 @@ void bind_operations(nb::module_& m) {
 
 constexpr const char* kFormats[] = {"bc7", "uint8", "half"};
 struct Texels {
-  int format, layers, height, width;
+  int format, height, width;
   const uint8_t* texels;
 
   template <class R>
   void fields(R& r) {
     r.choice("format", format, kFormats);
-    r.number("layers", layers);
     r.number("height", height);
     r.number("width", width);
     const int bytes[] = {1, 4, 8};  // per texel
-    r.array("texels", texels, bytes[format] * layers * int64_t(height) * width);
+    r.array("texels", texels, bytes[format] * int64_t(height) * width);
   }
 };
 
 void bind_baked(nb::module_& m) {
-  nb::class_<AtlasTexture>(m, "AtlasTexture")
-      .def("__init__",
-           [](AtlasTexture* to, const nb::kwargs& given) {
-             const Device host = {nb::device::cpu::value, "the CPU", false};
-             Reader r("AtlasTexture", given, host);
-             const Texels t = read<Texels>(r);
-             new (to) AtlasTexture(TexelFormat(t.format), t.layers, t.height, t.width, t.texels);
-           })
-      .def_prop_ro("handles", &AtlasTexture::handles);
+  nb::class_<AtlasTexture>(m, "AtlasTexture").def("__init__", [](AtlasTexture* to, const nb::kwargs& given) {
+    const Device host = {nb::device::cpu::value, "the CPU", false};
+    Reader r("AtlasTexture", given, host);
+    const Texels t = read<Texels>(r);
+    new (to) AtlasTexture(TexelFormat(t.format), t.height, t.width, t.texels);
+  });
   m.def("draws_bc7", &draws_bc7, "Whether the current device draws BC7 blocks; tried once.");
   bind_class<BakedScene>(m, "BakedScene", kCard, "A baked scene as the kernels read it.");
   bind_operation(m, "baked_frame", &baked_frame);
   m.def(
       "baked_memory",
-      [](int64_t surfels, int views, int width, int height, int64_t capacity, bool normals) {
-        return baked_memory(surfels, {views, width, height, nullptr, nullptr}, capacity, normals);
+      [](int64_t surfels, int views, int width, int height, int slots, int64_t capacity, bool normals) {
+        return baked_memory(surfels, {views, width, height, nullptr, nullptr}, slots, capacity, normals);
       },
-      "surfels"_a, "views"_a, "width"_a, "height"_a, "capacity"_a, "normals"_a, "Bytes of working memory of a frame.");
+      "surfels"_a, "views"_a, "width"_a, "height"_a, "slots"_a, "capacity"_a, "normals"_a,
+      "Bytes of working memory of a frame.");
   m.attr("MOST_ROWS") = kMostRows;
   m.attr("MOST_PAIRS") = kMostPairs;
 }

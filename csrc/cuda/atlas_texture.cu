@@ -1,7 +1,9 @@
-// Atlas pages on the device; on the host a stand-in with the texture unit's rounding.
+// An atlas on the device; on the host a stand-in with the texture unit's rounding.
 #include <cstring>
 #include <map>
 #include <stdexcept>
+#include <string>
+#include <vector>
 
 #include "cuda/atlas_texture.h"
 
@@ -12,11 +14,20 @@
 
 namespace bt::cuda {
 
+namespace {
+void check_size(int height, int width) {
+  if (height > kMostTextureHeight || width > kMostTextureWidth)
+    throw std::invalid_argument("the pages of the atlas come to " + std::to_string(width) + " x " +
+                                std::to_string(height) + " texels, a texture has " + std::to_string(kMostTextureWidth) +
+                                " x " + std::to_string(kMostTextureHeight) + " at most: bake fewer texels");
+}
+}  // namespace
+
 #if defined(__CUDACC__)
 
 namespace {
-// The array and the texture of a page; `page` is set as soon as there is something to free.
-cudaTextureObject_t make_page(TexelFormat format, int height, int width, const char* texels, cudaArray_t& page) {
+// The array and its texture; `array` is set as soon as there is something to free.
+cudaTextureObject_t make_texture(TexelFormat format, int height, int width, const void* texels, cudaArray_t& array) {
   const bool blocks = format == TexelFormat::kBc7, half = format == TexelFormat::kHalf;
   const cudaChannelFormatDesc channels = blocks
                                              ? cudaCreateChannelDesc<cudaChannelFormatKindUnsignedBlockCompressed7>()
@@ -24,16 +35,16 @@ cudaTextureObject_t make_page(TexelFormat format, int height, int width, const c
   // a row of blocks is four rows of texels
   const size_t row = blocks ? size_t(width) / 4 * 16 : size_t(width) * (half ? 8 : 4);
   const size_t rows = blocks ? height / 4 : height;
-  check(cudaMallocArray(&page, &channels, width, height), "memory for a page of the atlas");
+  check(cudaMallocArray(&array, &channels, width, height), "memory for the atlas");
   cudaMemcpy3DParms copy = {};
-  copy.srcPtr = make_cudaPitchedPtr(const_cast<char*>(texels), row, width, rows);
-  copy.dstArray = page;
+  copy.srcPtr = make_cudaPitchedPtr(const_cast<void*>(texels), row, width, rows);
+  copy.dstArray = array;
   copy.extent = make_cudaExtent(width, height, 1);  // of an array of blocks: in texels (measured; not written down)
   copy.kind = cudaMemcpyHostToDevice;
   check(cudaMemcpy3D(&copy), "copy of the atlas");
   cudaResourceDesc resource = {};
   resource.resType = cudaResourceTypeArray;
-  resource.res.array.array = page;
+  resource.res.array.array = array;
   cudaTextureDesc sampling = {};
   sampling.addressMode[0] = sampling.addressMode[1] = cudaAddressModeClamp;
   sampling.filterMode = cudaFilterModeLinear;
@@ -44,7 +55,7 @@ cudaTextureObject_t make_page(TexelFormat format, int height, int width, const c
   return texture;
 }
 
-// A page of blocks of one colour each, and what lies between its texels.
+// Blocks of one colour each, and what lies between its texels.
 constexpr int kProbeWidth = 32, kProbeHeight = 16, kProbeAcross = kProbeWidth / 4;
 constexpr int kProbeX = kProbeWidth / 2 - 1, kProbeY = kProbeHeight / 2 - 1;
 int probe_red(int block) { return 6 * block + 11; }  // odd, as the last bit of every colour below
@@ -65,17 +76,16 @@ void probe() {                        // throws when it does not work
   std::vector<unsigned char> blocks(4 * kProbeWidth * kProbeHeight);
   for (int i = 0; i < kProbeAcross * kProbeHeight / 4; ++i) probe_block(i, blocks.data() + 16 * i);
   struct Owned {
-    cudaArray_t page = nullptr;
+    cudaArray_t array = nullptr;
     cudaTextureObject_t texture = 0;
     float4* found = nullptr;
     ~Owned() {
       cudaFree(found);
       if (texture) cudaDestroyTextureObject(texture);
-      if (page) cudaFreeArray(page);
+      if (array) cudaFreeArray(array);
     }
   } owned;
-  const char* texels = reinterpret_cast<const char*>(blocks.data());
-  owned.texture = make_page(TexelFormat::kBc7, kProbeHeight, kProbeWidth, texels, owned.page);
+  owned.texture = make_texture(TexelFormat::kBc7, kProbeHeight, kProbeWidth, blocks.data(), owned.array);
   check(cudaMalloc(&owned.found, kProbeX * kProbeY * sizeof(float4)), "memory for a probe");
   BT_LAUNCH(probe_kernel, dim3(kProbeY), dim3(kProbeX), 0, nullptr, owned.texture, owned.found);
   float4 found[kProbeY][kProbeX];
@@ -108,27 +118,19 @@ bool draws_bc7() {
   }
 }
 
-AtlasTexture::AtlasTexture(TexelFormat format, int layers, int height, int width, const void* texels) {
-  const bool blocks = format == TexelFormat::kBc7;
-  if (blocks && !draws_bc7()) throw std::runtime_error("this card draws no BC7 textures: decode the blocks first");
-  const size_t bytes = size_t(height) * width * (blocks ? 1 : format == TexelFormat::kHalf ? 8 : 4);
+AtlasTexture::AtlasTexture(TexelFormat format, int height, int width, const void* texels) {
+  check_size(height, width);
+  if (format == TexelFormat::kBc7 && !draws_bc7())
+    throw std::runtime_error("this card draws no BC7 textures: decode the blocks first");
   check(cudaGetDevice(&device_), "current device");
+  cudaArray_t array = nullptr;
   try {
-    for (int layer = 0; layer < layers; ++layer) {
-      pages_.push_back(nullptr);
-      cudaArray_t page = nullptr;
-      const char* from = static_cast<const char*>(texels) + bytes * layer;
-      try {
-        handles_.push_back(make_page(format, height, width, from, page));
-      } catch (...) {
-        pages_.back() = page;
-        throw;
-      }
-      pages_.back() = page;
-    }
+    handle_ = make_texture(format, height, width, texels, array);
+    texels_ = array;
     // a copy from pageable memory may still be under way, and streams other than the default one do not wait for it
     check(cudaStreamSynchronize(nullptr), "copy of the atlas");
   } catch (...) {
+    texels_ = array;
     release();
     throw;
   }
@@ -138,13 +140,10 @@ void AtlasTexture::release() {
   int current = device_;
   cudaGetDevice(&current);
   cudaSetDevice(device_);
-  cudaDeviceSynchronize();  // frames under way still read the pages
-  for (uint64_t texture : handles_) cudaDestroyTextureObject(texture);
-  for (void* page : pages_)
-    if (page) cudaFreeArray(static_cast<cudaArray_t>(page));
+  cudaDeviceSynchronize();  // frames under way still read the texels
+  if (handle_) cudaDestroyTextureObject(handle_);
+  if (texels_) cudaFreeArray(static_cast<cudaArray_t>(texels_));
   cudaSetDevice(current);
-  handles_.clear();
-  pages_.clear();
 }
 
 #else
@@ -152,7 +151,7 @@ void AtlasTexture::release() {
 bool draws_bc7() { return false; }
 
 namespace {
-struct Page {
+struct HostTexture {
   int height, width;
   std::vector<float> texels;  // RGBA
 };
@@ -165,34 +164,30 @@ float from_half(uint16_t h) {
 }
 }  // namespace
 
-AtlasTexture::AtlasTexture(TexelFormat format, int layers, int height, int width, const void* texels) {
+AtlasTexture::AtlasTexture(TexelFormat format, int height, int width, const void* texels) {
+  check_size(height, width);
   if (format == TexelFormat::kBc7)
     throw std::runtime_error("the host has no texture unit: decode the BC7 blocks first");
   const size_t values = size_t(height) * width * 4;
-  for (int layer = 0; layer < layers; ++layer) {
-    auto page = std::make_unique<Page>(Page{height, width, std::vector<float>(values)});
-    for (size_t i = 0; i < values; ++i)
-      page->texels[i] = format == TexelFormat::kHalf
-                            ? from_half(static_cast<const uint16_t*>(texels)[values * layer + i])
-                            : static_cast<const uint8_t*>(texels)[values * layer + i] * (1.0f / 255);
-    handles_.push_back(reinterpret_cast<uint64_t>(page.get()));
-    pages_.push_back(page.release());
-  }
+  auto texture = std::make_unique<HostTexture>(HostTexture{height, width, std::vector<float>(values)});
+  for (size_t i = 0; i < values; ++i)
+    texture->texels[i] = format == TexelFormat::kHalf ? from_half(static_cast<const uint16_t*>(texels)[i])
+                                                      : static_cast<const uint8_t*>(texels)[i] * (1.0f / 255);
+  handle_ = reinterpret_cast<uint64_t>(texture.get());
+  texels_ = texture.release();
 }
 AtlasTexture::~AtlasTexture() { release(); }
-void AtlasTexture::release() {
-  for (void* page : pages_) delete static_cast<Page*>(page);
-}
+void AtlasTexture::release() { delete static_cast<HostTexture*>(texels_); }
 
 float4 fetch_texel(uint64_t handle, float x, float y) {
-  const Page& page = *reinterpret_cast<const Page*>(handle);
+  const HostTexture& texture = *reinterpret_cast<const HostTexture*>(handle);
   // weights are fixed point with 8 bits of fraction
   const float bx = std::floor(x - 0.5f), by = std::floor(y - 0.5f);
   const float fx = std::floor((x - 0.5f - bx) * 256 + 0.5f) / 256, fy = std::floor((y - 0.5f - by) * 256 + 0.5f) / 256;
   const auto at = [&](float column, float row) {
-    const int i = column < 0 ? 0 : column > page.width - 1 ? page.width - 1 : int(column);
-    const int j = row < 0 ? 0 : row > page.height - 1 ? page.height - 1 : int(row);
-    return page.texels.data() + 4 * (size_t(j) * page.width + i);
+    const int i = column < 0 ? 0 : column > texture.width - 1 ? texture.width - 1 : int(column);
+    const int j = row < 0 ? 0 : row > texture.height - 1 ? texture.height - 1 : int(row);
+    return texture.texels.data() + 4 * (size_t(j) * texture.width + i);
   };
   const float *t00 = at(bx, by), *t10 = at(bx + 1, by), *t01 = at(bx, by + 1), *t11 = at(bx + 1, by + 1);
   float c[4];

@@ -1,8 +1,8 @@
-// The pages of an atlas as textures: bilinear, unnormalised coordinates, RGBA as floats in [0, 1] (halves: as stored).
+// The pages of an atlas as one texture: bilinear, unnormalised coordinates, RGBA as floats in [0, 1] (halves: as
+// stored).
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
 #include "cuda/device.h"
 
@@ -13,30 +13,35 @@ enum class TexelFormat { kBc7, kUint8, kHalf };
 // Whether the current device draws BC7 blocks, found out by drawing some. The first call waits for the device.
 bool draws_bc7();
 
-// One texture per page: a handle is 64 bits, the same in a whole warp, and pages are as large as they like. Memory is
-// allocated here, once, and freed by the destructor. Throws std::runtime_error when the device refuses.
+// Of a texture, on every card that the kernels are built for.
+constexpr int kMostTextureWidth = 131072, kMostTextureHeight = 65536;
+
+// One texture of all pages, which the caller has put together, so that its handle is an argument of the drawing kernel:
+// a handle per surfel is the same in a whole warp, but the compiler cannot know that, and takes sixteen instructions to
+// find out. Memory is allocated here, once, and freed by the destructor. Throws std::runtime_error when the device
+// refuses, std::invalid_argument when the texture is too large for any.
 class AtlasTexture {
  public:
-  // texels: on the host, [layers, height, width, 4] bytes or halves, or BC7 blocks [layers, height / 4, width / 4, 16].
-  AtlasTexture(TexelFormat format, int layers, int height, int width, const void* texels);
+  // texels: on the host, [height, width, 4] bytes or halves, or BC7 blocks [height / 4, width / 4, 16].
+  AtlasTexture(TexelFormat format, int height, int width, const void* texels);
   ~AtlasTexture();
   AtlasTexture(const AtlasTexture&) = delete;
   AtlasTexture& operator=(const AtlasTexture&) = delete;
-  const std::vector<uint64_t>& handles() const { return handles_; }
+  uint64_t handle() const { return handle_; }
 
  private:
   void release();
-  std::vector<uint64_t> handles_;
-  std::vector<void*> pages_;
+  uint64_t handle_ = 0;
+  void* texels_ = nullptr;
   int device_ = 0;
 };
 
 #if defined(__CUDACC__)
-__device__ __forceinline__ float4 fetch_texel(uint64_t page, float x, float y) {
-  return tex2D<float4>(static_cast<cudaTextureObject_t>(page), x, y);
+__device__ __forceinline__ float4 fetch_texel(uint64_t texture, float x, float y) {
+  return tex2D<float4>(static_cast<cudaTextureObject_t>(texture), x, y);
 }
 #else
-float4 fetch_texel(uint64_t page, float x, float y);
+float4 fetch_texel(uint64_t texture, float x, float y);
 #endif
 
 }  // namespace bt::cuda

@@ -1,14 +1,15 @@
 // The forward-only renderer of a baked scene on the device.
 //
-//   prepare   one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
-//             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later.
-//   bin       pairs of surfel and tile are listed as they are found, numbered within their tile, and moved to their
-//             tile's list; each tile then sorts its own list front to back (ties by the surfel's number).
-//   draw      one warp per 8 x 8 pixels, two per thread, four warps per tile of 16 x 16. A pair carries the mask of the
-//             8 x 4 parts of the tile that its surfel reaches, so a warp looks at those alone.
+//   list      one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
+//             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later. Pairs of surfel
+//             and tile are numbered within their tile as they are found, and written to the tile's slot of this number,
+//             or to a list of all tiles where it has no slot.
+//   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's number);
+//             then one warp per 8 x 8 pixels, two per thread. A pair carries the mask of the 8 x 4 parts of the tile
+//             that its surfel reaches, so a warp looks at those alone.
 //
-// Nothing is allocated and nothing waits: counts stay on the device. When the pairs do not fit, `total` says how many
-// there are; the image then lacks surfels and the frame is to be drawn again with more capacity.
+// Nothing is allocated and nothing waits: counts stay on the device. Pairs without room are counted; the image then
+// lacks surfels and the frame is to be drawn again with more capacity.
 #pragma once
 
 #include <cstddef>
@@ -30,13 +31,11 @@ struct BakedScene : BakedResidual {
   ViewColorArrays<const float> colors;
   LeanColors<float> lean;  // in place of those where lean.base is not null
   int64_t lean_terms;
-  const int32_t* tiles;   // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
-  const uint64_t* pages;  // [page_count] a texture per page of the atlas, null: none
-  int64_t page_count;
-  const AtlasTexture* texture;  // whose pages they are; Python keeps it
-  // likewise the levels of the tiles (core/texel.h), for views smaller than the photographs; null: none
-  const uint64_t* coarser[kTileLevels - 1];
-  const AtlasTexture* coarser_texture[kTileLevels - 1];
+  const int32_t* tiles;  // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
+  // The atlas, and the levels of its tiles (core/texel.h) for views smaller than the photographs; null: none. On the
+  // host; Python keeps them.
+  const AtlasTexture* levels[kTileLevels];
+  int pages_down, page_width, page_height;  // pages lie below each other, so many of them, then beside
   float near;
   bool through_pixel;  // chooses between the kernels of core/surfel.h
 
@@ -49,12 +48,15 @@ struct BakedScene : BakedResidual {
     else
       colors.fields(r, n);
     r.array("tiles", tiles, 5 * n);
-    if (r.given("pages")) r.rows("pages", pages, page_count, 1);
-    r.maybe_object("texture", texture);
-    r.maybe("half_pages", coarser[0], page_count);
-    r.maybe("quarter_pages", coarser[1], page_count);
-    r.maybe_object("half", coarser_texture[0]);
-    r.maybe_object("quarter", coarser_texture[1]);
+    r.maybe_object("texture", levels[0]);
+    r.maybe_object("half", levels[1]);
+    r.maybe_object("quarter", levels[2]);
+    pages_down = 1, page_width = page_height = 0;
+    if (levels[0]) {
+      r.number("pages_down", pages_down);
+      r.number("page_width", page_width);
+      r.number("page_height", page_height);
+    }
     BakedResidual::fields(r, n);
     r.number("near", near);
     r.number("through_pixel", through_pixel);
@@ -87,13 +89,14 @@ struct BakedImages {
   }
 };
 
-enum BakedStage { kPrepare = 1, kBin = 2, kDraw = 4 };
+enum BakedStage { kList = 1, kDraw = 2 };
 
 constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair holds 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 
-// Bytes of working memory. Its first 8 hold `total` after a frame, the number of pairs (int64).
-size_t baked_memory(int64_t surfels, const BakedViews& views, int64_t capacity, bool normals);
+// Bytes of working memory. After a frame its first 16 hold the number of pairs and how many of them found no slot,
+// which must be at most `capacity` (int64).
+size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals);
 
 // A frame of all views: the stages (a sum of BakedStage); one needs what those before it left in `memory`.
 struct BakedDraw {
@@ -103,7 +106,8 @@ struct BakedDraw {
   int stages;
   float photo_pixel;  // side of a photograph's pixel in pixels of the views
   Workspace memory;
-  int64_t capacity;  // pairs that fit
+  int slots;         // of a screen tile, for pairs; a multiple of 32
+  int64_t capacity;  // pairs that find no slot and fit
 
   template <class R>
   void fields(R& r) {
@@ -118,6 +122,7 @@ struct BakedDraw {
     r.number("stages", stages);
     r.number("photo_pixel", photo_pixel);
     r.memory("memory", memory);
+    r.number("slots", slots);
     r.number("capacity", capacity);
   }
 };

@@ -1,9 +1,10 @@
-// Third stage of the baked renderer: the images.
+// Second stage of the baked renderer: the images.
 //
-// A warp draws 8 x 8 pixels, two per thread (four rows apart), and works for itself: no barrier of the block, no
-// waiting for pixels elsewhere in the tile. It takes the tile's list 32 pairs at a time and keeps those whose mask
-// names one of its two parts. When it has 32 it loads their rows side by side into shared memory. Then every thread
-// reads the same row (a broadcast, four loads of 16 bytes), and works on both its pixels together.
+// The block of a tile sorts the tile's list. From there on a warp draws 8 x 8 pixels, two per thread (four rows apart),
+// and works for itself: no barrier of the block, no waiting for pixels elsewhere in the tile. It takes the tile's list
+// 32 pairs at a time and keeps those whose mask names one of its two parts. When it has 32 it loads their rows side by
+// side into shared memory. Then every thread reads the same row (a broadcast, four loads of 16 bytes), and works on
+// both its pixels together.
 //
 // On scenes like trained ones 2.5 of a tile's four warps examine a pair, in 4.3 of its 8 parts, and 6 of 10 pixels that
 // are examined blend it. So the masks leave little to reject. A hit costs one reciprocal, one logarithm, one
@@ -15,7 +16,7 @@
 #include "core/shading.h"
 #include "core/texel.h"
 #include "cuda/atlas_texture.h"
-#include "cuda/baked_stages.h"
+#include "cuda/baked_sort.h"
 #include "cuda/fast.h"
 
 namespace bt::cuda {
@@ -23,16 +24,13 @@ namespace bt::cuda {
 namespace {
 constexpr int kPixels = 2;  // per thread; with one, frames of bundles take 6 to 33 % longer on an H100
 constexpr int kWarps = 2 * kBands / kPixels, kThreads = kWarps * kWarp;
+static_assert(kThreads == kDrawThreads);
 constexpr int kRowQuads = kRow / 4;  // float4s of a row
 constexpr int kLook = 8;             // rows between looks whether all pixels are done
 
 struct DrawArgs {
-  const float* rows;
-  const float4* normals;
-  const uint32_t* pairs;
-  const int32_t* ranges;
-  const uint32_t* order;
-  int width, height, tiles_x, tiles_of_view;
+  BakedFrame frame;
+  uint64_t atlas[kTileLevels];
   float near, offset, scale, weight_bound, transmittance_min;
   float sharp;  // of the low pass (core/resize.h)
   BakedImages images;
@@ -54,7 +52,7 @@ struct Row {
 
 // Adds a row's fragments to the thread's pixels, with weight 0 to those that do not take it. The texels of all are on
 // their way before one is used.
-template <bool kMaps>
+template <bool kMaps, bool kLevels>
 __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
                                     const float (&weight)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
                                     Pixel (&p)[kPixels]) {
@@ -68,15 +66,21 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
   if (any && c.y != 0) {
     const float4 t = s.rest[1];
     if (c.y > 0) {
-      uint64_t page;
-      const float handle[2] = {c.z, c.w};
-      memcpy(&page, handle, sizeof page);
       float4 texel[kPixels];
-      BT_UNROLL
-      for (int j = 0; j < kPixels; ++j)
-        if (textured[j])
-          texel[j] = fetch_texel(page, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
-                                 t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
+      const auto fetch = [&](uint64_t atlas) {
+        BT_UNROLL
+        for (int j = 0; j < kPixels; ++j)
+          if (textured[j])
+            texel[j] = fetch_texel(atlas, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
+                                   t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
+      };
+      // by name, not by index: see AtlasTexture
+      if (!kLevels || c.z == 0)
+        fetch(a.atlas[0]);
+      else if (c.z == 1)
+        fetch(a.atlas[1]);
+      else
+        fetch(a.atlas[2]);
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j)
         if (textured[j])
@@ -95,7 +99,7 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
     p[j].red += w * color[j].x.v, p[j].green += w * color[j].y.v, p[j].blue += w * color[j].z.v;
     if (kMaps && taken[j]) {
       p[j].beta += w * s.g[kBeta];
-      const float4 n = a.normals ? a.normals[s.id] : make_float4(0, 0, 0, 0);
+      const float4 n = a.frame.memory.normals ? a.frame.memory.normals[s.id] : make_float4(0, 0, 0, 0);
       p[j].depth += w * f[j].depth.v;
       p[j].nx += w * n.x, p[j].ny += w * n.y, p[j].nz += w * n.z;
       ++p[j].count;
@@ -106,7 +110,7 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 // A row under the thread's pixels, of which the first is dx, dy from the projected centre. Both are worked on together,
 // so that one does not wait for the other's steps. Unless kAll the low pass does not show, and no pixel of the disc
 // lies before the near plane; PixelKernel is for the rows that it filters alone.
-template <bool kMaps, class Kernel, bool kAll>
+template <bool kMaps, bool kLevels, class Kernel, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];
   FastFloat y[kPixels];
@@ -142,7 +146,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
     taken[j] = v.takes;
     any |= taken[j];
   }
-  if (any) add<kMaps>(a, s, taken, weight, f, p);
+  if (any) add<kMaps, kLevels>(a, s, taken, weight, f, p);
 }
 
 // Rounded as the image of floats would be: the product for itself.
@@ -175,33 +179,51 @@ __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
 template <class Kernel>
 using Unfiltered = std::conditional_t<Kernel::kResized, ResizedKernel, LowPassKernel>;
 
+// Tiles of long lists are drawn first, so that none of them is left when all others are done. The block of such a tile
+// draws the tile of a block that draws one of them.
+__device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
+  if (block < unsigned(*m.long_count)) return m.long_tiles[block];
+  unsigned tile = block;
+  while (const uint32_t i = m.lists[tile].long_index) tile = i - 1;
+  return tile;
+}
+
+// Blocks per multiprocessor: as many as registers allow that the loop over pairs needs without the sort.
 template <bool kMaps, class Kernel>
-__global__ void __launch_bounds__(kThreads, (kMaps || Kernel::kPixel ? 3 : 4) * kPixels) draw_kernel(DrawArgs a) {
+constexpr int kBlocks =
+    bounded_blocks(kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9), kThreads);
+
+template <bool kMaps, class Kernel>
+__global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
+  constexpr bool kLevels = Kernel::kPixel || Kernel::kResized;  // those of smaller views are among these
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  const unsigned tile = a.order ? a.order[blockIdx.x] : blockIdx.x;
-  const int in_view = int(tile % unsigned(a.tiles_of_view));
-  const int x = in_view % a.tiles_x * kTile + (warp & 1) * 8 + (lane & 7);
-  const int y = in_view / a.tiles_x * kTile + (warp >> 1) * (kBandRows * kPixels) + (lane >> 3);
+  const BakedFrame& f = a.frame;
+  const unsigned tile = f.rows ? tile_of_block(f.memory, blockIdx.x) : blockIdx.x;
+  const unsigned tiles_of_view = unsigned(f.tiles_x * f.tiles_y);
+  const int in_view = int(tile % tiles_of_view);
+  const int x = in_view % f.tiles_x * kTile + (warp & 1) * 8 + (lane & 7);
+  const int y = in_view / f.tiles_x * kTile + (warp >> 1) * (kBandRows * kPixels) + (lane >> 3);
   const float px = pixel_centre<float>(x), py = pixel_centre<float>(y);
+  const int count = f.rows ? sort_list(f, tile, reinterpret_cast<Key*>(&staged[0][0])) : 0;
   float4* stage = staged[warp];
   uint32_t* queue = queues[warp];
   Pixel p[kPixels];
   uint32_t part[kPixels];  // bit of the part of the tile that holds the thread's pixel
   for (int j = 0; j < kPixels; ++j) {
-    p[j] = {x < a.width && y + kBandRows * j < a.height ? 1.0f : -1.0f, 0, 0, 0, 0, 0, 0, 0, 0, 0};
+    p[j] = {x < f.width && y + kBandRows * j < f.height ? 1.0f : -1.0f, 0, 0, 0, 0, 0, 0, 0, 0, 0};
     part[j] = 1u << (2 * ((warp >> 1) * kPixels + j) + (warp & 1));
   }
   uint32_t wanted = 0;  // parts that still take light
   for (int j = 0; j < kPixels; ++j) wanted |= __any_sync(kFullMask, p[j].transmittance > 0) ? part[j] : 0;
 
-  int next = a.ranges ? a.ranges[2 * int64_t(tile)] : 0;
-  const int end = a.ranges ? a.ranges[2 * int64_t(tile) + 1] : 0;
+  int next = 0;
   int waiting = 0;  // in the queue
   while (wanted) {
-    while (waiting < kWarp && next < end) {
-      const uint32_t pair = next + lane < end ? __ldg(a.pairs + next + lane) : 0u;
+    while (waiting < kWarp && next < count) {
+      const uint32_t from = next < f.slots ? tile * unsigned(f.slots) : f.memory.lists[tile].rest;
+      const uint32_t pair = next + lane < count ? f.memory.pairs[from + unsigned(next + lane)] : 0u;
       const unsigned votes = __ballot_sync(kFullMask, (pair & wanted) != 0);
       if (pair & wanted) queue[waiting + __popc(votes & ((1u << lane) - 1))] = pair;
       waiting += __popc(votes);
@@ -215,8 +237,8 @@ __global__ void __launch_bounds__(kThreads, (kMaps || Kernel::kPixel ? 3 : 4) * 
     for (int k = 0; k < kRowQuads; ++k) {
       const int quad = k * kWarp + lane, r = quad / kRowQuads;
       if (r < in_hand)
-        stage[quad] =
-            __ldg(reinterpret_cast<const float4*>(a.rows) + int64_t(queue[r] >> 8) * kRowQuads + quad % kRowQuads);
+        stage[quad] = __ldg(reinterpret_cast<const float4*>(f.memory.rows) + int64_t(queue[r] >> 8) * kRowQuads +
+                            quad % kRowQuads);
     }
     __syncwarp();
     const float4* q = stage;
@@ -238,11 +260,11 @@ __global__ void __launch_bounds__(kThreads, (kMaps || Kernel::kPixel ? 3 : 4) * 
                        kMaps ? queue[k] >> 8 : 0};
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
         if (filtered<Kernel>(s.g))
-          blend<kMaps, Kernel, true>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, Kernel, true>(a, s, dx, dy, p);
         else if (Kernel::kPixel || s.blur2 != 0)
-          blend<kMaps, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
         else
-          blend<kMaps, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
       }
     }
     wanted = 0;
@@ -252,25 +274,20 @@ __global__ void __launch_bounds__(kThreads, (kMaps || Kernel::kPixel ? 3 : 4) * 
     __syncwarp();
     if (lane < waiting) queue[lane] = moved;
   }
-  const int64_t view = tile / unsigned(a.tiles_of_view);
+  const int64_t view = tile / tiles_of_view;
   for (int j = 0; j < kPixels; ++j) {
     const int column = int(px), row = int(py) + kBandRows * j;  // not x and y, which would be kept for this alone
-    if (column < a.width && row < a.height) write<kMaps>(a, p[j], (view * a.height + row) * a.width + column);
+    if (column < f.width && row < f.height) write<kMaps>(a, p[j], (view * f.height + row) * f.width + column);
   }
 }
 }  // namespace
 
 void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame& f, Stream stream) {
   if (!f.tiles) return;
-  const DrawArgs a = {f.memory.rows,
-                      f.memory.normals,
-                      f.memory.pairs,
-                      f.rows ? f.memory.ranges : nullptr,
-                      f.rows ? f.memory.order : nullptr,
-                      f.width,
-                      f.height,
-                      f.tiles_x,
-                      f.tiles_x * f.tiles_y,
+  static_assert(kTileLevels == 3);
+  const auto handle = [&](int level) { return s.levels[level] ? s.levels[level]->handle() : 0; };
+  const DrawArgs a = {f,
+                      {handle(0), handle(1), handle(2)},
                       s.near,
                       s.offset,
                       s.scale,

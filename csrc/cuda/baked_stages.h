@@ -19,35 +19,50 @@ enum RowColumn {
                     // also says how high the low pass is: 1/255 is left of it there
   kRed,             // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
-  kPage,                   // handle of the texture, 64 bits
-  kTileX = kPage + 2,      // centre of the tile's first texel, two; or three: the colour with the constant residual
+  kLevel,                  // of the tile; the column after it is free
+  kTileX = kLevel + 2,     // centre of the tile's first texel, two; or three: the colour with the constant residual
   kSpanX = kTileX + 2,     // texels of the tile less one, two
   kRow = kSpanX + 2
 };
 static_assert(kRow == 24 && kR2 == 12);
 constexpr float kNearCuts = -1;  // without PixelKernel, which compares all rows that it does not filter
 
+// A screen tile's list: its first pairs are in slots of its own, the others as they come in one list of all tiles,
+// where each names the one before it. Four chains, because following one is waiting for memory at every step.
+constexpr int kChains = 4;
+struct alignas(16) TileList {
+  int32_t count;             // pairs
+  int32_t listed;            // where they are more than slots: those that are listed once that is done, before that 0
+  uint32_t rest;             // likewise from where on in `pairs` the list stands as a whole, but for its slots
+  uint32_t long_index;       // in long_tiles plus one, 0: the list is not long
+  uint32_t chains[kChains];  // the last pair's index in `spilled` plus one, 0: none
+};
+static_assert(sizeof(TileList) == 32);
+struct alignas(8) SpilledPair {
+  uint32_t pair, before;  // as in `pairs`; as in `chains`
+};
+
 struct BakedMemory {
-  int64_t* total;                     // pairs of surfel and tile
-  int32_t* given;                     // places of lists that tiles have taken
-  int32_t* large_count;               // surfels of many tiles
-  int32_t *long_tiles, *other_tiles;  // tiles whose list is long, and others
-  int32_t* ranges;                    // [tiles, 2] where a tile's list begins and ends; before that a 0 and its pairs
-  int64_t cleared;                    // bytes from `total` on that a frame begins with as zeros: all above
-  float* rows;                        // [rows, kRow]
-  float4* normals;                    // [rows], null: not wanted
-  uint32_t* depth;                    // [rows] keys in the order of depth
-  uint32_t* large;                    // [rows] surfels of many tiles
-  uint32_t* order;                    // [tiles] in which they are drawn
-  uint32_t* pairs;                    // [capacity] row << 8 | mask, tile by tile
-  uint64_t *keys, *merged;            // [capacity] of lists that are too long for shared memory
-  // [capacity] pairs as they come, in the memory of these: tile, row << 8 | mask, and which of the tile's pairs it is
-  uint32_t *listed_tile, *listed_pair;
-  int32_t* listed_number;
+  int64_t* total;          // pairs of surfel and tile
+  int64_t* spilled_count;  // of these, those that found no slot
+  int64_t* rest_count;     // of these, those that tiles have moved behind the slots
+  int32_t* large_count;    // surfels of many tiles
+  int32_t* long_count;     // tiles whose list is long
+  TileList* lists;         // [tiles]
+  int64_t cleared;         // bytes from `total` on that a frame begins with as zeros: all above
+  float* rows;             // [rows, kRow]
+  float4* normals;         // [rows], null: not wanted
+  uint32_t* depth;         // [rows] keys in the order of depth
+  uint32_t* pairs;         // [tiles * slots + capacity] row << 8 | mask
+  SpilledPair* spilled;    // [capacity]
+  uint32_t* large;         // [rows] surfels of many tiles
+  uint32_t* long_tiles;    // [tiles] those whose list is long
 };
 
 struct BakedFrame {
-  int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs
+  int64_t n, rows, capacity;  // surfels; surfels times views; room for pairs that find no slot
+  int slots;                  // of a tile
+  int long_from;              // pairs beyond which its list is long
   int width, height, tiles_x, tiles_y;
   int64_t tiles;       // of all views
   bool through_pixel;  // as in BakedScene
@@ -55,10 +70,12 @@ struct BakedFrame {
   BakedMemory memory;
 };
 
-void baked_prepare(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
-void baked_bin(const BakedFrame& frame, Stream stream);
-void baked_sort(const BakedFrame& frame, Stream stream);  // the end of baked_bin
+void baked_list(const BakedScene& surfels, const BakedViews& views, const BakedFrame& frame, Stream stream);
 void baked_draw(const BakedScene& surfels, const BakedImages& images, const BakedFrame& frame, Stream stream);
+
+__device__ inline int64_t add_to(int64_t* count, int64_t more) {  // what it was before
+  return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(count), static_cast<unsigned long long>(more)));
+}
 
 // The pixels that a surfel can touch, by tile.
 struct Footprint {

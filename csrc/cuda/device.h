@@ -70,6 +70,16 @@ using Stream = void*;
 constexpr int kWarp = 32;
 constexpr unsigned kFullMask = 0xffffffffu;
 
+// Threads of a multiprocessor; launch bounds must not ask for more.
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+constexpr int kMostThreads = 1024;
+#else
+constexpr int kMostThreads = 1536;
+#endif
+constexpr int bounded_blocks(int blocks, int threads) {
+  return blocks * threads > kMostThreads ? kMostThreads / threads : blocks;
+}
+
 // Sets memory to zero bytes, which are zeros of every number type.
 template <class T>
 void fill_zero(T* to, int64_t count, Stream stream) {

@@ -109,6 +109,12 @@ T atomicAdd(T* to, T value) {
   return old;
 }
 template <class T>
+T atomicExch(T* to, T value) {
+  const T old = *to;
+  *to = value;
+  return old;
+}
+template <class T>
 T atomicMax(T* to, T value) {
   const T old = *to;
   if (value > old) *to = value;

@@ -24,7 +24,7 @@ from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import draw
-from bitymi_ns.ops.baked_cuda import Stage, draws_blocks
+from bitymi_ns.ops.baked_cuda import Sheet, Stage, draws_blocks
 from bitymi_ns.ops.baked_scene import DrawCache
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera, baked_renderer
@@ -241,7 +241,7 @@ def test_stages_one_by_one(device: torch.device) -> None:
     whole = {name: image.clone() for name, image in renderer.draw([front(40, 30)]).items()}
     for image in renderer.images.values():
         image.zero_()
-    for stage in (Stage.PREPARE, Stage.BIN, Stage.DRAW):
+    for stage in (Stage.LIST, Stage.DRAW):
         renderer.run(stage)
     for name, image in renderer.images.items():
         assert torch.equal(image, whole[name]), name
@@ -276,6 +276,32 @@ def test_nothing_to_see(device: torch.device) -> None:
         assert torch.equal(output.rgb, background.expand_as(output.rgb)) and not output.overdraw.any()
 
 
+@pytest.mark.parametrize("photo_pixel", [1.0, 0.5, 0.25])
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+def test_where_pages_lie_in_the_texture_does_not_show(
+    prefilter: str, photo_pixel: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Below each other, beside, in a grid with a gap, and with pages whose sides are on no grid."""
+    scene = replace(textured(30, 5), prefilter=prefilter)
+    assert scene.atlas is not None
+    atlas = torch.cat([scene.atlas, scene.atlas.flip(1)[:1]])
+    tiles = scene.tiles.clone()
+    tiles[:, 2] = torch.arange(30) % 3
+    wider = torch.zeros(3, atlas.shape[1] + 3, atlas.shape[2] + 1, 4, dtype=torch.uint8)
+    wider[:, :-3, :-1] = atlas
+    images = []
+    for down, pages in ((3, atlas), (1, atlas), (2, atlas), (3, wider), (2, wider)):
+        made = Sheet.of(3, *pages.shape[1:3])
+        assert made.down == 3 and made.width % 4 == 0 and made.height % 4 == 0
+        monkeypatch.setattr(Sheet, "of", lambda *size, made=made, down=down: made._replace(down=down))
+        placed = replace(scene, atlas=pages, tiles=tiles).to(device)
+        images.append(baked_cuda.draw(placed, [front()], None, ("rgb",), photo_pixel)["rgb"])
+        monkeypatch.undo()
+    for image in images[1:]:
+        off = (image - images[0]).abs()  # where a coordinate lies between two of the texture unit's fractions
+        assert off.max() < 1 / 256 and (off > 0).double().mean() < 0.01
+
+
 def test_errors(device: torch.device, cpu) -> None:
     scene = textured(4, 0).to(device)
     double = BakedScene({name: v.double() for name, v in scene.surfels.items()}, "sv", scene.tiles, None)
@@ -294,7 +320,14 @@ def test_errors(device: torch.device, cpu) -> None:
     with pytest.raises(ValueError, match="draws .1, 8, 8."):
         BakedRenderer(scene, 8, 8).draw([front(8, 9)])
     with pytest.raises(ValueError, match="16777217, at most 16777216"):
-        module(device).baked_memory(2**24 + 1, 1, 8, 8, 1, False)
+        module(device).baked_memory(2**24 + 1, 1, 8, 8, 32, 1, False)
+    with pytest.raises(ValueError, match="has 33 slots, it needs a multiple of 32"):
+        module(device).baked_memory(1, 1, 8, 8, 33, 1, False)
+    with pytest.raises(ValueError, match="too many views, pixels or pairs"):
+        module(device).baked_memory(1, 1, 2**20, 2**20, 32, 1, False)
+    assert Sheet.of(9, 8192, 4096) == (2, 4096, 8192)
+    with pytest.raises(ValueError, match="come to 131076 x 4 texels, a texture has 131072 x 65536 at most: bake fewer"):
+        baked_cuda.AtlasTexture(torch.zeros(1, 4, 131076, 4, dtype=torch.uint8), False, device)
     with pytest.raises(ValueError, match="a frame can have"):
         BakedRenderer(scene, 8, 8)._resize(2**40)
     if device.type == "cpu":

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.baked_cuda import Stage, listed_pairs
+from bitymi_ns.ops import baked_cuda
+from bitymi_ns.ops.baked_cuda import Stage, Workspace, listed_pairs, slots_per_tile
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
@@ -16,22 +17,19 @@ from tests.ops.golden import SURFEL_KEYS, crossing_scene, random_scene, referenc
 
 def mask_pixels(renderer: BakedRenderer, surfels: int, width: int, height: int) -> int:
     """Pixels of all parts of tiles that pairs of a frame of one view name, within the image or not."""
-    pairs = listed_pairs(renderer.workspace, surfels, 1, width, height).pairs
-    masks = pairs[: renderer.workspace.pairs] & 0xFF
+    masks = listed_pairs(renderer.workspace, surfels, 1, width, height).pairs & 0xFF
     return 32 * sum(int((masks >> part & 1).sum()) for part in range(8))
 
 
 def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, views: int) -> list[Tensor]:
     """The surfels that each tile lists after a frame, numbered through all views.
 
-    They must be front to back, those of one depth by their number, each once; the lists must not overlap and hold all
-    pairs that fit.
+    They must be front to back, those of one depth by their number, each once; of a complete frame they must hold all
+    pairs.
     """
     ranges, depth, pairs = listed_pairs(renderer.workspace, surfels, views, width, height)
-    order = ranges[ranges[:, 0].argsort(stable=True)]
-    order = order[order[:, 0] < order[:, 1]]
-    assert order[0, 0] == 0 and torch.equal(order[1:, 0], order[:-1, 1])
-    assert order[-1, 1] == min(renderer.workspace.pairs, len(pairs))
+    if renderer.complete():
+        assert len(pairs) == renderer.workspace.pairs
     lists = [pairs[begin:end] >> 8 for begin, end in ranges.tolist()]
     for rows_of_tile in lists:
         keys = depth[rows_of_tile] * 2**24 + rows_of_tile
@@ -86,18 +84,27 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
     assert mask_pixels(renderer, 60, width, height) <= 1.25 * float(want.sum())
 
 
-def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu) -> None:
-    case = random_scene(12, 0, width=70, height=60)
+@pytest.fixture
+def few_slots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tiles have the fewest slots that the kernels take."""
+    monkeypatch.setattr(baked_cuda, "slots_per_tile", lambda capacity, tiles: 32)
+
+
+def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu, few_slots: None) -> None:
+    """Neither the tiles' slots nor the room for other pairs are enough."""
+    case = random_scene(60, 0, width=70, height=60)
     case.params["log_scales"] += 3.0  # every surfel on nearly every tile
     case.params["opacity_logits"] -= 3.0
     scene, camera = scene_of(case).to(device), camera_of(case)
     renderer = BakedRenderer(scene, camera.width, camera.height, images=("rgb",))
     small = renderer.workspace.capacity
     renderer.draw([camera], check=False)
-    assert not renderer.complete() and renderer.workspace.pairs > small
-    lists_of(renderer, 12, camera.width, camera.height, 1)
+    pairs, spilled = renderer.workspace.counts()
+    assert not renderer.complete() and pairs > spilled > small
+    lists = lists_of(renderer, 60, camera.width, camera.height, 1)
+    assert pairs - spilled < sum(len(rows) for rows in lists) <= pairs - spilled + small
     rgb = renderer.draw([camera])["rgb"].clone()
-    assert renderer.complete() and renderer.workspace.capacity > renderer.workspace.pairs
+    assert renderer.complete() and renderer.workspace.capacity > renderer.workspace.pairs == pairs
     again = renderer.draw([camera])["rgb"]
     assert torch.equal(rgb, again) and again.data_ptr() == renderer.images["rgb"].data_ptr()
     with cpu():
@@ -133,6 +140,46 @@ def test_lists_of_all_lengths_are_in_order(count: int, views: int, device: torch
         assert [len(each) for each in lists[view * per_view : (view + 1) * per_view]] == lengths[:per_view]
 
 
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize(
+    "count, width, height, scale", [(2500, 16, 16, 0.0), (1200, 40, 40, 2.0), (80, 90, 130, 3.0), (200, 300, 20, 1.0)]
+)
+def test_pairs_without_a_slot_are_listed_like_the_others(
+    count: int, width: int, height: int, scale: float, views: int, device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All pairs in one tile, some in several, those of surfels of many tiles, and tiles with and without."""
+    surfels = make_surfels(count, seed=31)
+    surfels["log_scales"] += scale
+    surfels["opacity_logits"] = surfels["opacity_logits"] - 4.0
+    scene = BakedScene(surfels, "sv", torch.zeros(count, 5, dtype=torch.int32), None).to(device)
+    cameras = [front(width, height, distance) for distance in (4.0, 6.0, 5.0)[:views]]
+    found = []
+    for slots in (1024 * -(-count // 1024), 32):
+        monkeypatch.setattr(baked_cuda, "slots_per_tile", lambda capacity, tiles, slots=slots: slots)
+        renderer = BakedRenderer(scene, width, height, views, images=("rgb", "overdraw"))
+        images = {name: image.clone() for name, image in renderer.draw(cameras).items()}
+        found.append((images, lists_of(renderer, count, width, height, views), renderer.workspace.counts()))
+        renderer.run(Stage.DRAW)  # of lists that are sorted
+        for name, image in images.items():
+            assert torch.equal(image, renderer.images[name])
+    (all_images, all_lists, counts), (images, lists, spilled_counts) = found
+    assert counts[1] == 0 and 0 < spilled_counts[1] < spilled_counts[0] == counts[0]
+    for rows, same in zip(all_lists, lists, strict=True):
+        assert torch.equal(rows, same)
+    for name, image in images.items():
+        assert torch.equal(image, all_images[name])
+
+
+@pytest.mark.parametrize("pairs, width, height", [(8, 16, 16), (80_000, 320, 240), (10**7, 3840, 2160)])
+def test_memory_is_bounded_by_the_pairs(pairs: int, width: int, height: int, device: torch.device) -> None:
+    """20 bytes of each, 32 MB, and 36 bytes of each tile."""
+    workspace, tiles = Workspace(device), -(-width // 16) * -(-height // 16)
+    workspace.resize(1, 1, width, height, False, pairs)
+    assert workspace.memory.numel() < 20 * pairs + 2**25 + 36 * tiles + 4096
+    assert workspace.slots % 32 == 0 and 32 <= workspace.slots <= 1024
+    assert slots_per_tile(pairs, 2**24) == 32
+
+
 def test_many_tiles(device: torch.device) -> None:
     """The tiles that a narrower image has as well must get the same lists."""
     case = random_scene(30, 9, 1_000, 20)
@@ -142,12 +189,10 @@ def test_many_tiles(device: torch.device) -> None:
         renderer._resize(2_000)
         renderer._viewmats.copy_(case.viewmat)
         renderer._Ks.copy_(case.K)
-        renderer.run(Stage.PREPARE)
-        renderer.run(Stage.BIN)
+        renderer.run(Stage.LIST)
         assert 100 < renderer.workspace.pairs <= renderer.workspace.capacity
-        across = -(-width // 16)
-        all_ranges = renderer.workspace.memory[256 : 256 + 8 * 2 * across].view(torch.int32).view(2, across, 2)
-        ranges.append(all_ranges.diff(dim=-1)[..., 0].cpu())
+        all_ranges = listed_pairs(renderer.workspace, 30, 1, width, 20).ranges
+        ranges.append(all_ranges.diff(dim=-1).view(2, -(-width // 16)))
         assert ranges[-1].sum() == renderer.workspace.pairs and (ranges[-1] >= 0).all()
     narrow = ranges[0].shape[1] - 1  # the last tile is cut by the narrow image
     assert torch.equal(ranges[0][:, :narrow], ranges[1][:, :narrow])

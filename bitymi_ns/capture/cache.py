@@ -62,6 +62,12 @@ def work_folder(source: Path, key: str) -> Iterator[Path]:
     )
 
 
+def finished(source: Path, key: str, mark: str) -> Path | None:
+    """The folder of this key in which a file of this name says that the work is done; None = there is none."""
+    homes = ((source if source.is_dir() else source.parent) / FOLDER, user_cache())
+    return next((folder for home in homes if ((folder := home / f"poses-{key}") / mark).is_file()), None)
+
+
 def take_place(work: Path, source: Path, contents: str) -> None:
     """Say what a work folder is of, and remove those of the same source as it was before: their key cannot come back.
     Those with other options stay, because runs were trained on them; so do those that a process works in or reads from.

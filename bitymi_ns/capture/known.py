@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
-from bitymi_ns.capture.cache import content_key, work_folder
+from bitymi_ns.capture.cache import content_key, finished, work_folder
+from bitymi_ns.capture.photos import PLAIN_SUFFIXES
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError
@@ -25,76 +27,74 @@ DONE = "points"
 class KnownView:
     """A photograph whose camera is known."""
 
-    name: str
-    """Of the file, relative to the folder of the photographs."""
+    file: Path
+    model: str
+    """COLMAP's camera model."""
     width: int
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    params: tuple[float, ...]
+    """Of the camera model, in pixels of the file."""
     world_to_camera: np.ndarray
     """[3,4] rotation and translation, OpenCV axes (x right, y down, z forward)."""
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2 of OpenCV."""
 
     @property
     def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """COLMAP's camera model, size in pixels, and parameters."""
-        pinhole = (self.fx, self.fy, self.cx, self.cy)
-        if any(self.distortion):
-            return "OPENCV", self.width, self.height, (*pinhole, *self.distortion)
-        return "PINHOLE", self.width, self.height, pinhole
+        """What photographs of one camera have in common."""
+        return self.model, self.width, self.height, self.params
 
 
-def triangulate(images: Path, views: Sequence[KnownView], progress: Progress | None = None) -> Path:
+def triangulate(home: Path, views: Sequence[KnownView], progress: Progress | None = None) -> Path:
     """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept and continued as
     `find_poses` does.
 
     Args:
-        images: folder that the views' names are relative to.
+        home: folder of the capture, beside whose photographs the result is kept.
         views: the photographs with their cameras.
         progress: told the stage and how far it is.
 
     Returns:
-        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses.
+        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses, in which the
+        photographs have their full names.
 
     Raises:
         CaptureError: too few points can be found; says what may be wrong.
         KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
-    images = Path(images)
-    missing = [view.name for view in views if not (images / view.name).is_file()]
+    missing = [view.file for view in views if not view.file.is_file()]
     if missing:
-        raise CaptureError(
-            f"{images / missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there"
-        )
+        raise CaptureError(f"{missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there")
     if len(views) < 2:
-        raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
-    settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
-    with work_folder(images, content_key([images / view.name for view in views], settings)) as work:
-        model = work / MODEL
-        if (work / DONE).exists():
-            return model
+        raise CaptureError(f"{home}: points need at least two photographs with poses, these are {len(views)}")
+    settings = [(view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
+    key = content_key([view.file for view in views], settings)
+    done = finished(home, key, DONE)
+    if done is not None:  # several processes may read it
+        return done / MODEL
+    with work_folder(home, key) as work:
         with explained(work, CaptureError):
-            process.run(_job(images, views, work), images, progress or no_progress)
+            process.run(_job(views, work), home, progress or no_progress)
             write_file(work / DONE, b"")
             shutil.rmtree(work / "links", ignore_errors=True)
             process.forget(work)
-        return model
+        return work / MODEL
 
 
-def _job(images: Path, views: Sequence[KnownView], work: Path) -> Job:
+def _job(views: Sequence[KnownView], work: Path) -> Job:
     links = work / "links"
     shutil.rmtree(links, ignore_errors=True)
     links.mkdir()
     groups: dict[tuple[str, int, int, tuple[float, ...]], list[str]] = defaultdict(list)
     names, poses = {}, {}
     for i, view in enumerate(views):
-        plain = f"{i:06d}{Path(view.name).suffix.lower()}"
-        (links / plain).symlink_to((images / view.name).resolve())
+        suffix = view.file.suffix.lower()
+        plain = f"{i:06d}{suffix if suffix in PLAIN_SUFFIXES else '.png'}"
+        if suffix in PLAIN_SUFFIXES:
+            (links / plain).symlink_to(view.file.resolve())
+        else:
+            with Image.open(view.file) as image:
+                image.convert("RGB").save(links / plain)
         groups[view.camera].append(plain)
-        names[plain] = view.name
+        names[plain] = str(view.file)
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
     return Job(
         work=str(work.resolve()),

@@ -236,9 +236,7 @@ def optimizers(options: AdamConfig) -> dict[str, Any]:
 def trainer_config(preset: Preset) -> BitymiTrainerConfig:
     """The configuration of a training run by a preset."""
     trainer, data = preset.trainer, preset.data
-    dataparser = BitymiDataParserConfig(
-        eval_mode=data.eval_mode, eval_interval=data.eval_interval, load_3D_points=data.load_3D_points
-    )
+    dataparser = BitymiDataParserConfig(eval_mode=data.eval_mode, eval_interval=data.eval_interval, points=data.points)
     return BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]

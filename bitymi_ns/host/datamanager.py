@@ -31,6 +31,7 @@ from bitymi_ns.host.ply import colours
 from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.host.poses import check_cloud, check_places, orienting_all, warn_of_mirrored
 from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
+from bitymi_ns.host.starting_points import for_a_new_scene
 from bitymi_ns.host.transforms import corrected_files
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.processes import Processes
@@ -114,6 +115,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
             orienting_all(),
             checked_models(config.dataparser),
             reporting_time("Reading", cloud.points),
+            for_a_new_scene(test_mode == "val"),
         ):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)

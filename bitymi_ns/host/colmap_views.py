@@ -175,8 +175,8 @@ def _photographs(
     if counts[other] > present(best):
         return other
     if present(best) == 0:
-        near = Files(capture).nearest(names[0])
-        hint = f" ({near})" if near else ""
+        near = [hint for each in searched if each.is_dir() and (hint := Files(each).nearest(names[0]))]
+        hint = f" ({near[0]})" if near else ""
         fail(
             f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}{hint}. "
             "Copy the photographs to its folder `images`, or give their folder, seen from there: `bitymi-data "

@@ -117,10 +117,16 @@ class Files:
 
 
 def renamed(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
-    """A sentence on the files that were found under another name; empty where none was."""
+    """A sentence on the files that were found under another name; empty where none was. Names without their ending are
+    usual, and so are either separators."""
+
+    def is_usual(name: str, file: Path) -> bool:
+        plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
+        return os.path.normpath(file) in (str(plain), f"{plain}{file.suffix}")
+
     other = [
         f"{file.relative_to(folder).as_posix()} for {name}"
         for name, file in zip(names, files, strict=True)
-        if file.is_relative_to(folder) and file != folder / name and file != folder / os.path.normpath(name)
+        if file.is_relative_to(folder) and not is_usual(name, file)
     ]
     return f"{len(other)} of {len(names)} photographs have other names than it says: {listed(other)}." if other else ""

@@ -4,6 +4,7 @@ special about it, in every format that can have it."""
 from __future__ import annotations
 
 import json
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -224,3 +225,61 @@ def test_aria_s_camera(capture: Path) -> None:
     theirs = fisheye624_project(rays[None], torch.tensor([[20.0, *lens.params[2:4], *params]]))[0]
     ours = pycolmap.Camera(model=lens.model, width=48, height=36, params=list(lens.params)).img_from_cam(rays.numpy())
     np.testing.assert_allclose(ours, theirs.numpy(), atol=1e-3)
+
+
+# names of photographs
+
+
+def name_frames(place: Path, change: Callable[[str], str]) -> None:
+    """Change the names of the photographs in the capture's file, seen from the folder of the capture."""
+    if place.is_dir():
+        text = (place / "images.txt").read_text("utf8").split("\n")
+        for i in range(0, len(text) - 1, 2):
+            words = text[i].split(" ")
+            text[i] = " ".join([*words[:9], change(words[9])])
+        (place / "images.txt").write_text("\n".join(text), "utf8")
+    else:
+        rewrite(place, lambda meta: [frame.update(file_path=change(frame["file_path"])) for frame in meta["frames"]])
+
+
+NAMES = {
+    "case": lambda name: name.upper(),
+    "ending": lambda name: name.replace(".png", ".JPG"),
+    "no ending": lambda name: name.replace(".png", ""),
+    "backslashes": lambda name: ".\\" + name.replace("/", "\\"),
+    "absolute": lambda name: f"/home/somebody/project/{name}",
+    "drive": lambda name: "C:\\Users\\somebody\\" + name.replace("/", "\\"),
+    "unicode": lambda name: unicodedata.normalize("NFD", name),
+}
+
+
+@pytest.mark.parametrize("difference", NAMES)
+@pytest.mark.parametrize("form", ALL)
+def test_names_of_another_machine_or_program(
+    capture: Path, form: Callable[[Path], Path], difference: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    for path in images_of(capture):
+        path.rename(path.with_name(path.name.replace("frame_", "f\u00fcr_")))
+    name_frames(place, lambda name: NAMES[difference](name.replace("frame_", "f\u00fcr_")))
+    manager = load_any(capture)
+    assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
+    assert {path.parent for path in manager.train_dataset.image_filenames} == {capture / "images"}
+    assert manager.cached_train[0]["image"].shape == (36, 48, 3)
+    told = "of 12 photographs have other names than it says" in said(capsys)
+    assert told is (difference not in ("backslashes", "no ending"))
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_a_name_that_is_nearly_there(capture: Path, form: Callable[[Path], Path]) -> None:
+    place = form(capture)
+    for path in images_of(capture):
+        path.rename(path.with_name(path.name.replace("frame_", "fr\u0430me_")))  # a Cyrillic letter
+    with expect(r"(?s)but there is \S*fr\u0430me_\d+.png, '\S*fr\\u0430me_\d+.png', instead of '\S*frame_\d+.png'"):
+        load_any(place)
+
+
+def test_one_file_is_not_taken_for_two_photographs(capture: Path) -> None:
+    rewrite(capture / "transforms.json", lambda meta: meta["frames"][3].update(file_path="images/FRAME_00003.png"))
+    with expect(r"(?s)1 of 12 photographs of .* are missing:\s+\S*images/FRAME_00003.png"):
+        load_any(capture)

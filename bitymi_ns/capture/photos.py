@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
-from bitymi_ns.capture.recognise import is_photograph
+from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
 
@@ -60,18 +61,17 @@ def _photos_in(folder: Path) -> list[Path]:
 
 
 def find_photos(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its folders, in natural order; masks and hidden folders are passed over.
+    """Names of the photographs in a folder and its folders, in natural order; see `photographs_below`.
 
     Raises:
         CaptureError: the folder is missing, or cannot be read.
     """
     try:
-        paths = [path for path in folder.rglob("*") if is_photograph(path)]
+        os.listdir(folder)
+        paths = list(photographs_below(folder))
     except OSError as error:
         raise CaptureError(f"{folder} cannot be read: {error.strerror}") from error
-    parts = [path.relative_to(folder).parts for path in paths]
-    seen = [p for p in parts if not any(part.startswith(".") or part in ("masks", "mask") for part in p[:-1])]
-    return sorted(("/".join(p) for p in seen), key=natural)
+    return sorted((path.relative_to(folder).as_posix() for path in paths), key=natural)
 
 
 def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:

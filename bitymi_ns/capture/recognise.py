@@ -4,6 +4,7 @@ video."""
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,8 +21,16 @@ PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP model usually lies in a capture, the most usual place first."""
-BESIDES = {"masks", "depths", "sparse", "colmap"}
-"""Folders of a capture that hold no photographs."""
+BESIDES = {
+    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
+    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
+    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
+    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
+    "stereo": "a model", "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+}  # fmt: skip
+"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
+BESIDE = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
+"""The same for files, without their endings, that lie beside folders of photographs."""
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries that a transforms.json has from nerfstudio alone."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
@@ -185,25 +194,72 @@ def image_count(model: Path) -> int:
 
 
 def _photographs_in(folder: Path) -> Path | None:
-    """The folder to search for photographs: this one where they lie in it or in its `images`, else the one below."""
-    if _has_photographs(folder) or _has_photographs(folder / "images"):
+    """The folder to search for photographs: this one where they lie in it or in its `images`, else the one below, else
+    this one again where they lie in several. None = there are none, or captures of their own."""
+    if _has_photographs(folder) or _has_photographs(folder / "images", below=True):
         return folder
-    below = sorted(
-        path
-        for path in folder.iterdir()
-        if path.is_dir() and path.name not in BESIDES and not path.name.startswith(".")
-    )
-    holding = [path for path in below if _has_photographs(path)]
-    if not holding:
+    holding = [path for path in _folders_in(folder) if _has_photographs(path, below=True)]
+    if not holding or captures_in(folder):
         return None
-    return holding[0] if len(holding) == 1 else folder
+    return _photographs_in(holding[0]) if len(holding) == 1 else folder
 
 
-def _has_photographs(folder: Path) -> bool:
-    return folder.is_dir() and any(is_photograph(path) for path in folder.iterdir())
+def captures_in(folder: Path) -> list[Path]:
+    """Folders of this one that are captures of their own: several of them have an `images` of photographs."""
+    found = [path for path in _folders_in(folder) if _has_photographs(path / "images", below=True)]
+    return found if len(found) > 1 else []
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and _may_hold_photographs(path.name))
+
+
+def _may_hold_photographs(name: str) -> bool:
+    return not name.startswith(".") and name.lower() not in BESIDES
+
+
+def _has_photographs(folder: Path, below: bool = False) -> bool:
+    if not folder.is_dir():
+        return False
+    return any(True for _ in photographs_below(folder)) if below else any(map(is_photograph, folder.iterdir()))
+
+
+def photographs_below(folder: Path) -> Iterator[Path]:
+    """The photographs in a folder and in those below it, but for hidden ones and those that hold something else."""
+    for place, below, names in os.walk(folder):
+        below[:] = sorted(name for name in below if _may_hold_photographs(name))
+        for name in names:
+            path = Path(place, name)
+            if is_photograph(path):
+                yield path
+
+
+def passed_over(folder: Path) -> list[str]:
+    """What pictures in a folder and below it `photographs_below` leaves out, a phrase each."""
+    found = []
+    for place, below, names in os.walk(folder):
+        for name in sorted(below):
+            if name.lower() in BESIDES and _pictures(Path(place, name)):
+                shown = Path(place, name).relative_to(folder)
+                found.append(f"{shown} ({_pictures(Path(place, name))} {BESIDES[name.lower()]})")
+        below[:] = sorted(name for name in below if _may_hold_photographs(name))
+        for name in sorted(names):
+            path = Path(place, name)
+            if is_picture(path) and not is_photograph(path):
+                found.append(f"{path.relative_to(folder)} ({BESIDE[path.stem.lower()]})")
+    return found
+
+
+def _pictures(folder: Path) -> int:
+    return sum(is_picture(path) for path in folder.iterdir())
 
 
 def is_photograph(path: Path) -> bool:
+    """Whether it is a picture, and not one that programs put beside photographs."""
+    return is_picture(path) and path.stem.lower() not in BESIDE
+
+
+def is_picture(path: Path) -> bool:
     """Whether it is a file with the ending of a photograph, and not hidden."""
     return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
@@ -236,8 +292,11 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
     other = (data / "meta_data.json").is_file()
     hint = " It has a meta_data.json: give `sdfstudio-data` after the options of the method." if other else ""
+    several = captures_in(data)
+    if several:
+        hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
-    if archive is not None:
+    if archive is not None and not several:
         hint = f" Unpack {archive.name} first."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "

@@ -12,7 +12,7 @@ import numpy as np
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from bitymi_ns.capture.masks import USUAL_FOLDERS, mask_folder, mask_of, smaller_masks
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
@@ -230,8 +230,8 @@ def tell_left_out(source: Source, model: Model) -> None:
         say(f"The COLMAP model {source.folder}: {other}")
     used = {_name_in(source.read, path) for path in files}
     nested = any("/" in name for name in used)
-    there = source.photographs.rglob("*") if nested else source.photographs.glob("*")
-    names = {path.relative_to(source.photographs).as_posix() for path in there if path.suffix.lower() in PHOTOGRAPHS}
+    there = photographs_below(source.photographs) if nested else filter(is_photograph, source.photographs.glob("*"))
+    names = {path.relative_to(source.photographs).as_posix() for path in there}
     unused = sorted((names | source.left_out.keys()) - used)
     if unused:
         named = [f"{name} ({source.left_out[name]})" if name in source.left_out else name for name in unused]

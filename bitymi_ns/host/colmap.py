@@ -127,14 +127,30 @@ def parameter_count(model: str) -> int | None:
 
 
 def check_cameras(path: Path, cameras: dict[int, Any]) -> None:
-    """Stop at a camera whose parameters do not go with its camera model."""
+    """Stop at a camera whose parameters are no numbers, or do not go with its camera model."""
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
+        numbers = [camera.width, camera.height, *camera.params]
+        if not np.isfinite(numbers).all() or min(camera.width, camera.height) < 1:
+            written = " ".join(f"{value:g}" for value in numbers)
+            fail(
+                f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
+                "has to be positive and all numbers finite. Correct it, or write the model anew from COLMAP."
+            )
         if count is not None and len(camera.params) != count:
             fail(
                 f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}. "
                 "Correct its line."
             )
+
+
+def _line_of(path: Path, number: int) -> str:
+    """Words on where a text file states the camera or image of a number; empty for a binary one."""
+    if path.suffix != ".txt":
+        return ""
+    with open(path, encoding="utf8", errors="replace") as file:
+        lines = [i for i, line in enumerate(file, 1) if line.split()[:1] == [str(number)]]
+    return f", line {lines[0]}" if lines else ""
 
 
 def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
@@ -149,6 +165,6 @@ def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) ->
             )
         if not np.isfinite([*image.qvec, *image.tvec]).all() or not image.qvec.any():
             fail(
-                f"{path}: the pose of image {number} ({image.name}) is not finite, or its rotation is zero. Correct "
+                f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its rotation is zero. Correct "
                 "its line or remove the image."
             )

@@ -53,7 +53,10 @@ class Files:
         if portable.is_file():
             return portable
         parts = folded(name)
-        return None if not parts else self._like(parts) or self._like(_without_ending(parts), endings=True)
+        if not parts:
+            return None
+        other = (parts, _without_ending(parts))  # one more than it has, or another one
+        return self._like(parts) or next(filter(None, (self._like(each, endings=True) for each in other)), None)
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
         """The files of several names. A file that would be that of two of them is that of the one it has the name of,

@@ -15,12 +15,13 @@ import pytest
 import torch
 from nerfstudio.cameras.camera_utils import fisheye624_project
 from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.host.datamanager import BitymiDataManager
 from bitymi_ns.host.export import world_of
-from tests.host.captures import colmap_model, expect, images_of, load, load_any, said
+from tests.host.captures import colmap_model, expect, images_of, load, load_any, load_with, said
 
 UTM = np.array([500123.0, 4649876.0, 312.0])
 Edit = Callable[[Path, Callable[[dict[str, Any]], Any]], None]
@@ -283,3 +284,74 @@ def test_one_file_is_not_taken_for_two_photographs(capture: Path) -> None:
     rewrite(capture / "transforms.json", lambda meta: meta["frames"][3].update(file_path="images/FRAME_00003.png"))
     with expect(r"(?s)1 of 12 photographs of .* are missing:\s+\S*images/FRAME_00003.png"):
         load_any(capture)
+
+
+# files of a model, and sizes
+
+
+@pytest.mark.parametrize("wrong", ["nan 40 24 18", "40 inf 24 18", "40 40 24 nan"])
+def test_the_camera_of_a_model_that_is_no_number(project: Path, wrong: str) -> None:
+    path = project / "sparse/0/cameras.txt"
+    path.write_text("# cameras\n" + path.read_text().replace("40 40 24 18", wrong))
+    with expect(rf"{path}, line 2: camera 1 \(PINHOLE 48 36 {wrong}\) cannot be used"):
+        load_any(project)
+    with expect("camera 1 .* cannot be used"):
+        load_with(project, ColmapDataParserConfig(colmap_path=Path("sparse/0")))
+
+
+def test_points_of_a_model_in_a_ply_file_alone(project: Path) -> None:
+    (project / "sparse/0/points3D.txt").unlink()
+    path = project / "sparse/0/points3D.ply"
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {c}\n" for c in "xyz")
+    header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    path.write_text(f"{header}0 0 0.5 200 10 10\n0.1 0 0.5 200 10 10\n")
+    metadata = load_any(project).train_dataparser_outputs.metadata
+    assert metadata["points3D_rgb"].tolist() == [[200, 10, 10]] * 2
+    path.write_text(header)
+    with expect("the point cloud .*points3D.ply is cut off: it has 0 of 2 points"):
+        load_any(project)
+
+
+def test_points_of_a_model_that_are_no_numbers(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = project / "sparse/0/points3D.txt"
+    path.write_text(path.read_text() + "3 nan 0 0.5 200 10 10 0.5\n")
+    assert len(load_any(project).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
+    assert f"{path}: 1 of 3 points, the first is point 3, are not finite" in said(capsys)
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -> None:
+    """`--downscale-factor` without a folder of copies is the same for every format."""
+    manager = load_any(form(capture), downscale_factor=2)
+    assert manager.cached_train[0]["image"].shape == (18, 24, 3)
+    assert int(manager.train_dataset.cameras.width[0]) == 24
+
+
+# Blender's files
+
+
+def test_blenders_names_with_two_endings(capture: Path) -> None:
+    """nerfstudio's reader appends .png to all of them."""
+    place = blender(capture)
+    for path in images_of(capture):
+        path.rename(path.with_name(f"{path.stem}.jpg.png"))
+    name_frames(place, lambda name: f"./{name.replace('.png', '.jpg')}")
+    assert load_any(capture).train_dataset.image_filenames[0].name == "frame_00002.jpg.png"
+
+
+@pytest.mark.parametrize("lacking", ["all", "some"])
+def test_held_out_views_of_blender_without_photographs(
+    capture: Path, lacking: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = blender(capture)
+    meta = json.loads(place.read_text())
+    frames, test = meta["frames"][:8], meta["frames"][8:]
+    place.write_text(json.dumps({**meta, "frames": frames}))
+    for frame in test if lacking == "all" else test[1:]:
+        frame["file_path"] = f"./test/r_{frame['file_path'][-5:-4]}"
+    (capture / "transforms_test.json").write_text(json.dumps({**meta, "frames": test}))
+    manager = load_any(capture)
+    assert (len(manager.train_dataset), len(manager.eval_dataset)) == ((7, 1) if lacking == "all" else (8, 1))
+    text = said(capsys)
+    what = "all" if lacking == "all" else "3"
+    assert f"transforms_test.json lacks {what} of its 4 photographs, left out: {capture}/test/r_" in text

@@ -165,6 +165,6 @@ def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) ->
             )
         if not np.isfinite([*image.qvec, *image.tvec]).all() or not image.qvec.any():
             fail(
-                f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its rotation is zero. Correct "
-                "its line or remove the image."
+                f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its "
+                "rotation is zero. Correct its line or remove the image."
             )

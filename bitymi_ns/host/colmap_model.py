@@ -93,13 +93,13 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     if path.is_file():
         with reading(path):
             xyz, rgb = _points_text(path) if path.suffix == ".txt" else _points_binary(path)
-            if not np.isfinite(xyz).all():
-                where = int(np.nonzero(~np.isfinite(xyz).all(1))[0][0])
-                warn(
-                    f"{path}: point {where + 1} of {len(xyz):,} is not finite, or more of them are; they are left out."
-                )
-                kept = np.isfinite(xyz).all(1)
-                xyz, rgb = xyz[kept], rgb[kept]
+            kept = np.isfinite(xyz).all(1)
+        if not kept.all():
+            warn(
+                f"{path}: {np.sum(~kept):,} of {len(xyz):,} points, the first is point {np.argmin(kept) + 1}, are not "
+                "finite. They are left out."
+            )
+            xyz, rgb = xyz[kept], rgb[kept]
     elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
         wrong = what_is_wrong_with(cloud)
         if wrong is not None:

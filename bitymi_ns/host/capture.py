@@ -24,9 +24,11 @@ from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.recognise import PHOTOGRAPHS, Found, models_in
 from bitymi_ns.host import transforms
+from bitymi_ns.host.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.host.colmap import check_model, options_for
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import mask_files
+from bitymi_ns.host.commands import folder_being_evaluated, how_to_say_where
 from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import MOST_PIXELS, check_sizes
@@ -58,7 +60,10 @@ def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> Cl
     dataparser = config.dataparser
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
-        fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
+        made = "" if folder_being_evaluated() else f" {HOW_TO_GET_ONE}"
+        fail(f"the capture {data} does not exist. {how_to_say_where()}{made}")
+    if isinstance(dataparser, BundleCamerasConfig):
+        return Cloud()
     _check_options(dataparser)
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data

@@ -23,6 +23,9 @@ from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.ply import Points
 from bitymi_ns.host.poses import check_spread, is_far_off, oriented
 
+ALONE = "without photographs"
+"""Entry of the metadata of views whose photographs are gone."""
+
 
 @dataclass(frozen=True)
 class Photograph:

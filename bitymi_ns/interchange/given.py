@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -57,6 +57,14 @@ class Given:
     held_out: list[View] = field(default_factory=list)
 
 
+class NamedCamera(NamedTuple):
+    """A camera of a capture: the name of its photograph, whether that was held out, and the camera."""
+
+    name: str
+    held_out: bool
+    camera: Camera
+
+
 def given_with(folder: str | Path, info: Manifest) -> Given:
     """What cameras.json of a bundle says, and the photographs that it names; nothing, where it has no such file.
 
@@ -68,15 +76,24 @@ def given_with(folder: str | Path, info: Manifest) -> Given:
         BundleError: a file is missing, altered or malformed.
     """
     folder = Path(folder)
+    rows = _rows(folder, info)
+    held_out = [_view(folder, info, row) for row in rows if row.held_out and row.photograph is not None]
+    return Given([row.camera() for row in rows if not row.held_out], held_out)
+
+
+def named_cameras(folder: str | Path, info: Manifest) -> list[NamedCamera]:
+    """The cameras of the capture that a bundle was made of, as cameras.json has them; see `given_with`."""
+    return [NamedCamera(row.name, row.held_out, row.camera()) for row in _rows(Path(folder), info)]
+
+
+def _rows(folder: Path, info: Manifest) -> list[_Row]:
     if CAMERAS not in info.files:
-        return Given()
+        return []
     try:
-        rows = _File.model_validate_json(_bytes(folder, info, CAMERAS)).cameras
+        return _File.model_validate_json(_bytes(folder, info, CAMERAS)).cameras
     except ValidationError as error:
         first = error.errors()[0]
         raise BundleError(f"{folder / CAMERAS}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    held_out = [_view(folder, info, row) for row in rows if row.held_out and row.photograph is not None]
-    return Given([row.camera() for row in rows if not row.held_out], held_out)
 
 
 def _view(folder: Path, info: Manifest, row: _Row) -> View:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import yaml
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts import exporter, render
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils.eval_utils import eval_setup
@@ -120,3 +123,24 @@ def test_commands_that_cannot_work_on_surfels(
     options = {} if command is render.SpiralRender else {"output_dir": tmp_path}
     with pytest.raises(InputError, match="ns-(render|export) .*(bitymi extras|ns-render interpolate)"):
         command(load_config=config, **options).main()
+
+
+def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, pipeline, _, _ = eval_setup(bundle / "config.yml")
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    seen = pipeline.model.get_outputs_for_camera(camera)
+    camera.camera_type[:] = CameraType.EQUIRECTANGULAR.value
+    with pytest.raises(InputError, match="equirectangular cannot be rendered"):
+        pipeline.model.get_outputs_for_camera(camera)
+    with ThreadPoolExecutor(1) as thread:
+        outputs = [thread.submit(pipeline.model.get_outputs_for_camera, camera).result() for _ in range(2)]
+    assert {name: value.shape for name, value in outputs[1].items()} == {n: v.shape for n, v in seen.items()}
+    assert capsys.readouterr().out.count("equirectangular cannot be rendered") == 1
+
+
+def test_a_crop_that_is_not_heeded_is_said(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, pipeline, _, _ = eval_setup(bundle / "config.yml")
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    for _ in range(2):
+        pipeline.model.get_outputs_for_camera(pipeline.datamanager.eval_dataset.cameras[:1], obb_box=box)
+    assert capsys.readouterr().out.count("Crop boxes are not supported") == 1

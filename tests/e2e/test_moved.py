@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,6 +16,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts import exporter, render
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
 
 from bitymi_ns.host.commands import REFUSED
 from bitymi_ns.host.config import BitymiTrainerConfig
@@ -144,3 +146,17 @@ def test_a_crop_that_is_not_heeded_is_said(bundle: Path, capsys: pytest.CaptureF
     for _ in range(2):
         pipeline.model.get_outputs_for_camera(pipeline.datamanager.eval_dataset.cameras[:1], obb_box=box)
     assert capsys.readouterr().out.count("Crop boxes are not supported") == 1
+
+
+def test_photographs_through_a_lens_are_rendered(
+    bundle: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = Path(shutil.copytree(room, tmp_path / "room"))
+    meta = json.loads((capture / "transforms.json").read_text())
+    (capture / "transforms.json").write_text(json.dumps({**meta, "k1": 0.08, "k2": -0.01}))
+    monkeypatch.setenv("BITYMI_DATA", str(capture))
+    render.DatasetRender(load_config=bundle / "config.yml", output_path=tmp_path / "out", split="test").main()
+    (picture,) = [path for path in (tmp_path / "out").rglob("*frame_00009*") if "gt-rgb" in str(path)]
+    (drawn,) = [path for path in (tmp_path / "out").rglob("*frame_00009*") if path.parent.name == "rgb"]
+    sizes = {Image.open(path).size for path in (picture, drawn)}
+    assert len(sizes) == 1 and sizes.pop()[0] < 48  # the edges are beyond the photograph

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
+from bitymi_ns.capture.panorama import says_so, shows_so
 from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
@@ -43,6 +44,8 @@ class Photo:
     """[h,w] float32 grey levels, longer side THUMB."""
     sharpness: float
     """Share of the fine detail in all detail; see `sharpness`."""
+    panorama: bool = False
+    """Whether it shows all directions at once."""
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -129,7 +132,8 @@ def read_photo(folder: Path, name: str) -> Photo:
     plain = orientation in (0, 1) and suffix in PLAIN_SUFFIXES and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
     thumb = np.asarray(_reduced(grey, THUMB), np.float32)
     detail = np.asarray(_reduced(grey, SHARPNESS_SIZE), np.float32)
-    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail))
+    panorama = says_so(path) or shows_so(thumb)
+    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail), panorama)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:

@@ -11,13 +11,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
+from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
-PANORAMAS = (
-    "360-degree pictures cannot be trained on as they are. Cut them into perspective views with "
-    "`ns-process-data images --camera-type equirectangular`, which finds their poses anew."
-)
 UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
 """Kinds of cameras whose photographs become those of a perspective camera on loading."""
 OFF_AXIS = 80

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
-from bitymi_ns.host.cameras import PANORAMAS
+from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.host.colmap_model import ModelCamera
 from bitymi_ns.host.errors import fail, listed, say
 from bitymi_ns.host.names import Files, renamed

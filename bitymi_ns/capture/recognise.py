@@ -13,7 +13,9 @@ from typing import Any, Literal, get_args
 
 import pillow_heif
 
-Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
+Format = Literal[
+    "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "pose-files", "photographs", "video"
+]
 
 pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
 
@@ -33,6 +35,8 @@ BESIDE = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
 """The same for files, without their endings, that lie beside folders of photographs."""
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries that a transforms.json has from nerfstudio alone."""
+POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
+"""Folders of Polycam's pictures and of the cameras that belong to them, the better ones first."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 
@@ -129,11 +133,26 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", folder
     for model in models_in(folder):
         yield "colmap", folder / model
+    yield from _scanned(folder)
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
     for video in sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()):
         yield "video", video
+
+
+def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
+    """What scanning programs wrote, and RGB-D sets with poses."""
+    keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
+    if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
+        yield "polycam", folder
+    for name in ("metadata", "metadata.json"):
+        if (folder / name).is_file() and b'"poses"' in (folder / name).read_bytes():
+            yield "record3d", folder
+            break
+    colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
+    if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
+        yield "pose-files", folder
 
 
 def _kind_of(file: Path) -> Format:
@@ -211,7 +230,8 @@ def captures_in(folder: Path) -> list[Path]:
 
 
 def _folders_in(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir() and _may_hold_photographs(path.name))
+    names = [path.name for path in folder.iterdir() if path.is_dir()]
+    return sorted(folder / name for name in names if _may_hold_photographs(name) and not _copies(name, names))
 
 
 def _may_hold_photographs(name: str) -> bool:
@@ -227,11 +247,19 @@ def _has_photographs(folder: Path, below: bool = False) -> bool:
 def photographs_below(folder: Path) -> Iterator[Path]:
     """The photographs in a folder and in those below it, but for hidden ones and those that hold something else."""
     for place, below, names in os.walk(folder):
-        below[:] = sorted(name for name in below if _may_hold_photographs(name))
+        below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
         for name in names:
             path = Path(place, name)
             if is_photograph(path):
                 yield path
+
+
+def _copies(name: str, beside: list[str]) -> str:
+    """What copies of the pictures in other folders beside it a folder holds, by its name; empty = none."""
+    if f"corrected_{name}" in beside:
+        return "raw copies of corrected pictures"
+    original, _, factor = name.rpartition("_")
+    return "reduced copies" if factor in ("2", "4", "8", "16") and original in beside else ""
 
 
 def passed_over(folder: Path) -> list[str]:
@@ -239,14 +267,14 @@ def passed_over(folder: Path) -> list[str]:
     found = []
     for place, below, names in os.walk(folder):
         for name in sorted(below):
-            if name.lower() in BESIDES and _pictures(Path(place, name)):
-                shown = Path(place, name).relative_to(folder)
-                found.append(f"{shown} ({_pictures(Path(place, name))} {BESIDES[name.lower()]})")
-        below[:] = sorted(name for name in below if _may_hold_photographs(name))
+            what = BESIDES.get(name.lower()) or _copies(name, below)
+            if what and _pictures(Path(place, name)):
+                found.append(f"{Path(place, name).relative_to(folder)} ({_pictures(Path(place, name))} {what})")
+        below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
         for name in sorted(names):
             path = Path(place, name)
             if is_picture(path) and not is_photograph(path):
-                found.append(f"{path.relative_to(folder)} ({BESIDE[path.stem.lower()]})")
+                found.append(f"{path.relative_to(folder)} ({_beside(path)})")
     return found
 
 
@@ -256,7 +284,13 @@ def _pictures(folder: Path) -> int:
 
 def is_photograph(path: Path) -> bool:
     """Whether it is a picture, and not one that programs put beside photographs."""
-    return is_picture(path) and path.stem.lower() not in BESIDE
+    return is_picture(path) and not _beside(path)
+
+
+def _beside(path: Path) -> str:
+    """What a picture beside photographs is, by its name; empty = a photograph."""
+    stem = path.stem.lower()
+    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else BESIDE.get(stem, "")
 
 
 def is_picture(path: Path) -> bool:

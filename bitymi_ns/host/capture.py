@@ -29,11 +29,12 @@ from bitymi_ns.host.colmap import check_model, options_for
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import mask_files
 from bitymi_ns.host.commands import folder_being_evaluated, how_to_say_where
-from bitymi_ns.host.dataparser import BitymiDataParserConfig
+from bitymi_ns.host.dataparser import SCANNED, BitymiDataParserConfig
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
 from bitymi_ns.host.poses import check_spread
+from bitymi_ns.host.scanner_views import scanned
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
 from bitymi_ns.host.transforms_views import missing_photographs
 
@@ -94,6 +95,11 @@ def _check_own(dataparser: BitymiDataParserConfig, found: Found, images: bool) -
     """The same for what the methods' own parser reads."""
     if found.format in ("photographs", "video"):
         return Cloud()  # there are no poses yet
+    if found.format in SCANNED:
+        photographs = scanned(found, images)
+        if images:
+            check_sizes([photograph.file for photograph in photographs])
+        return Cloud()
     own = dataparser.points == "auto"
     if found.format == "colmap":
         source = dataparser.source(found, images)

@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.utils.colors import get_color
 
 from bitymi_ns.capture.frame import read_frame
-from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
+from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import finding, holdout, kept_poses
 from bitymi_ns.host.colmap_model import read_model
@@ -33,6 +33,7 @@ from bitymi_ns.host.dataset import views_of
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.kept_poses import KeptPoses
 from bitymi_ns.host.ply import Points, read_points
+from bitymi_ns.host.scanner_views import scanned
 from bitymi_ns.host.starting_points import Choice, starting_points
 from bitymi_ns.host.transforms import Lists, colmap_points
 from bitymi_ns.host.transforms_views import Transforms, missing_photographs, read_transforms
@@ -41,18 +42,20 @@ from bitymi_ns.ply import PlyError
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model, which is found for those that come without."""
+SCANNED = ("polycam", "record3d", "pose-files")
+"""Formats of scanning programs, with their poses."""
 USED_BY: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
     "masks_path": ("colmap", "photographs"),
     "ply_path": ("blender",),
     "alpha_color": ("blender",),
-    "scene_scale": ("nerfstudio", *WITH_MODEL),
-    "orientation_method": ("nerfstudio", *WITH_MODEL),
-    "center_method": ("nerfstudio", *WITH_MODEL),
-    "auto_scale_poses": ("nerfstudio", *WITH_MODEL),
-    "scale_factor": ("nerfstudio", *WITH_MODEL, "blender"),
-    "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL),
+    "scene_scale": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "orientation_method": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "center_method": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "auto_scale_poses": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "scale_factor": ("nerfstudio", *WITH_MODEL, *SCANNED, "blender"),
+    "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL, *SCANNED),
     "sfm": ("photographs", "video"),
 }
 """Formats that an option is for, where that is not all of them."""
@@ -64,13 +67,13 @@ BLENDER_SIDE = 1.5
 
 @dataclass
 class BitymiDataParserConfig(DataParserConfig):
-    """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set, a
-    folder of photographs, or a video."""
+    """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set,
+    what Polycam, Record3D or an RGB-D camera wrote, a folder of photographs, or a video."""
 
     _target: type = field(default_factory=lambda: BitymiDataParser)
     data: Path = Path()
     """Folder, or file: transforms.json or video."""
-    format: Literal["auto", "nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"] = "auto"
+    format: Format | Literal["auto"] = "auto"
     """What to read where there is more than one thing; auto = what has poses before what has none."""
     downscale_factor: int | None = None
     """Use photographs that are so many times smaller: those of images_2, images_4, ... where there is such a folder."""
@@ -193,7 +196,8 @@ class BitymiDataParser(DataParser):
         if found.format == "blender":
             return self._blender(found)
         self.poses_report = None if read_frame(found.folder) is None else found.folder
-        outputs, lists = self._colmap(found) if found.format in WITH_MODEL else self._transforms(found)
+        readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
+        outputs, lists = readers.get(found.format, self._transforms)(found)
         return self._split(outputs, lists, found)
 
     def _split(self, outputs: Views, lists: Lists, found: Found) -> dict[str, DataparserOutputs]:
@@ -264,6 +268,18 @@ class BitymiDataParser(DataParser):
             photographs, config.place(), points, str(source.folder), source.reduction, look, before=TO_NERFSTUDIO
         )
         return outputs, _lists_in(found.folder)
+
+    def _scanned(self, found: Found) -> tuple[Views, Lists]:
+        """All views of what a scanning program wrote."""
+        config, look = self.config, self._look
+        photographs = scanned(found, look)
+        self._tell(found, f"{found.path} ({found.format}, {len(photographs)} photographs with their poses)")
+        others = passed_over(found.path)
+        if others and look:
+            say(f"Not taken for photographs: {listed(others)}.")
+        points = starting_points(None, config.points, photographs, found.folder, str(found.path))
+        reduction = config.downscale_factor or 1
+        return views_of_capture(photographs, config.place(), points, str(found.path), reduction, look), {}
 
     def _blender(self, found: Found) -> dict[str, DataparserOutputs]:
         """The capture's own split. Where one of its two files of held-out views is missing, or all its photographs are,

@@ -20,7 +20,7 @@ OF = "of.json"
 """File in a work folder: what it is of, and the key of that alone."""
 IN_USE = ".in-use-"
 """Begins the names of the locks of processes that read what a work folder holds."""
-VERSION = 3
+VERSION = 4
 """Raised where the same photographs and options give other poses than before, so that kept ones are found anew."""
 
 

@@ -195,6 +195,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         points = outputs.metadata.get("points3D_xyz")
         if points is None:
             return
+        if len(points) and not len(outputs.metadata["points3D_rgb"]):  # our own reader gives all of them some
+            warn("The points of the capture have no colours: they start grey. `bitymi-data` takes them of photographs.")
         rgb = None if file is None else colours(file)
         if isinstance(rgb, str):
             warn(f"The points of {file} start without colours: {rgb}. Write them as bytes (property uchar red).")

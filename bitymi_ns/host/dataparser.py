@@ -33,8 +33,9 @@ from bitymi_ns.host.dataset import views_of
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.kept_poses import KeptPoses
 from bitymi_ns.host.ply import Points, read_points
+from bitymi_ns.host.point_colours import coloured
 from bitymi_ns.host.scanner_views import scanned
-from bitymi_ns.host.starting_points import Choice, starting_points
+from bitymi_ns.host.starting_points import Choice, are_wanted, starting_points
 from bitymi_ns.host.transforms import Lists, colmap_points
 from bitymi_ns.host.transforms_views import Transforms, missing_photographs, read_transforms
 from bitymi_ns.host.views import Photograph, Place, Views, views_of_capture
@@ -233,7 +234,7 @@ class BitymiDataParser(DataParser):
         own = None
         if config.points == "auto":
             if meta.get("ply_file_path"):
-                own = _points_of_file(found.folder / meta["ply_file_path"])
+                own = _points_of_file(found.folder / meta["ply_file_path"], read.photographs)
             elif model is not None:
                 own = points_of(read_model(model), np.eye(4) if before is None else before)
                 what += f", points of {model}"
@@ -295,7 +296,7 @@ class BitymiDataParser(DataParser):
                 parts[name] = _present(part) if look else part.photographs
         there = [name for name in ("val", "test") if parts.get(name)]
         self._tell(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
-        own = None if config.ply_path is None else _points_of_file(found.path / config.ply_path)
+        own = None if config.ply_path is None else _points_of_file(found.path / config.ply_path, train.photographs)
         points = starting_points(own, config.points, train.photographs, found.folder, str(train.path))
         outputs = views_of_capture(
             [each for part in parts.values() for each in part],
@@ -349,17 +350,16 @@ def _applied(meta: dict[str, Any], folder: Path) -> np.ndarray | None:
     return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
 
 
-def _points_of_file(path: Path) -> Points:
+def _points_of_file(path: Path, photographs: Sequence[Photograph]) -> Points:
+    """The points of a PLY file; those without colours get them of the photographs, where a scene starts from them."""
     try:
         points, without_colours = read_points(path)
     except PlyError as error:
         fail(f"the point cloud {path} cannot be read: {error}. Write its points without lists.", error)
-    if without_colours and len(points.xyz):
-        warn(
-            f"The points of {path} start grey, which costs quality: {without_colours}. Write colours with them "
-            "(property uchar red, green, blue), or use points that are triangulated (--points triangulate)."
-        )
-    return points
+    if not without_colours or not len(points.xyz) or not are_wanted():
+        return points
+    say(f"The points of {path} get the colours of the photographs that see them: {without_colours}.")
+    return coloured(points, photographs)
 
 
 def _present(part: Transforms) -> list[Photograph]:

@@ -37,6 +37,11 @@ def for_a_new_scene(wanted: bool) -> Iterator[None]:
         _wanted.reset(token)
 
 
+def are_wanted() -> bool:
+    """Whether the capture is read for a scene that starts from points."""
+    return _wanted.get()
+
+
 def starting_points(
     own: Points | None, choice: Choice, photographs: Sequence[Photograph], home: Path, where: str
 ) -> Points | None:
@@ -53,7 +58,7 @@ def starting_points(
         return None
     if own is not None and len(own.xyz) and choice == "auto":
         return own
-    return triangulated(photographs, home, where) if _wanted.get() else None
+    return triangulated(photographs, home, where) if are_wanted() else None
 
 
 def triangulated(photographs: Sequence[Photograph], home: Path, where: str) -> Points | None:

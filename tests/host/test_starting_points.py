@@ -15,6 +15,7 @@ import bitymi_ns.capture
 from bitymi_ns.capture import known
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.dataparser import BitymiDataParserConfig
+from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.sample.capture import camera_path, render
 from bitymi_ns.sample.room import Room
 from tests.host.captures import load_any, said
@@ -120,3 +121,19 @@ def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form
     before = len(asked)
     load_any(capture, points="triangulate")
     assert len(asked) == before + 1
+
+
+def test_points_without_colours_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    header = read_header(capture / "sparse_pc.ply")
+    rows = read_rows(capture / "sparse_pc.ply", header, "vertex")
+    with_colours = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
+    lines = "\n".join(f"{row['x']} {row['y']} {row['z']}" for row in rows)
+    properties = "".join(f"property float {c}\n" for c in "xyz")
+    (capture / "sparse_pc.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}end_header\n{lines}\n"
+    )
+    found = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
+    assert (found - with_colours).abs().mean() < 0.5 * (128.0 - with_colours).abs().mean()
+    assert "get the colours of the photographs that see them: its points have none." in said(capsys)
+    config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())
+    assert len(config.setup(device="cpu", test_mode="test").train_dataparser_outputs.metadata["points3D_rgb"]) == 0

@@ -18,6 +18,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as reader
 from bitymi_ns.capture.recognise import is_model, models_in
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.point_cloud import point_count
+from bitymi_ns.host.poses import warn_of_far_off
 
 
 def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:
@@ -84,7 +85,7 @@ def checked_models(config: DataParserConfig) -> Iterator[None]:
 
     checks: dict[str, Callable[[Path, Any], None]] = {
         "cameras": check_and_keep,
-        "images": lambda path, found: check_images(path, found, cameras),
+        "images": lambda path, found: _check_images_of_stock(path, found, cameras),
         "points3D": lambda path, found: None,
     }
     kept = {}
@@ -96,6 +97,12 @@ def checked_models(config: DataParserConfig) -> Iterator[None]:
     finally:
         for name, original in kept.items():
             setattr(reader, name, original)
+
+
+def _check_images_of_stock(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
+    check_images(path, images, cameras)
+    centers = [-(reader.qvec2rotmat(each.qvec / np.linalg.norm(each.qvec)).T @ each.tvec) for each in images.values()]
+    warn_of_far_off(path, np.array(centers))
 
 
 def _read(original: Callable[[Path], Any], check: Callable[[Path, Any], None], path: Path) -> Any:

@@ -141,6 +141,15 @@ def is_far_off(centers: npt.NDArray[np.float64]) -> bool:
     return bool(0.0 < FAR_OFF * spread < np.linalg.norm(middle))
 
 
+def warn_of_far_off(path: object, centers: npt.NDArray[np.float64]) -> None:
+    """Say that nerfstudio's own readers cannot tell the positions of such cameras [N, 3]."""
+    if is_far_off(centers):
+        warn(
+            f"{path}: the cameras lie so far from the origin that nerfstudio's reader, which has seven digits, blurs "
+            "their positions. Read it with `bitymi-data`, the default, which centres the capture first."
+        )
+
+
 def check_cloud(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:

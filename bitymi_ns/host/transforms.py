@@ -20,7 +20,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.host.errors import fail, listed, warn
-from bitymi_ns.host.poses import is_far_off, rotations
+from bitymi_ns.host.poses import rotations, warn_of_far_off
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 SIZES = ("w", "h")
@@ -94,11 +94,8 @@ def load(path: Path, own_format: bool, announce: bool = True, stock: bool = True
     if isinstance(frames, list) and all(isinstance(f, dict) and "transform_matrix" in f for f in frames):
         _correct_poses(path, frames, announce)
         _check_repeated(path, frames)
-        if stock and announce and is_far_off(np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]):
-            warn(
-                f"{path}: the cameras lie so far from the origin that nerfstudio's reader, which has seven digits, "
-                "blurs their positions. Read it with `bitymi-data`, the default, which centres the capture first."
-            )
+        if stock and announce and frames:
+            warn_of_far_off(path, np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3])
     return meta
 
 

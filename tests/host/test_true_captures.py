@@ -16,6 +16,7 @@ import torch
 from nerfstudio.cameras.camera_utils import fisheye624_project
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -139,6 +140,21 @@ def test_coordinates_of_a_map(
         assert np.abs(back[:, :, 3].numpy().mean(0) - offset).max() < 10.0
     moved = "float32 would blur the scene: their middle becomes the origin" in said(capsys)
     assert moved is (centred == "none" or fixed)
+
+
+@pytest.mark.parametrize("form", [nerfstudio, colmap])
+def test_nerfstudios_own_readers_blur_them(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    reader = (
+        NerfstudioDataParserConfig() if form is nerfstudio else ColmapDataParserConfig(colmap_path=Path("sparse/0"))
+    )
+    load_with(capture, reader)
+    assert "blurs" not in said(capsys)
+    move(place, UTM)
+    load_with(capture, reader)
+    assert "blurs their positions. Read it with `bitymi-data`, the default" in said(capsys)
 
 
 # entries of a camera

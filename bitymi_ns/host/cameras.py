@@ -47,7 +47,8 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     if distortion is not None and bool((distortion != 0).any()):
         fail(
             "a camera has lens distortion, which this method does not render. Training and evaluation undistort the "
-            "images on loading; for other tools undistort the capture first (COLMAP's image_undistorter)."
+            "images on loading; for other tools have the capture read with `bitymi-data`, the default, or undistort it "
+            "first (COLMAP's image_undistorter)."
         )
     c2w = cameras.camera_to_worlds[0].detach().double()  # [3, 4]
     rotation = c2w[:, :3] * c2w.new_tensor([1.0, -1.0, -1.0])

@@ -66,7 +66,7 @@ def to_capture(place: Place) -> Similarity:
     if float(shift.norm()) > FARTHEST * scale:
         raise BundleError(
             f"the capture lies {float(shift.norm()):,.0f} of its units from the origin of its own frame, as "
-            "coordinates of a map do, and the numbers of such files have seven digits: the scene would be blurred. Leave it in the "
-            "scene's frame; world.transform and world.scale of bundle.json say where that lies"
+            "coordinates of a map do, and the numbers of such files have seven digits: the scene would be blurred. "
+            "Leave it in the scene's frame; world.transform and world.scale of bundle.json say where that lies"
         )
     return Similarity(turn.T, scale, shift)

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, finished, work_folder
+from bitymi_ns.capture.masks import counted
 from bitymi_ns.capture.photos import PLAIN_SUFFIXES
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
@@ -36,6 +37,8 @@ class KnownView:
     """Of the camera model, in pixels of the file."""
     world_to_camera: np.ndarray
     """[3,4] rotation and translation, OpenCV axes (x right, y down, z forward)."""
+    mask: Path | None = None
+    """Picture that is black where no point is to be found; see `masks.counted`."""
 
     @property
     def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
@@ -66,7 +69,8 @@ def triangulate(home: Path, views: Sequence[KnownView], progress: Progress | Non
     if len(views) < 2:
         raise CaptureError(f"{home}: points need at least two photographs with poses, these are {len(views)}")
     settings = [(view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
-    key = content_key([view.file for view in views], settings)
+    masks = [view.mask for view in views if view.mask is not None and view.mask.is_file()]
+    key = content_key([*(view.file for view in views), *masks], settings)
     done = finished(home, key, DONE)
     if done is not None:  # several processes may read it
         return done / MODEL
@@ -74,7 +78,8 @@ def triangulate(home: Path, views: Sequence[KnownView], progress: Progress | Non
         with explained(work, CaptureError):
             process.run(_job(views, work), home, progress or no_progress)
             write_file(work / DONE, b"")
-            shutil.rmtree(work / "links", ignore_errors=True)
+            for name in ("links", "masks"):
+                shutil.rmtree(work / name, ignore_errors=True)
             process.forget(work)
         return work / MODEL
 
@@ -96,10 +101,16 @@ def _job(views: Sequence[KnownView], work: Path) -> Job:
         groups[view.camera].append(plain)
         names[plain] = str(view.file)
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
+        if view.mask is not None and view.mask.is_file():
+            with Image.open(view.mask) as image:
+                mask = Image.fromarray(counted(image))
+            (work / "masks").mkdir(exist_ok=True)
+            size = (view.width, view.height)
+            mask.resize(size, Image.Resampling.NEAREST).convert("L").save(work / "masks" / f"{plain}.png")
     return Job(
         work=str(work.resolve()),
         images=str(links.resolve()),
-        masks=None,
+        masks=str((work / "masks").resolve()) if (work / "masks").is_dir() else None,
         cameras=[CameraGroup(m, w, h, list(params), True, members) for (m, w, h, params), members in groups.items()],
         order=list(names),
         names=names,

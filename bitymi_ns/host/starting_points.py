@@ -78,7 +78,8 @@ def triangulated(photographs: Sequence[Photograph], home: Path, where: str) -> P
         turn = (mirror @ c2w[:3, :3]).T
         shift = -turn @ mirror @ (c2w[:3, 3] - middle)
         params = rescaled(camera.model, camera.params, size, stored)
-        views.append(KnownView(photograph.file, camera.model, *stored, params, np.column_stack([turn, shift])))
+        pose = np.column_stack([turn, shift])
+        views.append(KnownView(photograph.file, camera.model, *stored, params, pose, photograph.mask))
     say(f"{where} has no points: they are triangulated from the photographs, once. --points random does without.")
     try:
         if any(mirrored) and not all(mirrored):

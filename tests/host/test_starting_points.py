@@ -65,6 +65,24 @@ def test_points_are_triangulated_once(
     assert list((capture / ".bitymi").glob("poses-*/points"))
 
 
+def test_masked_pixels_give_no_points(arc: Path, tmp_path: Path, triangulating: None) -> None:
+    capture = Path(shutil.copytree(arc, tmp_path / "arc"))
+    meta = json.loads((capture / "transforms.json").read_text())
+    (capture / "masks").mkdir()
+    mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    mask[: SIZE[1] // 2] = 255
+    for i, frame in enumerate(meta["frames"]):
+        Image.fromarray(mask).save(capture / f"masks/{i}.png")
+        frame["mask_path"] = f"masks/{i}.png"
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    outputs = load_any(capture, eval_interval=6).train_dataparser_outputs
+    camera = outputs.cameras[0]
+    pose = camera.camera_to_worlds.double()
+    local = (outputs.metadata["points3D_xyz"].double() - pose[:, 3]) @ pose[:, :3]
+    rows = float(camera.cy) - float(camera.fy) * local[:, 1] / -local[:, 2]
+    assert len(local) > 10 and float((rows < 0.55 * SIZE[1]).double().mean()) > 0.9
+
+
 def test_what_cannot_be_triangulated(
     arc: Path, tmp_path: Path, triangulating: None, capsys: pytest.CaptureFixture[str]
 ) -> None:

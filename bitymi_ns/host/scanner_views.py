@@ -42,6 +42,9 @@ def scanned(found: Found, look: bool) -> list[Photograph]:
     }  # fmt: skip
     try:
         rows = readers[found.format](found.path)
+        for path, pose, pinhole, stated in rows:
+            if not np.isfinite([*pose.ravel(), *pinhole]).all() or min(stated or (1, 1)) < 1:
+                raise ValueError(f"the pose or camera of {path.name} is not finite, or its picture has no pixels")
     except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
         detail = f"the entry {error} is missing" if isinstance(error, KeyError) else str(error)
         fail(f"{found.path}, read as {found.format}, is damaged: {detail}. Export it again.", error)

@@ -122,6 +122,18 @@ def test_scans_that_are_damaged(capture: Path, tmp_path: Path) -> None:
     path.write_text(json.dumps(values))
     with expect("read as polycam, is damaged: the entry 't_01' is missing"):
         load_any(folder)
+    for change, why in (
+        ({"t_01": float("nan")}, "the pose or camera of 3.png is not finite"),
+        ({"t_01": 0.0, "width": 0}, "its picture has no pixels"),
+        ({"t_01": 0.0, "width": float("inf")}, "infinity"),
+        ({"t_01": [[]] * 3}, "float"),
+    ):
+        path.write_text(json.dumps({**values, **change}))
+        with expect(f"read as polycam, is damaged: .*{why}"):
+            load_any(folder)
+    path.write_text("[" * 100_000)
+    with expect("read as polycam, is damaged: it is nested too deeply"):
+        load_any(folder)
     path.unlink()
     (folder / "keyframes/corrected_images/5.png").unlink()
     with expect("1 of 11 photographs of .* are missing: .*corrected_images/5"):

@@ -294,7 +294,10 @@ def passed_over(folder: Path) -> list[str]:
 
 
 def _pictures(folder: Path) -> int:
-    return sum(is_picture(path) for path in folder.iterdir())
+    try:
+        return sum(is_picture(path) for path in folder.iterdir())
+    except OSError:  # it may not be read, and need not be
+        return 0
 
 
 def is_photograph(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +19,7 @@ from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
+from bitymi_ns.bundle import strict_json
 from bitymi_ns.host.commands import REFUSED
 from bitymi_ns.host.config import BitymiTrainerConfig
 from bitymi_ns.host.errors import InputError
@@ -49,6 +51,19 @@ def test_a_bundle_alone_has_the_cameras_of_its_capture(bundle: Path, alone: Path
         assert [path.name for path in a.image_filenames] == [path.name for path in b.image_filenames]
         assert torch.allclose(a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, atol=1e-5)
         assert torch.equal(a.cameras.fx, b.cameras.fx) and torch.equal(a.cameras.width, b.cameras.width)
+
+
+def test_names_of_a_bundle_alone_lead_nowhere_else(alone: Path, tmp_path: Path) -> None:
+    info = json.loads((alone / "bundle.json").read_text())
+    cameras = json.loads((alone / "cameras.json").read_text())
+    cameras["cameras"][0]["name"] = "../../somewhere.png"
+    data = json.dumps(cameras).encode()
+    (alone / "cameras.json").write_bytes(data)
+    info["files"]["cameras.json"].update(bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
+    info.pop("digest")
+    (alone / "bundle.json").write_text(json.dumps({**info, "digest": strict_json.digest(info)}))
+    with pytest.raises(InputError, match=r"cameras.json: the name '../../somewhere.png' leads elsewhere"):
+        eval_setup(alone / "config.yml")
 
 
 def test_trajectories_need_a_bundle_alone(alone: Path, drawn: list[Any]) -> None:

@@ -302,6 +302,34 @@ def test_one_file_is_not_taken_for_two_photographs(capture: Path) -> None:
         load_any(capture)
 
 
+def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_capture(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = project / "sparse/0/images.txt"
+    text = images.read_text()
+    images.write_text(text.replace("frame_00004.png", "../../frame_00004.png"))
+    assert len(load_any(project, eval_mode="all").train_dataset) == 12
+    assert "frame_00004.png for ../../frame_00004.png" in said(capsys)
+    elsewhere = tmp_path / "elsewhere/private.png"
+    elsewhere.parent.mkdir()
+    Image.new("RGB", (48, 36)).save(elsewhere)
+    for name in (str(elsewhere), "../../elsewhere/private.png", "..\\..\\elsewhere\\private.png"):
+        images.write_text(text.replace("frame_00004.png", name))
+        with expect(r"(?s)1 of 12 images of the capture are missing:.*private.png"):
+            load_any(project)
+
+
+@pytest.mark.parametrize("form", JSON)
+def test_photographs_outside_of_the_capture_are_named(
+    capture: Path, form: Callable[[Path], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place, picture = form(capture), images_of(capture)[3]
+    picture.rename(tmp_path / "elsewhere.png")
+    rewrite(place, lambda meta: meta["frames"][3].update(file_path=str(tmp_path / "elsewhere.png")))
+    load_any(capture)
+    assert f"names pictures outside of its folder, which are read there: {tmp_path}/elsewhere.png." in said(capsys)
+
+
 # files of a model, and sizes
 
 

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
 from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
@@ -19,9 +20,11 @@ from bitymi_ns.trust import Refused, check_no_links, is_own, json_of, own_folder
 FOLDER = ".bitymi"
 OF = "of.json"
 """File in a work folder: what it is of, and the key of that alone."""
+Kind = Literal["poses", "points"]
+"""What a work folder is for, with which its name begins: poses, or points of known poses."""
 IN_USE = ".in-use-"
 """Begins the names of the locks of processes that read what a work folder holds."""
-VERSION = 4
+VERSION = 5
 """Raised where the same photographs and options give other poses than before, so that kept ones are found anew."""
 
 
@@ -39,7 +42,7 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 
 
 @contextmanager
-def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
+def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
     """The folder of this key, held for one process, made where it is missing: in `.bitymi` beside the photographs, or
     in the user's cache folder where nothing can be written there, or others can write there.
 
@@ -47,6 +50,7 @@ def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
         photographs: their folder, or a video.
         key: see `content_key`.
         tell: told why it is the cache folder, where that is not plain from its permissions.
+        kind: what it is for.
 
     Raises:
         CaptureError: another process is at work there, or neither can be written.
@@ -56,7 +60,7 @@ def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
     for place in (beside, cache):
         if place is None:
             continue
-        folder = place / f"poses-{key}"
+        folder = place / f"{kind}-{key}"
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
             own_folder(place, close=True)
@@ -64,10 +68,10 @@ def work_folder(photographs: Path, key: str, tell: Tell) -> Iterator[Path]:
             check_no_links(folder.iterdir())
             lock = files.Lock(folder / ".lock", tell=lambda text: None)
         except files.Busy as error:
-            raise CaptureError(f"poses of {photographs} are being found already: {error}") from error
+            raise CaptureError(f"{kind} of {photographs} are being found already: {error}") from error
         except OSError as error:
             if place == beside and isinstance(error, Refused):
-                tell(f"{error}. It is not used: the poses are kept in {cache or 'no place that is known'}.")
+                tell(f"{error}. It is not used: the {kind} are kept in {cache or 'no place that is known'}.")
             problem = error
             continue
         with lock:
@@ -87,8 +91,21 @@ def home(photographs: Path) -> Path:
     return (folder.parent if folder.name == "images" and not os.path.ismount(folder) else folder) / FOLDER
 
 
+def finished(photographs: Path, key: str, mark: str, kind: Kind = "poses") -> Path | None:
+    """The folder of this key in which a file of this name says that the work is done; None = there is none that others
+    cannot write to."""
+    for place in (home(photographs), user_cache()):
+        if place is not None and is_own(place) and is_own(folder := place / f"{kind}-{key}"):
+            with suppress(OSError):
+                check_no_links(folder.iterdir())
+                if (folder / mark).is_file():
+                    return folder
+    return None
+
+
 def take_place(work: Path, photographs: Path, contents: str) -> None:
-    """Say what a work folder is of, and remove those of the same source as it was before: their key cannot come back.
+    """Say what a work folder is of, and remove those of its kind and source as it was before: their key cannot come
+    back.
     Those with other options stay, because runs were trained on them; so do those that a process works in or reads from.
 
     Args:
@@ -98,7 +115,7 @@ def take_place(work: Path, photographs: Path, contents: str) -> None:
     """
     source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # still so when both are moved
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
-    for other in work.parent.glob("poses-*"):
+    for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
         if other != work and _is_stale(other, source, contents):
             try:
                 with files.Lock(other / ".lock", tell=lambda text: None):

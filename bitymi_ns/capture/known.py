@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import warnings
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
-from bitymi_ns.capture.cache import content_key, work_folder
-from bitymi_ns.capture.photos import check_names
+from bitymi_ns.capture.cache import content_key, finished, take_place, work_folder
+from bitymi_ns.capture.masks import counted
+from bitymi_ns.capture.photos import PLAIN_SUFFIXES, check_names, eight_bits
+from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError
@@ -27,86 +31,97 @@ DONE = "points"
 class KnownView:
     """A photograph whose camera is known."""
 
-    name: str
-    """Of the file, relative to the folder of the photographs."""
+    file: Path
+    model: str
+    """COLMAP's camera model."""
     width: int
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    params: tuple[float, ...]
+    """Of the camera model, in pixels of the file."""
     world_to_camera: np.ndarray
     """[3,4] rotation and translation, OpenCV axes (x right, y down, z forward)."""
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2 of OpenCV."""
+    mask: Path | None = None
+    """Picture that is black where no point is to be found; see `masks.counted`."""
 
     @property
     def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """COLMAP's camera model, size in pixels, and parameters."""
-        pinhole = (self.fx, self.fy, self.cx, self.cy)
-        if any(self.distortion):
-            return "OPENCV", self.width, self.height, (*pinhole, *self.distortion)
-        return "PINHOLE", self.width, self.height, pinhole
+        """What photographs of one camera have in common."""
+        return self.model, self.width, self.height, self.params
 
 
 def triangulate(
-    images: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
+    capture: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
     """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept and continued as
     `find_poses` does.
 
     Args:
-        images: folder that the views' names are relative to.
+        capture: folder in which the result is kept.
         views: the photographs with their cameras.
         progress: told the stage and how far it is.
         tell: told where the points are kept, if not beside the photographs although these can be written.
 
     Returns:
-        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses.
+        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses, in which the
+        photographs have their names as seen from the folder of the capture.
 
     Raises:
         CaptureError: too few points can be found; says what may be wrong.
         KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
-    images = Path(images)
-    missing = [view.name for view in views if not (images / view.name).is_file()]
+    missing = [view.file for view in views if not view.file.is_file()]
     if missing:
-        raise CaptureError(
-            f"{images / missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there"
-        )
+        raise CaptureError(f"{missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there")
     if len(views) < 2:
-        raise CaptureError(f"{images}: points need at least two photographs with poses, these are {len(views)}")
-    check_names(images, [view.name for view in views])
-    settings = [(view.name, view.camera, np.asarray(view.world_to_camera).tolist()) for view in views]
-    key = content_key([(view.name, images / view.name) for view in views], settings)
-    with work_folder(images, key, tell) as work:
-        model = work / MODEL
-        if (work / DONE).exists():
-            return model
+        raise CaptureError(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
+    names = [os.path.relpath(view.file, capture) for view in views]
+    check_names(capture, names)
+    masks = [view.mask for view in views if view.mask is not None and view.mask.is_file()]
+    inputs = list(zip(names, (view.file for view in views), strict=True))
+    inputs += [(os.path.relpath(mask, capture), mask) for mask in masks]
+    key = content_key(inputs, [(view.camera, np.asarray(view.world_to_camera).tolist()) for view in views])
+    done = finished(capture, key, DONE, "points")
+    if done is not None:  # several processes may read it
+        return done / MODEL
+    with work_folder(capture, key, tell, "points") as work:
+        if (work / DONE).is_file():
+            return work / MODEL
         with explained(work, CaptureError):
-            process.run(_job(images, views, work), images, progress or no_progress)
+            process.run(_job(names, views, work), capture, progress or no_progress)
             write_file(work / DONE, b"")
-            shutil.rmtree(work / "links", ignore_errors=True)
+            for name in ("links", "masks"):
+                shutil.rmtree(work / name, ignore_errors=True)
             process.forget(work)
-        return model
+            folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
+            take_place(work, folder, content_key(inputs, "contents"))
+        return work / MODEL
 
 
-def _job(images: Path, views: Sequence[KnownView], work: Path) -> Job:
-    links = work / "links"
-    shutil.rmtree(links, ignore_errors=True)
-    links.mkdir()
+def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
+    links, masks = work / "links", work / "masks"
+    for folder in (links, masks):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
     groups: dict[tuple[str, int, int, tuple[float, ...]], list[str]] = defaultdict(list)
     names, poses = {}, {}
-    for i, view in enumerate(views):
-        plain = f"{i:06d}{Path(view.name).suffix.lower()}"
-        (links / plain).symlink_to((images / view.name).resolve())
+    for i, (name, view) in enumerate(zip(stated, views, strict=True)):
+        suffix = view.file.suffix.lower()
+        plain = f"{i:06d}{suffix if suffix in PLAIN_SUFFIXES else '.png'}"
+        if suffix in PLAIN_SUFFIXES:
+            (links / plain).symlink_to(view.file.resolve())
+        else:
+            _read(view.file, lambda image: eight_bits(image).convert("RGB")).save(links / plain)
         groups[view.camera].append(plain)
-        names[plain] = view.name
+        names[plain] = name
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
+        if view.mask is not None and view.mask.is_file():
+            mask = _read(view.mask, lambda image: Image.fromarray(counted(image)))
+            size = (view.width, view.height)
+            mask.resize(size, Image.Resampling.NEAREST).convert("L").save(masks / f"{plain}.png")
     return Job(
         work=str(work.resolve()),
         images=str(links.resolve()),
-        masks=None,
+        masks=str(masks.resolve()) if any(masks.iterdir()) else None,
         cameras=[CameraGroup(m, w, h, list(params), True, members) for (m, w, h, params), members in groups.items()],
         order=list(names),
         names=names,
@@ -114,3 +129,12 @@ def _job(images: Path, views: Sequence[KnownView], work: Path) -> Job:
         positions={},
         poses=poses,
     )
+
+
+def _read(path: Path, what: Callable[[Image.Image], Image.Image]) -> Image.Image:
+    """What is made of a picture."""
+    try:
+        with open_picture(path) as image:
+            return what(image)
+    except Exception as error:
+        raise CaptureError(f"{path} cannot be read as a picture: save it anew") from error

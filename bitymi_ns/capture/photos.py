@@ -13,7 +13,8 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
-from bitymi_ns.capture.recognise import is_photograph, open_picture
+from bitymi_ns.capture.panorama import says_so, shows_so
+from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import is_text
@@ -45,6 +46,8 @@ class Photo:
     """[h,w] float32 grey levels, longer side THUMB."""
     sharpness: float
     """Share of the fine detail in all detail; see `sharpness`."""
+    panorama: bool = False
+    """Whether it shows all directions at once."""
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -63,18 +66,17 @@ def _photos_in(folder: Path) -> list[Path]:
 
 
 def find_photos(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its folders, in natural order; masks and hidden folders are passed over.
+    """Names of the photographs in a folder and its folders, in natural order; see `photographs_below`.
 
     Raises:
         CaptureError: the folder is missing, or cannot be read.
     """
     try:
-        paths = [path for path in folder.rglob("*") if is_photograph(path)]
+        os.listdir(folder)
+        paths = list(photographs_below(folder))
     except OSError as error:
         raise CaptureError(f"{folder} cannot be read: {error.strerror}") from error
-    parts = [path.relative_to(folder).parts for path in paths]
-    seen = [p for p in parts if not any(part.startswith(".") or part in ("masks", "mask") for part in p[:-1])]
-    return sorted(("/".join(p) for p in seen), key=natural)
+    return sorted((path.relative_to(folder).as_posix() for path in paths), key=natural)
 
 
 def check_names(folder: Path, names: Sequence[str]) -> None:
@@ -148,7 +150,8 @@ def read_photo(folder: Path, name: str) -> Photo:
     plain = orientation in (0, 1) and suffix in PLAIN_SUFFIXES and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
     thumb = np.asarray(_reduced(grey, THUMB), np.float32)
     detail = np.asarray(_reduced(grey, SHARPNESS_SIZE), np.float32)
-    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail))
+    panorama = says_so(path) or shows_so(thumb)
+    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail), panorama)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:

@@ -19,6 +19,7 @@ from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, take_place, work_folder
 from bitymi_ns.capture.frame import local_positions, settle, write_frame
 from bitymi_ns.capture.masks import mask_folder
+from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.capture.photos import Photo, check_names, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
@@ -32,6 +33,8 @@ from bitymi_ns.progress import Progress, no_progress
 
 GUESSED_FOCAL = 1.2
 """First guess of a focal length that is not known, in units of the longer side; COLMAP's own."""
+TELLING = 0.25
+"""Share of the photographs of a size that show all directions, from which on all of them do."""
 LEAST = 3
 """Photographs without which there is nothing to find."""
 SPARSE = Path("sparse/0")
@@ -151,6 +154,7 @@ def _find(
     given = len(names)
     read = time.monotonic()
     photos, left_out = read_photos(folder, names, tell)
+    photos = _without_panoramas(source, photos, left_out)
     twins = duplicates(photos)
     left_out |= {name: f"the same as {twin}" for name, twin in twins.items()}
     photos = [photo for photo in photos if photo.name not in twins]
@@ -170,6 +174,26 @@ def _find(
     seconds["all"] = time.monotonic() - begun
     values = {"source": str(source), "given": given, "left_out": left_out, "notes": notes, "seconds": seconds}
     return _write(work, images, {**values, **result}, photos, job)
+
+
+def _without_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str]) -> list[Photo]:
+    """The photographs that a lens took; others are left out, or all refused where they are the most.
+
+    A zenith with detail, or edges without, hide what a picture is; others of its size tell.
+    """
+    groups: dict[tuple[int, int], list[Photo]] = defaultdict(list)
+    for photo in photos:
+        groups[photo.width, photo.height].append(photo)
+    told = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
+    all_round = [photo.name for photo in photos if (photo.width, photo.height) in told or photo.panorama]
+    if len(all_round) > len(photos) / 2:
+        some = ", ".join(all_round[:3])
+        raise CaptureError(
+            f"{len(all_round)} of {len(photos)} photographs of {source} show all directions at once ({some}). "
+            f"{PANORAMAS}"
+        )
+    left_out |= dict.fromkeys(all_round, "it shows all directions at once (360 degrees)")
+    return [photo for photo in photos if photo.name not in left_out]
 
 
 def _too_few_left(

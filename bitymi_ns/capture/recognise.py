@@ -3,8 +3,10 @@ video."""
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,7 +16,9 @@ from PIL import Image
 
 from bitymi_ns.trust import json_of
 
-Format = Literal["nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"]
+Format = Literal[
+    "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "pose-files", "photographs", "video"
+]
 
 pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
 
@@ -27,10 +31,20 @@ one, EPS, is a program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP model usually lies in a capture, the most usual place first."""
-BESIDES = {"masks", "depths", "sparse", "colmap"}
-"""Folders of a capture that hold no photographs."""
+BESIDES = {
+    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
+    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
+    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
+    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
+    "stereo": "a model", "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+}  # fmt: skip
+"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
+BESIDE = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
+"""The same for files, without their endings, that lie beside folders of photographs."""
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries that a transforms.json has from nerfstudio alone."""
+POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
+"""Folders of Polycam's pictures and of the cameras that belong to them, the better ones first."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 
@@ -133,11 +147,27 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", folder
     for model in models_in(folder):
         yield "colmap", folder / model
+    yield from _scanned(folder)
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
     for video in sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()):
         yield "video", video
+
+
+def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
+    """What scanning programs wrote, and RGB-D sets with poses."""
+    keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
+    if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
+        yield "polycam", folder
+    for name in ("metadata", "metadata.json"):
+        with suppress(OSError):
+            if (folder / name).is_file() and b'"poses"' in (folder / name).read_bytes():
+                yield "record3d", folder
+                break
+    colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
+    if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
+        yield "pose-files", folder
 
 
 def _kind_of(file: Path) -> Format:
@@ -198,25 +228,90 @@ def image_count(model: Path) -> int:
 
 
 def _photographs_in(folder: Path) -> Path | None:
-    """The folder to search for photographs: this one where they lie in it or in its `images`, else the one below."""
-    if _has_photographs(folder) or _has_photographs(folder / "images"):
+    """The folder to search for photographs: this one where they lie in it or in its `images`, else the one below, else
+    this one again where they lie in several. None = there are none, or captures of their own."""
+    if _has_photographs(folder) or _has_photographs(folder / "images", below=True):
         return folder
-    below = sorted(
-        path
-        for path in folder.iterdir()
-        if path.is_dir() and path.name not in BESIDES and not path.name.startswith(".")
-    )
-    holding = [path for path in below if _has_photographs(path)]
-    if not holding:
+    holding = [path for path in _folders_in(folder) if _has_photographs(path, below=True)]
+    if not holding or captures_in(folder):
         return None
-    return holding[0] if len(holding) == 1 else folder
+    return _photographs_in(holding[0]) if len(holding) == 1 else folder
 
 
-def _has_photographs(folder: Path) -> bool:
-    return folder.is_dir() and any(is_photograph(path) for path in folder.iterdir())
+def captures_in(folder: Path) -> list[Path]:
+    """Folders of this one that are captures of their own: several of them have an `images` of photographs."""
+    found = [path for path in _folders_in(folder) if _has_photographs(path / "images", below=True)]
+    return found if len(found) > 1 else []
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    names = [path.name for path in folder.iterdir() if path.is_dir()]
+    return sorted(folder / name for name in names if _may_hold_photographs(name) and not _copies(name, names))
+
+
+def _may_hold_photographs(name: str) -> bool:
+    return not name.startswith(".") and name.lower() not in BESIDES
+
+
+def _has_photographs(folder: Path, below: bool = False) -> bool:
+    if not folder.is_dir():
+        return False
+    return any(True for _ in photographs_below(folder)) if below else any(map(is_photograph, folder.iterdir()))
+
+
+def photographs_below(folder: Path) -> Iterator[Path]:
+    """The photographs in a folder and in those below it, but for hidden ones and those that hold something else."""
+    for place, below, names in os.walk(folder):
+        below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
+        for name in names:
+            path = Path(place, name)
+            if is_photograph(path):
+                yield path
+
+
+def _copies(name: str, beside: list[str]) -> str:
+    """What copies of the pictures in other folders beside it a folder holds, by its name; empty = none."""
+    if f"corrected_{name}" in beside:
+        return "raw copies of corrected pictures"
+    original, _, factor = name.rpartition("_")
+    return "reduced copies" if factor in ("2", "4", "8", "16") and original in beside else ""
+
+
+def passed_over(folder: Path) -> list[str]:
+    """What pictures in a folder and below it `photographs_below` leaves out, a phrase each."""
+    found = []
+    for place, below, names in os.walk(folder):
+        for name in sorted(below):
+            what = BESIDES.get(name.lower()) or _copies(name, below)
+            if what and _pictures(Path(place, name)):
+                found.append(f"{Path(place, name).relative_to(folder)} ({_pictures(Path(place, name))} {what})")
+        below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
+        for name in sorted(names):
+            path = Path(place, name)
+            if is_picture(path) and not is_photograph(path):
+                found.append(f"{path.relative_to(folder)} ({_beside(path)})")
+    return found
+
+
+def _pictures(folder: Path) -> int:
+    try:
+        return sum(is_picture(path) for path in folder.iterdir())
+    except OSError:  # it may not be read, and need not be
+        return 0
 
 
 def is_photograph(path: Path) -> bool:
+    """Whether it is a picture, and not one that programs put beside photographs."""
+    return is_picture(path) and not _beside(path)
+
+
+def _beside(path: Path) -> str:
+    """What a picture beside photographs is, by its name; empty = a photograph."""
+    stem = path.stem.lower()
+    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else BESIDE.get(stem, "")
+
+
+def is_picture(path: Path) -> bool:
     """Whether it is a file with the ending of a photograph, and not hidden."""
     return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
@@ -249,8 +344,11 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
     other = (data / "meta_data.json").is_file()
     hint = " It has a meta_data.json: give `sdfstudio-data` after the options of the method." if other else ""
+    several = captures_in(data)
+    if several:
+        hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
-    if archive is not None:
+    if archive is not None and not several:
         hint = f" Unpack {archive.name} first."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "

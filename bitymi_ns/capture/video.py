@@ -11,6 +11,7 @@ import av
 import numpy as np
 from PIL import Image
 
+from bitymi_ns.capture.hdr import is_hdr, ordinary
 from bitymi_ns.capture.photos import sharpness
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.types import CaptureError
@@ -199,5 +200,5 @@ def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:
 
 def _upright(frame: av.VideoFrame, turn: int) -> Image.Image:
     """The frame as it is seen: `turn` is counter-clockwise, as ffmpeg's display matrix has it."""
-    image = frame.to_image()
+    image = ordinary(frame) if is_hdr(frame) else frame.to_image()
     return image.rotate(turn, expand=True) if turn % 360 else image

@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from bitymi_ns.host.bundle_model import BakedModelConfig  # noqa: F401 - the config.yml of earlier bundles name it here
+from bitymi_ns.host.commands import folder_being_evaluated
 from bitymi_ns.host.errors import fail
 
 MANIFEST = "bundle.json"
@@ -28,16 +29,6 @@ def find_bundle(recorded: Path) -> Path:
             return folder.absolute()
     places = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
     fail(f"no bundle found (looked for {MANIFEST} in {places}). Keep config.yml in the bundle's folder.")
-
-
-def folder_being_evaluated() -> Path | None:
-    """The folder of the config.yml that nerfstudio's eval_setup is loading, which it does not pass on; else None."""
-    frame = sys._getframe()
-    while frame is not None:
-        if frame.f_code.co_name == "eval_setup" and isinstance(frame.f_locals.get("config_path"), Path):
-            return frame.f_locals["config_path"].absolute().parent
-        frame = frame.f_back
-    return None
 
 
 def _loaded_from() -> list[Path]:

@@ -11,13 +11,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
+from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
-PANORAMAS = (
-    "360-degree pictures cannot be trained on as they are. Cut them into perspective views with "
-    "`ns-process-data images --camera-type equirectangular`, which finds their poses anew."
-)
 UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
 """Kinds of cameras whose photographs become those of a perspective camera on loading."""
 OFF_AXIS = 80
@@ -50,7 +47,8 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     if distortion is not None and bool((distortion != 0).any()):
         fail(
             "a camera has lens distortion, which this method does not render. Training and evaluation undistort the "
-            "images on loading; for other tools undistort the capture first (COLMAP's image_undistorter)."
+            "images on loading; for other tools have the capture read with `bitymi-data`, the default, or undistort it "
+            "first (COLMAP's image_undistorter)."
         )
     c2w = cameras.camera_to_worlds[0].detach().double()  # [3, 4]
     rotation = c2w[:, :3] * c2w.new_tensor([1.0, -1.0, -1.0])

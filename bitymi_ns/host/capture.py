@@ -23,15 +23,19 @@ from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.recognise import PHOTOGRAPHS, Found, models_in
 from bitymi_ns.host import transforms
+from bitymi_ns.host.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.host.colmap import check_model, options_for
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import mask_files
-from bitymi_ns.host.dataparser import BitymiDataParserConfig
+from bitymi_ns.host.commands import folder_being_evaluated, how_to_say_where
+from bitymi_ns.host.dataparser import SCANNED, BitymiDataParserConfig
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import MOST_PIXELS, check_sizes
 from bitymi_ns.host.point_cloud import point_count, what_is_wrong_with
 from bitymi_ns.host.poses import check_spread
+from bitymi_ns.host.scanner_views import scanned
 from bitymi_ns.host.transforms import HOW_TO_GET_ONE
+from bitymi_ns.host.transforms_views import missing_photographs
 from bitymi_ns.trust import json_of
 
 
@@ -57,15 +61,14 @@ def check_capture(config: FullImageDatamanagerConfig, images: bool = True) -> Cl
     dataparser = config.dataparser
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
-        fail(f"the capture {data} does not exist. Give its folder with --data. {HOW_TO_GET_ONE}")
+        made = "" if folder_being_evaluated() else f" {HOW_TO_GET_ONE}"
+        fail(f"the capture {data} does not exist. {how_to_say_where()}{made}")
+    if isinstance(dataparser, BundleCamerasConfig):
+        return Cloud()
     _check_options(dataparser)
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data
-        found = dataparser.find()
-        stock = dataparser.stock(found)
-        if stock is None:
-            return _check_model(dataparser, found, images)
-        data, dataparser = stock.data, stock
+        return _check_own(dataparser, dataparser.find(), images)
     if isinstance(dataparser, NerfstudioDataParserConfig):
         return _check_transforms(data, dataparser, images)
     if isinstance(dataparser, ColmapDataParserConfig):
@@ -88,15 +91,38 @@ def _check_options(dataparser: DataParserConfig) -> None:
             fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
-def _check_model(dataparser: BitymiDataParserConfig, found: Found, images: bool) -> Cloud:
-    if found.format != "colmap":
+def _check_own(dataparser: BitymiDataParserConfig, found: Found, images: bool) -> Cloud:
+    """The same for what the methods' own parser reads."""
+    if found.format in ("photographs", "video"):
         return Cloud()  # there are no poses yet
-    source = dataparser.source(found, images)
-    model = read_model(source.folder)
+    if found.format in SCANNED:
+        photographs = scanned(found, images)
+        if images:
+            check_sizes([photograph.file for photograph in photographs])
+        return Cloud()
+    own = dataparser.points == "auto"
+    if found.format == "colmap":
+        source = dataparser.source(found, images)
+        model = read_model(source.folder)
+        if images:
+            check_images(source.files(model))
+            mask_files(source, model)
+        return Cloud(len(model.xyz) if own else 0)
+    read = dataparser.transforms(found, "transforms_train.json", images, announce=False)
     if images:
-        check_images(source.files(model))
-        mask_files(source, model)
-    return Cloud(len(model.xyz) if dataparser.load_3D_points else 0)
+        missing_photographs(read.path, read.photographs)
+        check_sizes([photograph.file for photograph in read.photographs])
+    if dataparser.auto_scale_poses and found.format == "nerfstudio":
+        check_spread(np.array([photograph.pose[:3, 3] for photograph in read.photographs]), str(read.path))
+    if found.format == "blender":
+        name, way_out = dataparser.ply_path, "leave --ply-path out"
+    else:
+        name, way_out = read.meta.get("ply_file_path"), f"remove ply_file_path from {read.path}"
+    if not own or name is None:
+        return Cloud()
+    if isinstance(name, str) and not name or not isinstance(name, (str, Path)):
+        fail(f"{read.path}: ply_file_path is {name!r}, not the name of a file. Correct it or remove it.")
+    return Cloud(_check_cloud(found.folder / name, way_out).points)
 
 
 def _check_transforms(data: Path, dataparser: NerfstudioDataParserConfig, images: bool) -> Cloud:
@@ -191,8 +217,8 @@ def declares_box(dataparser: DataParserConfig) -> bool:
     """Whether the capture itself states the box that holds its scene. Other parsers' boxes are defaults of nerfstudio,
     which say nothing about the capture."""
     if isinstance(dataparser, BitymiDataParserConfig):
-        stock = dataparser.stock(dataparser.find())
-        return stock is not None and declares_box(stock)
+        found = dataparser.find()
+        return found.format == "instant-ngp" and "aabb_scale" in json_of(found.path.read_bytes())
     if isinstance(dataparser, (MinimalDataParserConfig, SDFStudioDataParserConfig)):
         return True
     if isinstance(dataparser, InstantNGPDataParserConfig):

@@ -18,7 +18,8 @@ from nerfstudio.data.utils import colmap_parsing_utils as reader
 from bitymi_ns.capture.recognise import is_model, models_in
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.point_cloud import point_count
-from bitymi_ns.trust import inside
+from bitymi_ns.host.poses import warn_of_far_off
+from bitymi_ns.trust import leads_inside
 
 
 def check_model(data: Path, dataparser: ColmapDataParserConfig) -> int:
@@ -85,7 +86,7 @@ def checked_models(config: DataParserConfig) -> Iterator[None]:
 
     checks: dict[str, Callable[[Path, Any], None]] = {
         "cameras": check_and_keep,
-        "images": lambda path, found: check_images(path, found, cameras),
+        "images": lambda path, found: _check_images_of_stock(path, found, cameras),
         "points3D": lambda path, found: None,
     }
     kept = {}
@@ -97,6 +98,18 @@ def checked_models(config: DataParserConfig) -> Iterator[None]:
     finally:
         for name, original in kept.items():
             setattr(reader, name, original)
+
+
+def _check_images_of_stock(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
+    check_images(path, images, cameras)
+    for number, image in images.items():
+        if not leads_inside(image.name):
+            fail(
+                f"{path}, image {number}: the name {image.name!r} leads elsewhere than to a file in the folder: "
+                "correct it, or read the capture with `bitymi-data`, the default, which looks for the photograph there."
+            )
+    centers = [-(reader.qvec2rotmat(each.qvec / np.linalg.norm(each.qvec)).T @ each.tvec) for each in images.values()]
+    warn_of_far_off(path, np.array(centers))
 
 
 def _read(original: Callable[[Path], Any], check: Callable[[Path, Any], None], path: Path) -> Any:
@@ -128,9 +141,16 @@ def parameter_count(model: str) -> int | None:
 
 
 def check_cameras(path: Path, cameras: dict[int, Any]) -> None:
-    """Stop at a camera whose parameters do not go with its camera model."""
+    """Stop at a camera whose parameters are no numbers, or do not go with its camera model."""
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
+        numbers = [camera.width, camera.height, *camera.params]
+        if not np.isfinite(numbers).all() or min(camera.width, camera.height) < 1:
+            written = " ".join(f"{value:g}" for value in numbers)
+            fail(
+                f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
+                "has to be positive and all numbers finite. Correct it, or write the model anew from COLMAP."
+            )
         if count is not None and len(camera.params) != count:
             fail(
                 f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}. "
@@ -138,15 +158,20 @@ def check_cameras(path: Path, cameras: dict[int, Any]) -> None:
             )
 
 
+def _line_of(path: Path, number: int) -> str:
+    """Words on where a text file states the camera or image of a number; empty for a binary one."""
+    if path.suffix != ".txt":
+        return ""
+    with open(path, encoding="utf8", errors="replace") as file:
+        lines = [i for i, line in enumerate(file, 1) if line.split()[:1] == [str(number)]]
+    return f", line {lines[0]}" if lines else ""
+
+
 def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) -> None:
     """Stop at images that have no pose, or no camera of the model."""
     if not images:
         fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path` after `colmap`.")
     for number, image in images.items():
-        try:
-            inside(Path(), image.name)
-        except ValueError as error:
-            fail(f"{path}, image {number}: {error}.", error)
         if cameras and image.camera_id not in cameras:
             fail(
                 f"{path}: image {number} ({image.name}) was taken by camera {image.camera_id}, but the model has only "
@@ -154,6 +179,6 @@ def check_images(path: Path, images: dict[int, Any], cameras: dict[int, Any]) ->
             )
         if not np.isfinite([*image.qvec, *image.tvec]).all() or not image.qvec.any():
             fail(
-                f"{path}: the pose of image {number} ({image.name}) is not finite, or its rotation is zero. Correct "
-                "its line or remove the image."
+                f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its "
+                "rotation is zero. Correct its line or remove the image."
             )

@@ -19,7 +19,9 @@ import numpy.typing as npt
 import pycolmap
 
 from bitymi_ns.host.colmap import check_cameras, check_images, parameter_count, reading
-from bitymi_ns.host.errors import fail
+from bitymi_ns.host.errors import fail, warn
+from bitymi_ns.host.ply import read_points
+from bitymi_ns.host.point_cloud import what_is_wrong_with
 
 
 class ModelCamera(NamedTuple):
@@ -64,7 +66,7 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: what is wrong with it, by file and entry.
     """
-    files = [_file(folder, name) for name in ("cameras", "images", "points3D")]
+    files = [*(_file(folder, name) for name in ("cameras", "images", "points3D")), folder / "points3D.ply"]
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
     return _read_model(folder, stamps)
 
@@ -91,6 +93,18 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     if path.is_file():
         with reading(path):
             xyz, rgb = _points_text(path) if path.suffix == ".txt" else _points_binary(path)
+            kept = np.isfinite(xyz).all(1)
+        if not kept.all():
+            warn(
+                f"{path}: {np.sum(~kept):,} of {len(xyz):,} points, the first is point {np.argmin(kept) + 1}, are not "
+                "finite. They are left out."
+            )
+            xyz, rgb = xyz[kept], rgb[kept]
+    elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
+        wrong = what_is_wrong_with(cloud)
+        if wrong is not None:
+            fail(f"the point cloud {cloud} {wrong}. Copy it again, or move it away to have points triangulated.")
+        xyz, rgb = read_points(cloud)[0]
     # nerfstudio sorts paths, not text: so the same photographs are held out
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb)
 

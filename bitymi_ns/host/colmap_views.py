@@ -4,37 +4,22 @@ frame."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from bitymi_ns.capture.masks import USUAL_FOLDERS, mask_folder, mask_of, smaller_masks
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
-from bitymi_ns.host.images import THREADS, of_header
-from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
-from bitymi_ns.host.poses import check_spread, oriented
-
-
-@dataclass(frozen=True)
-class Place:
-    """How a model's frame becomes that of training; as in nerfstudio's parsers."""
-
-    scale_factor: float = 1.0
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
-    center_method: Literal["poses", "focus", "none"] = "poses"
-    auto_scale_poses: bool = True
-    scene_scale: float = 1.0
+from bitymi_ns.host.names import Files, renamed
+from bitymi_ns.host.ply import Points
+from bitymi_ns.host.views import Photograph
+from bitymi_ns.trust import leads_inside
 
 
 @dataclass(frozen=True)
@@ -85,8 +70,10 @@ class Source:
         return self.reduced or self.photographs
 
     def files(self, model: Model) -> list[Path]:
-        """The photographs of the model's images."""
-        return [self.read / image.name for image in model.images]
+        """The photographs of the model's images, missing ones under the names that the model has for them."""
+        names = [image.name for image in model.images]
+        files = Files(self.read)
+        return [path or files.missing(name) for path, name in zip(files.find_all(names), names, strict=True)]
 
     def told(self, model: Model) -> str:
         """What it is."""
@@ -169,15 +156,34 @@ def _photographs(
     places += [path for base in bases[:1] for path in sorted(base.iterdir()) if path.is_dir()]
     places += bases
 
+    def both(place: Path) -> list[Path]:
+        return [each for each in (place, place.with_name(f"{place.name}_{reduction}")) if each.is_dir()]
+
+    usual = [name for name in names if leads_inside(name)]
+
     def present(place: Path) -> int:
-        both = (place, place.with_name(f"{place.name}_{reduction}"))
-        return max(sum((each / name).is_file() for name in names) if each.is_dir() else 0 for each in both)
+        return max((sum((each / name).is_file() for name in usual) for each in both(place)), default=0)
+
+    def alike(place: Path) -> int:
+        found = (Files(each).find_all(names) for each in both(place))
+        return max((sum(path is not None for path in files) for files in found), default=0)
 
     best = max(places, key=present)  # the first of equals
-    if look and present(best) == 0:
+    if not look or present(best) == len(names):
+        return best
+    # a folder above the capture may be the root of a disk, which is not searched
+    searched = [place for place in places if place.is_relative_to(capture) or place.name in USUAL_FOLDERS]
+    counts = {place: alike(place) for place in dict.fromkeys(searched)}
+    other = max(counts, key=counts.__getitem__)
+    if counts[other] > present(best):
+        return other
+    if present(best) == 0:
+        near = [hint for each in searched if each.is_dir() and (hint := Files(each).nearest(names[0]))]
+        hint = f" ({near[0]})" if near else ""
         fail(
-            f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}. Copy the "
-            "photographs to its folder `images`, or give their folder, seen from there: `bitymi-data --images-path`."
+            f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}{hint}. "
+            "Copy the photographs to its folder `images`, or give their folder, seen from there: `bitymi-data "
+            "--images-path`."
         )
     return best
 
@@ -201,25 +207,34 @@ def masks_of_capture(photographs: Path, capture: Path, given: Path | None, reduc
 
 
 def mask_files(source: Source, model: Model) -> list[Path] | None:
-    """The masks of the model's images; see `mask_of`."""
+    """The masks of the model's images, by the names of the photographs; see `mask_of`."""
     if source.masks is None:
         return None
-    found = {image.name: mask_of(source.masks, image.name) for image in model.images}
+    names = [_name_in(source.read, path) for path in source.files(model)]
+    found = {name: mask_of(source.masks, name) for name in names}
     missing = [name for name, file in found.items() if file is None]
     if missing:
         fail(
             f"{source.masks} has no mask of {listed(missing)}, but of others. Give every photograph a mask of its name "
             "with .png (a white picture lets all pixels count), or move the folder away."
         )
-    return [file for file in found.values() if file is not None]
+    return [file for name in names if (file := found[name]) is not None]
+
+
+def _name_in(folder: Path, path: Path) -> str:
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
 def tell_left_out(source: Source, model: Model) -> None:
-    """Name the photographs that the model lacks."""
-    used = {image.name for image in model.images}
+    """Name the photographs that the model lacks, and those that have other names than it says."""
+    files = source.files(model)
+    other = renamed([image.name for image in model.images], files, source.read)
+    if other:
+        say(f"The COLMAP model {source.folder}: {other}")
+    used = {_name_in(source.read, path) for path in files}
     nested = any("/" in name for name in used)
-    there = source.photographs.rglob("*") if nested else source.photographs.glob("*")
-    names = {path.relative_to(source.photographs).as_posix() for path in there if path.suffix.lower() in PHOTOGRAPHS}
+    there = photographs_below(source.photographs) if nested else filter(is_photograph, source.photographs.glob("*"))
+    names = {path.relative_to(source.photographs).as_posix() for path in there}
     unused = sorted((names | source.left_out.keys()) - used)
     if unused:
         named = [f"{name} ({source.left_out[name]})" if name in source.left_out else name for name in unused]
@@ -229,68 +244,32 @@ def tell_left_out(source: Source, model: Model) -> None:
         )
 
 
-def views(source: Source, place: Place, points: bool, look: bool, announce: bool = True) -> DataparserOutputs:
-    """All views of a model in the order of their names, as a parser of nerfstudio gives them; the lenses of the
-    photographs are in its metadata.
+def photographs_of(source: Source, look: bool) -> list[Photograph]:
+    """The photographs of a model in the order of their names, with cameras and poses.
 
     Args:
         source: the model and its photographs.
-        place: what is done with its frame.
-        points: have its points, too.
-        look: look into photographs, which decide the size of reduced ones.
-        announce: say what is lost.
+        look: the photographs are needed; else they may be missing.
     """
     model = read_model(source.folder)
-    if len(model.images) == 1:
-        fail(f"{source.folder} has one image only. A scene cannot be learned from one view: add photographs.")
     files = source.files(model)
-    lenses = _lenses(source, model, files, look, announce)
-    c2w = np.stack([_camera_to_world(image.qvec, image.tvec) for image in model.images])
-    if place.auto_scale_poses:
-        check_spread(c2w[:, :3, 3], str(source.folder))
-    there = torch.from_numpy(c2w.astype(np.float32))
-    poses, transform = oriented(there, place.orientation_method, place.center_method)
-    scale = place.scale_factor
-    if place.auto_scale_poses:
-        scale /= float(poses[:, :3, 3].abs().max())
-    poses[:, :3, 3] *= scale
-    transform = transform @ torch.from_numpy(TO_NERFSTUDIO.astype(np.float32))
-    cameras = pinhole_cameras([each.pinhole for each in lenses], poses)
-    metadata: dict[str, Any] = {"lenses": lenses}
-    if points and len(model.xyz):
-        metadata.update(points_of(model, transform, scale))
-    elif points and announce:
-        warn(f"The COLMAP model {source.folder} has no points. Training starts from random points.")
-    side = place.scene_scale
-    return DataparserOutputs(
-        image_filenames=files,
-        cameras=cameras,
-        scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
-        mask_filenames=mask_files(source, model) if look else None,
-        dataparser_scale=scale,
-        dataparser_transform=transform,
-        metadata=metadata,
-    )
+    masks = mask_files(source, model) if look else None
+    return [
+        Photograph(
+            file=file,
+            camera=model.cameras[image.camera_id],
+            pose=TO_NERFSTUDIO @ _camera_to_world(image.qvec, image.tvec),
+            whose=f"camera {image.camera_id} of {source.folder}",
+            mask=None if masks is None else masks[i],
+            smaller=source.reduced is not None,
+        )
+        for i, (image, file) in enumerate(zip(model.images, files, strict=True))
+    ]
 
 
-def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras:
-    """nerfstudio's cameras of these, with poses [N, 3 or 4, 4] camera to world."""
-
-    def column(name: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-        return torch.tensor([getattr(pinhole, name) for pinhole in pinholes], dtype=dtype)
-
-    return Cameras(
-        **{name: column(name) for name in ("fx", "fy", "cx", "cy")},
-        **{name: column(name, torch.int32) for name in ("width", "height")},
-        camera_to_worlds=poses[:, :3, :4],
-        camera_type=CameraType.PERSPECTIVE,
-    )
-
-
-def points_of(model: Model, transform: torch.Tensor, scale: float) -> dict[str, torch.Tensor]:
-    """nerfstudio's entries for a model's points, moved by [3, 4] and scaled."""
-    xyz = torch.from_numpy(model.xyz.astype(np.float32)) @ transform[:3, :3].T + transform[:3, 3]
-    return {"points3D_xyz": xyz * scale, "points3D_rgb": torch.from_numpy(model.rgb)}
+def points_of(model: Model, turn: np.ndarray) -> Points:
+    """A model's points in another frame, [4, 4] float64 from its own."""
+    return Points(model.xyz @ turn[:3, :3].T + turn[:3, 3], model.rgb)
 
 
 TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -298,48 +277,8 @@ TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0
 
 
 def _camera_to_world(qvec: np.ndarray, tvec: np.ndarray) -> np.ndarray:
-    """[4, 4] camera to world in nerfstudio's frames (camera: x right, y up, z backward)."""
+    """[4, 4] camera to world, of a camera with nerfstudio's axes (x right, y up, z backward)."""
     rotation = qvec2rotmat(qvec / np.linalg.norm(qvec))
     c2w = np.eye(4)
     c2w[:3, :3], c2w[:3, 3] = rotation.T, -rotation.T @ tvec
-    return TO_NERFSTUDIO @ c2w @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def _lenses(source: Source, model: Model, files: Sequence[Path], look: bool, announce: bool) -> list[Lens]:
-    """The lens of each image."""
-    sizes: list[tuple[int, int] | None] = [None] * len(files)
-    if source.reduced is not None and look:
-        with ThreadPoolExecutor(THREADS) as pool:
-            sizes = list(pool.map(_size, files))
-    made: dict[tuple[int, tuple[int, int]], Lens] = {}
-    result, told = [], []
-    for image, path, size in zip(model.images, files, sizes, strict=True):
-        camera = model.cameras[image.camera_id]
-        full = (camera.width, camera.height)
-        small = (max(1, round(full[0] / source.reduction)), max(1, round(full[1] / source.reduction)))
-        if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
-            fail(
-                f"the image {path} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x {full[1]}, of "
-                f"which 1/{source.reduction} is {small[0]} x {small[1]}. Make the folder {source.read} anew, or leave "
-                "--downscale-factor out."
-            )
-        used = size or small
-        key = (image.camera_id, used)
-        if key not in made:
-            stored = used if source.reduced is not None else full
-            params = rescaled(camera.model, camera.params, full, used)
-            whose = f"camera {image.camera_id} of {source.folder}"
-            made[key], sentences = lens(camera.model, params, *used, stored, whose)
-            told += sentences
-        result.append(made[key])
-    if announce:
-        for sentence in told[:3]:
-            say(f"{sentence[0].upper()}{sentence[1:]}")
-        if len(told) > 3:
-            say(f"So are those of {len(told) - 3} more cameras.")
-    return result
-
-
-def _size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a photograph; None where there is none to read."""
-    return of_header(path, lambda image: image.size, None)
+    return c2w @ np.diag([1.0, -1.0, -1.0, 1.0])

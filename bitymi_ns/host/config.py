@@ -17,9 +17,11 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.host import checkpoints, kept_poses, run_folder
-from bitymi_ns.host.bundle_config import find_bundle, folder_being_evaluated, stub_checkpoint_dir
+from bitymi_ns.host.bundle_cameras import BundleCamerasConfig, has_cameras
+from bitymi_ns.host.bundle_config import find_bundle, stub_checkpoint_dir
 from bitymi_ns.host.bundle_model import BakedModelConfig
 from bitymi_ns.host.capture import check_capture
+from bitymi_ns.host.commands import folder_being_evaluated, moved_capture, refuse_others
 from bitymi_ns.host.datamanager import BitymiDataManagerConfig
 from bitymi_ns.host.dataparser import BitymiDataParserConfig
 from bitymi_ns.host.device import default_device_type, has_cuda_kernels, why_not_cuda
@@ -40,6 +42,7 @@ class BitymiTrainerConfig(TrainerConfig):
     """Configuration of a training run."""
 
     _target: type = field(default_factory=lambda: BitymiTrainer)
+    read_from = None  # folder of the config.yml that was loaded for evaluation; no field: config.yml is not to state it
     processes = 1  # of the run; no field: --machine.num-devices says it, which nerfstudio is not to see
     vis: Literal[
         "none",
@@ -200,17 +203,34 @@ class BitymiTrainerConfig(TrainerConfig):
         """
         model, evaluated = self.pipeline.model, folder_being_evaluated()
         if evaluated is not None:
+            refuse_others()
             adopt_viewer(self)
+            moved_capture(self.pipeline.datamanager)
         if isinstance(model, BakedModelConfig):
             model.bundle = find_bundle(model.bundle)
+            self.read_from = evaluated
+            self._read_cameras_of(model.bundle)
             return stub_checkpoint_dir(model.bundle)
         folder = super().get_checkpoint_dir()
         if evaluated is not None:
             if (evaluated / self.relative_model_dir).is_dir():
-                folder = evaluated / self.relative_model_dir
+                folder, self.read_from = evaluated / self.relative_model_dir, evaluated
             self._choose_checkpoint(folder)
             self._take_poses_of(evaluated)
         return folder
+
+    def get_base_dir(self) -> Path:
+        """The folder of the run; of one that is evaluated, that of its config.yml, from whatever folder that is done
+        and wherever the run was moved."""
+        return super().get_base_dir() if self.read_from is None else self.read_from
+
+    def _read_cameras_of(self, bundle: Path) -> None:
+        """Where the capture of a bundle is gone, have the bundle's own cameras read instead of it."""
+        datamanager = self.pipeline.datamanager
+        data = datamanager.data or getattr(datamanager.dataparser, "data", None)
+        if data is not None and not Path(data).exists() and has_cameras(bundle):
+            datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
+            datamanager.data = bundle
 
     def _choose_checkpoint(self, folder: Path) -> None:
         """Fix the checkpoint that nerfstudio's tools will load, and stop now if it cannot be used: they would report
@@ -244,9 +264,7 @@ def optimizers(options: AdamConfig) -> dict[str, Any]:
 def trainer_config(preset: Preset) -> BitymiTrainerConfig:
     """The configuration of a training run by a preset."""
     trainer, data = preset.trainer, preset.data
-    dataparser = BitymiDataParserConfig(
-        eval_mode=data.eval_mode, eval_interval=data.eval_interval, load_3D_points=data.load_3D_points
-    )
+    dataparser = BitymiDataParserConfig(eval_mode=data.eval_mode, eval_interval=data.eval_interval, points=data.points)
     return BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from bitymi_ns.host import duplicates
+from bitymi_ns.host.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.host.cameras import check_cameras, check_views, to_camera
 from bitymi_ns.host.capture import check_capture, check_images, declares_box, reporting_input_errors
 from bitymi_ns.host.colmap import checked_models
@@ -31,7 +32,9 @@ from bitymi_ns.host.ply import colours
 from bitymi_ns.host.point_cloud import reporting_time
 from bitymi_ns.host.poses import check_cloud, check_places, orienting_all, warn_of_mirrored
 from bitymi_ns.host.reduction import LONGEST_SIDE, reduce_views
+from bitymi_ns.host.starting_points import for_a_new_scene
 from bitymi_ns.host.transforms import corrected_files
+from bitymi_ns.host.views import ALONE
 from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import View, spread, training_order
@@ -114,6 +117,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
             orienting_all(),
             checked_models(config.dataparser),
             reporting_time("Reading", cloud.points),
+            for_a_new_scene(test_mode == "val"),
         ):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
@@ -125,7 +129,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         files = outputs.image_filenames
         self.train_dataset.metadata["has_alpha"] = bool(files) and file_has_transparency(files[0])
         # what decides how a run trains; without one there may be no photographs to read
-        self.train_dataset.metadata["transparent"] = test_mode != "inference" and any(
+        self.train_dataset.metadata["transparent"] = self._looks(test_mode) and any(
             file_has_transparency(files[i]) and self.train_dataset.get_numpy_image(i).shape[-1] == 4
             for i in spread(len(files), LOOKED_AT)
         )
@@ -133,6 +137,15 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         cameras = outputs.cameras
         self.train_dataset.metadata["train_pixels"] = int((cameras.width.long() * cameras.height.long()).sum())
         self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
+
+    def _looks(self, test_mode: str) -> bool:
+        """Whether there are photographs to look into."""
+        return test_mode != "inference" and ALONE not in self.train_dataparser_outputs.metadata
+
+    def get_datapath(self) -> Path:
+        """Where the viewer keeps camera paths: with the capture, or beside the bundle where that is gone."""
+        place = Path(super().get_datapath())
+        return place.parent if isinstance(self.config.dataparser, BundleCamerasConfig) else place
 
     @property
     def dataset_type(self) -> type[BitymiDataset]:  # type: ignore[override]
@@ -150,7 +163,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def _check_images(self, test_mode: str) -> None:
         """Stop, or warn, before any time is spent on a capture that cannot give a scene."""
         count = len(self.train_dataset)
-        if test_mode == "inference":
+        if not self._looks(test_mode):
             return
         train, held_out = self.train_dataset.image_filenames, self.eval_dataset.image_filenames
         for dataset in (self.train_dataset, self.eval_dataset):
@@ -182,6 +195,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         points = outputs.metadata.get("points3D_xyz")
         if points is None:
             return
+        if len(points) and not len(outputs.metadata["points3D_rgb"]):  # our own reader gives all of them some
+            warn("The points of the capture have no colours: they start grey. `bitymi-data` takes them of photographs.")
         rgb = None if file is None else colours(file)
         if isinstance(rgb, str):
             warn(f"The points of {file} start without colours: {rgb}. Write them as bytes (property uchar red).")
@@ -197,7 +212,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     def create_train_dataset(self) -> BitymiDataset:
         outputs = reduce_views(self.train_dataparser_outputs, self.config.longest_side, self.test_mode == "val")
-        if self.test_mode != "inference":
+        if self._looks(self.test_mode):
             outputs = without_blank_views(outputs, "training")
         self.train_dataparser_outputs = outputs
         return super().create_train_dataset()
@@ -205,7 +220,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def create_eval_dataset(self) -> BitymiDataset:
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
         outputs = reduce_views(outputs, self.config.longest_side, announce=False)
-        if self.test_mode != "inference":
+        if self._looks(self.test_mode):
             outputs = without_blank_views(outputs, "held-out")
         return BitymiDataset(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
 

@@ -1,85 +1,80 @@
 """One parser for whatever a folder or file holds: `bitymi-data`, the methods' default.
 
-It recognises the format, has nerfstudio's parser of it read it where there is one that does, and holds views out by one
-rule for all.
+It recognises the format, reads it as photographs with cameras and poses, and holds views out by one rule for all.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import os
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
+import numpy as np
 import tyro
-from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils.colors import get_color
 
 from bitymi_ns.capture.frame import read_frame
-from bitymi_ns.capture.recognise import Found, NotRecognised, recognise
+from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import finding, holdout, kept_poses
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import (
-    Place,
+    TO_NERFSTUDIO,
     Source,
     find_source,
-    pinhole_cameras,
+    photographs_of,
     points_of,
     tell_left_out,
-    views,
 )
 from bitymi_ns.host.dataset import views_of
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.kept_poses import KeptPoses
-from bitymi_ns.host.lens import lens
-from bitymi_ns.host.transforms import (
-    Lists,
-    colmap_points,
-    complete_instant_ngp,
-    corrected_files,
-    take_lists,
-    without_endings,
-)
+from bitymi_ns.host.ply import Points, read_points
+from bitymi_ns.host.point_colours import coloured
+from bitymi_ns.host.scanner_views import scanned
+from bitymi_ns.host.starting_points import Choice, are_wanted, starting_points
+from bitymi_ns.host.transforms import Lists, colmap_points
+from bitymi_ns.host.transforms_views import Transforms, missing_photographs, read_transforms
+from bitymi_ns.host.views import Photograph, Place, Views, views_of_capture
+from bitymi_ns.ply import PlyError
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model, which is found for those that come without."""
+SCANNED = ("polycam", "record3d", "pose-files")
+"""Formats of scanning programs, with their poses."""
 USED_BY: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
     "masks_path": ("colmap", "photographs"),
-    "downscale_factor": ("nerfstudio", *WITH_MODEL),
     "ply_path": ("blender",),
     "alpha_color": ("blender",),
-    "scene_scale": ("nerfstudio", *WITH_MODEL),
-    "orientation_method": ("nerfstudio", *WITH_MODEL),
-    "center_method": ("nerfstudio", *WITH_MODEL),
-    "auto_scale_poses": ("nerfstudio", *WITH_MODEL),
-    "scale_factor": ("nerfstudio", *WITH_MODEL, "blender"),
-    "load_3D_points": ("nerfstudio", *WITH_MODEL),
-    "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL),
+    "scene_scale": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "orientation_method": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "center_method": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "auto_scale_poses": ("nerfstudio", *WITH_MODEL, *SCANNED),
+    "scale_factor": ("nerfstudio", *WITH_MODEL, *SCANNED, "blender"),
+    "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL, *SCANNED),
     "sfm": ("photographs", "video"),
 }
 """Formats that an option is for, where that is not all of them."""
+NGP_SCALE = 0.3333
+"""Factor on positions of instant-ngp's captures, as in nerfstudio's reader."""
+BLENDER_SIDE = 1.5
+"""Half the side of the box of a Blender data set, as in nerfstudio's reader."""
 
 
 @dataclass
 class BitymiDataParserConfig(DataParserConfig):
-    """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set, a
-    folder of photographs, or a video."""
+    """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set,
+    what Polycam, Record3D or an RGB-D camera wrote, a folder of photographs, or a video."""
 
     _target: type = field(default_factory=lambda: BitymiDataParser)
     data: Path = Path()
     """Folder, or file: transforms.json or video."""
-    format: Literal["auto", "nerfstudio", "instant-ngp", "blender", "colmap", "photographs", "video"] = "auto"
+    format: Format | Literal["auto"] = "auto"
     """What to read where there is more than one thing; auto = what has poses before what has none."""
     downscale_factor: int | None = None
     """Use photographs that are so many times smaller: those of images_2, images_4, ... where there is such a folder."""
@@ -91,11 +86,12 @@ class BitymiDataParserConfig(DataParserConfig):
     colmap_path: Path | None = None
     """Folder of the COLMAP model, seen from --data; not given: it is found."""
     ply_path: Path | None = None
-    """Points of a Blender data set, a PLY file seen from --data; not given: random ones."""
+    """Points of a Blender data set, a PLY file seen from --data; not given: see --points."""
     alpha_color: Literal["white", "black"] | None = "white"
     """Colour behind the transparent pictures of a Blender data set; None = that of the method."""
-    load_3D_points: bool = True
-    """Start from the points of the capture; else from random ones."""
+    points: Choice = "auto"
+    """Points to start from: those of the capture, triangulated ones where it has none (auto); triangulated ones in any
+    case; or random ones."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
     """Which photographs are held out: evenly spaced ones, those with eval in their names, every n-th, or none (all are
     used for both)."""
@@ -149,26 +145,20 @@ class BitymiDataParserConfig(DataParserConfig):
                 )
         return found
 
-    def stock(self, found: Found) -> DataParserConfig | None:
-        """The configuration of nerfstudio's parser that reads this, all views as one split; None = it has none."""
-        if found.format == "nerfstudio":
-            names = ("downscale_factor", "scale_factor", "scene_scale", "orientation_method", "center_method")
-            kept = {name: getattr(self, name) for name in (*names, "auto_scale_poses")}
-            # it would ask whether to convert COLMAP's points, which are read as they are
-            points = self.load_3D_points and colmap_points(found.path) is None
-            return NerfstudioDataParserConfig(
-                data=Path(self.data), eval_mode="interval", eval_interval=1, load_3D_points=points, **kept
-            )
-        if found.format == "instant-ngp":
-            return InstantNGPDataParserConfig(data=Path(self.data), eval_mode="interval", eval_interval=1)
-        if found.format == "blender":
-            options = {"scale_factor": self.scale_factor, "alpha_color": self.alpha_color, "ply_path": self.ply_path}
-            return BlenderDataParserConfig(data=found.path, **options)
-        return None
+    def transforms(self, found: Found, name: str, look: bool, announce: bool = True) -> Transforms:
+        """A JSON file of a capture; see `read_transforms`.
+
+        Args:
+            found: nerfstudio, instant-ngp or blender.
+            name: of the file.
+            look, announce: see there.
+        """
+        path = found.folder / name if found.format == "blender" else found.path
+        return read_transforms(path, found.format == "nerfstudio", self.downscale_factor or 1, look, announce)
 
     def place(self) -> Place:
         """What is done with the frame of a COLMAP model."""
-        return Place(**{each.name: getattr(self, each.name) for each in dataclasses.fields(Place)})
+        return Place(**{each.name: getattr(self, each.name) for each in fields(Place)})
 
     def source(self, found: Found, look: bool = True) -> Source:
         """The COLMAP model and its photographs, found for photographs without poses; see `find_source`."""
@@ -207,7 +197,11 @@ class BitymiDataParser(DataParser):
         if found.format == "blender":
             return self._blender(found)
         self.poses_report = None if read_frame(found.folder) is None else found.folder
-        outputs, lists = self._colmap(found) if found.format in WITH_MODEL else self._transforms(found)
+        readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
+        outputs, lists = readers.get(found.format, self._transforms)(found)
+        return self._split(outputs, lists, found)
+
+    def _split(self, outputs: Views, lists: Lists, found: Found) -> dict[str, DataparserOutputs]:
         split = self._holdout(outputs.image_filenames, lists, found)
         say(split.told(outputs.image_filenames))
         held_out = views_of(outputs, split.held_out)
@@ -216,63 +210,112 @@ class BitymiDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         return self.splits[split]
 
-    def _transforms(self, found: Found) -> tuple[DataparserOutputs, Lists]:
+    @property
+    def _look(self) -> bool:
+        """Whether photographs are needed."""
+        return self.downscale_factor is None
+
+    def _transforms(self, found: Found) -> tuple[Views, Lists]:
         """All views of a transforms.json, and its lists of photographs for training and evaluation."""
-        lists: Lists = {}
-        files: set[Path] = set()
-
-        def adapt(path: Path, meta: Any) -> None:
-            if found.format == "instant-ngp":
-                complete_instant_ngp(path, meta)
-            lists.update(take_lists(meta))
-            files.update(Path(os.path.normpath(frame["file_path"])) for frame in meta["frames"])
-
-        outputs = self._read(found, "val", adapt)
-        _check_not_merged(files, outputs.image_filenames)
-        what = f"{found.path} ({found.format}, {len(outputs.image_filenames)} photographs)"
-        model = colmap_points(found.path) if found.format == "nerfstudio" and self.config.load_3D_points else None
-        if model is not None:
-            placed = points_of(read_model(model), outputs.dataparser_transform, outputs.dataparser_scale)
-            outputs = dataclasses.replace(outputs, metadata={**outputs.metadata, **placed})
-            what += f", points of {model}"
+        config, look = self.config, self._look
+        read = config.transforms(found, "", look)
+        if look:
+            missing_photographs(read.path, read.photographs)
+        meta, place = read.meta, config.place()
+        if found.format == "instant-ngp":  # whose scale is that of its bounding box
+            half = 0.5 * float(meta.get("aabb_scale", 1))
+            place = Place(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
+        elif "orientation_override" in meta:
+            place = replace(place, orientation_method=meta["orientation_override"])
+            say(f"{read.path} asks for the orientation method {place.orientation_method}.")
+        model = colmap_points(found.path)
+        before = _applied(meta, found.folder)
+        what = f"{found.path} ({found.format}, {len(read.photographs)} photographs)"
+        own = None
+        if config.points == "auto":
+            if meta.get("ply_file_path"):
+                own = _points_of_file(found.folder / meta["ply_file_path"], read.photographs)
+            elif model is not None:
+                own = points_of(read_model(model), np.eye(4) if before is None else before)
+                what += f", points of {model}"
         self._tell(found, what)
-        return outputs, lists
+        points = starting_points(own, config.points, read.photographs, found.folder, str(found.path))
+        outputs = views_of_capture(
+            read.photographs,
+            place,
+            points,
+            str(found.path),
+            config.downscale_factor or 1,
+            look,
+            before=before,
+            before_scale=float(meta.get("applied_scale", 1.0)),
+        )
+        return outputs, read.lists
 
-    def _read(self, found: Found, split: str, adapt: Callable[[Path, Any], None]) -> DataparserOutputs:
-        """What nerfstudio's parser of this format gives."""
-        stock = self.config.stock(found)
-        assert stock is not None
-        parser = stock.setup()
-        if self.downscale_factor is not None:
-            parser.downscale_factor = self.downscale_factor
-        with corrected_files(stock, adapt):
-            return _without_fisheyes(parser.get_dataparser_outputs(split), str(found.path))
-
-    def _colmap(self, found: Found) -> tuple[DataparserOutputs, Lists]:
+    def _colmap(self, found: Found) -> tuple[Views, Lists]:
         """All views of a COLMAP model, and the lists of photographs beside it."""
-        look = self.downscale_factor is None
-        source = self.config.source(found, look)
+        config, look = self.config, self._look
+        source = config.source(found, look)
         self.poses_report = source.report or self.poses_report
         self.found = None if source.origin is None else source
         model = read_model(source.folder)
         self._tell(found, source.told(model))
         if look:
             tell_left_out(source, model)
-        return views(source, self.config.place(), self.config.load_3D_points, look), _lists_in(found.folder)
+        photographs = photographs_of(source, look)
+        own = points_of(model, TO_NERFSTUDIO)
+        points = starting_points(own, config.points, photographs, found.folder, str(source.folder))
+        outputs = views_of_capture(
+            photographs, config.place(), points, str(source.folder), source.reduction, look, before=TO_NERFSTUDIO
+        )
+        return outputs, _lists_in(found.folder)
+
+    def _scanned(self, found: Found) -> tuple[Views, Lists]:
+        """All views of what a scanning program wrote."""
+        config, look = self.config, self._look
+        photographs = scanned(found, look)
+        self._tell(found, f"{found.path} ({found.format}, {len(photographs)} photographs with their poses)")
+        others = passed_over(found.path)
+        if others and look:
+            say(f"Not taken for photographs: {listed(others)}.")
+        points = starting_points(None, config.points, photographs, found.folder, str(found.path))
+        reduction = config.downscale_factor or 1
+        return views_of_capture(photographs, config.place(), points, str(found.path), reduction, look), {}
 
     def _blender(self, found: Found) -> dict[str, DataparserOutputs]:
-        """The capture's own split; where one of its two files of held-out views is missing, the other stands for it."""
-        there = [name for name in ("val", "test") if (found.path / f"transforms_{name}.json").is_file()]
+        """The capture's own split. Where one of its two files of held-out views is missing, or all its photographs are,
+        the other stands for it; where both are, views are held out of those for training."""
+        config, look = self.config, self._look
+        train = config.transforms(found, "transforms_train.json", look)
+        if look:
+            missing_photographs(train.path, train.photographs)
+        parts: dict[str, list[Photograph]] = {"train": train.photographs}
+        for name in ("val", "test"):
+            if (found.path / f"transforms_{name}.json").is_file():
+                part = config.transforms(found, f"transforms_{name}.json", look)
+                parts[name] = _present(part) if look else part.photographs
+        there = [name for name in ("val", "test") if parts.get(name)]
+        self._tell(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
+        own = None if config.ply_path is None else _points_of_file(found.path / config.ply_path, train.photographs)
+        points = starting_points(own, config.points, train.photographs, found.folder, str(train.path))
+        outputs = views_of_capture(
+            [each for part in parts.values() for each in part],
+            Place(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE),
+            points,
+            str(train.path),
+            config.downscale_factor or 1,
+            look,
+            alpha_color=None if config.alpha_color is None else get_color(config.alpha_color),
+        )
+        numbers, at = {}, 0
+        for name, part in parts.items():
+            numbers[name] = list(range(at, at + len(part)))
+            at += len(part)
         if not there:
-            fail(
-                f"{found.path} has a transforms_train.json, but neither a transforms_val.json nor a "
-                "transforms_test.json of held-out views. Write one with a few of the frames."
-            )
-        splits = {name: self._read(found, name, without_endings) for name in ("train", *there)}
-        counts = {name: len(outputs.image_filenames) for name, outputs in splits.items()}
-        self._tell(found, f"{found.path / 'transforms_train.json'} (blender, {counts['train']} photographs)")
-        held_out = " and ".join(f"{counts[name]} of transforms_{name}.json" for name in there)
+            return self._split(views_of(outputs, numbers["train"]), {}, found)
+        held_out = " and ".join(f"{len(parts[name])} of transforms_{name}.json" for name in there)
         say(f"Held out for evaluation: {held_out}.")
+        splits = {name: views_of(outputs, numbers[name]) for name in ("train", *there)}
         return {"val": splits[there[0]], "test": splits[there[-1]], **splits}
 
     def _tell(self, found: Found, what: str) -> None:
@@ -299,22 +342,34 @@ class BitymiDataParser(DataParser):
         return holdout.Split(numbers("train") if "train" in lists else rest, held_out, f"by {where}")
 
 
-def _check_not_merged(files: set[Path], read: Sequence[Path]) -> None:
-    """Stop where photographs of one name are taken for each other: nerfstudio looks for the reduced ones of all folders
-    in one.
+def _applied(meta: dict[str, Any], folder: Path) -> np.ndarray | None:
+    """[4, 4] that was applied to a capture of nerfstudio's before its file was written; None = nothing is known."""
+    rows = meta.get("applied_transform")
+    if rows is None and (folder / "colmap/sparse/0").is_dir():
+        rows = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # what its tool applied before it stated that
+    return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
 
-    Args:
-        files: that the capture names.
-        read: in their place.
-    """
-    if len(set(read)) >= len(files):
-        return
-    counts = Counter(path.name for path in files)
-    twins = sorted(path.as_posix() for path in files if counts[path.name] > 1)
-    fail(
-        f"{listed(twins)} have the same names in different folders, but {read[0].parent} can have one of each alone. "
-        "Use the photographs as they are (`bitymi-data --downscale-factor 1`), or give them different names."
-    )
+
+def _points_of_file(path: Path, photographs: Sequence[Photograph]) -> Points:
+    """The points of a PLY file; those without colours get them of the photographs, where a scene starts from them."""
+    try:
+        points, without_colours = read_points(path)
+    except PlyError as error:
+        fail(f"the point cloud {path} cannot be read: {error}. Write its points without lists.", error)
+    if not without_colours or not len(points.xyz) or not are_wanted():
+        return points
+    say(f"The points of {path} get the colours of the photographs that see them: {without_colours}.")
+    return coloured(points, photographs)
+
+
+def _present(part: Transforms) -> list[Photograph]:
+    """The photographs of a file of held-out views that are there; the others are named."""
+    there = [each for each in part.photographs if each.file.is_file()]
+    lacking = [each.file for each in part.photographs if not each.file.is_file()]
+    if lacking:
+        what = "all" if not there else str(len(lacking))
+        warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, left out: {listed(lacking)}.")
+    return there
 
 
 def _lists_in(folder: Path) -> Lists:
@@ -325,29 +380,3 @@ def _lists_in(folder: Path) -> Lists:
         if path.is_file():
             lists[split] = [line.strip() for line in path.read_text("utf8").splitlines() if line.strip()]
     return lists
-
-
-def _without_fisheyes(outputs: DataparserOutputs, where: str) -> DataparserOutputs:
-    """The views with those of fisheye cameras as pinhole pictures.
-
-    nerfstudio would choose their size by what the whole picture needs, which is endless for one of 180 degrees.
-    """
-    cameras = outputs.cameras
-    if not bool((cameras.camera_type == CameraType.FISHEYE.value).all()):
-        return outputs
-    columns = (cameras.fx, cameras.fy, cameras.cx, cameras.cy)
-    rows = torch.cat([torch.cat([c.double() for c in columns], -1), cameras.distortion_params[:, :4].double()], -1)
-    made, told, lenses = {}, [], []
-    for row, size in zip(rows.tolist(), torch.cat([cameras.width, cameras.height], -1).tolist(), strict=True):
-        key = (*row, *size)
-        if key not in made:
-            made[key], sentences = lens("OPENCV_FISHEYE", tuple(row), *size, tuple(size), f"the camera of {where}")
-            told += sentences
-        lenses.append(made[key])
-    for sentence in told[:1]:
-        say(f"{sentence[0].upper()}{sentence[1:]}")
-    return dataclasses.replace(
-        outputs,
-        cameras=pinhole_cameras([each.pinhole for each in lenses], cameras.camera_to_worlds),
-        metadata={**outputs.metadata, "lenses": lenses},
-    )

@@ -14,17 +14,24 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
+from bitymi_ns.host.commands import MOVED
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import Note, masks_without_pixels, note, read_image, read_mask, wrong_size
 from bitymi_ns.host.lens import Lens
 from bitymi_ns.host.poses import rotations
 from bitymi_ns.host.reduction import Reduction
+from bitymi_ns.host.views import ALONE
 from bitymi_ns.train.views import over_background
 
 
 class BitymiDataset(InputDataset):
     """nerfstudio's dataset, except that images with transparent pixels stay [H, W, 4]: the model composes them over a
-    background."""
+    background.
+
+    Attributes:
+        shows_blanks: photographs that are gone are grey, for the viewer, which shows them in small; else they are
+            missed.
+    """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -37,8 +44,11 @@ class BitymiDataset(InputDataset):
         c2w[:, :3, :3] = torch.from_numpy(parts)
         super().__init__(dataparser_outputs, scale_factor)
         self._notes: dict[int, Note] = {}
+        self.shows_blanks = False
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
+        if ALONE in self._dataparser_outputs.metadata:
+            return self._blank(image_idx)
         path = self._dataparser_outputs.image_filenames[image_idx]
         lens, reduction = self._lens(image_idx), self._reduction(image_idx)
         if lens is not None:
@@ -57,6 +67,13 @@ class BitymiDataset(InputDataset):
             pixels = np.ascontiguousarray(pixels[..., :3])  # nothing is transparent
         self._notes[image_idx] = note(pixels)
         return pixels
+
+    def _blank(self, image_idx: int) -> npt.NDArray[np.uint8]:
+        if not self.shows_blanks:
+            path = self._dataparser_outputs.image_filenames[image_idx]
+            fail(f"the photograph {path} is needed, and the capture is gone. {MOVED}")
+        camera = self.cameras[image_idx].reshape(())
+        return np.full((int(camera.height), int(camera.width), 3), 128, np.uint8)
 
     def note(self, image_idx: int) -> Note:
         """What there is to know of a photograph; it is read for that if it has not been yet."""

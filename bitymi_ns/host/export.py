@@ -351,6 +351,7 @@ def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> b
     config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=background)  # type: ignore[arg-type]
     config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None
     config.optimizers = {}
+    vars(config).pop("read_from", None)
     return yaml.dump(config).encode("utf8")
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from bitymi_ns.capture.cache import read_from
 from bitymi_ns.capture.photos import photo_folder
-from bitymi_ns.capture.recognise import Found
+from bitymi_ns.capture.recognise import Found, passed_over
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.host import kept_poses
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import Origin, Source, masks_of_capture, source_in
-from bitymi_ns.host.errors import fail, say, warn
+from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.kept_poses import KeptPoses
 
 
@@ -33,6 +33,9 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
     from bitymi_ns.progress import rich_progress
 
     masks = _masks(found, masks_path)
+    others = passed_over(found.path) if found.format == "photographs" else []
+    if others:
+        say(f"Not taken for photographs in {found.path}: {listed(others)}.")
     try:
         with rich_progress() as progress:
             poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress, warn)

@@ -17,7 +17,7 @@ from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.colmap_views import Origin, Source
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.images import THREADS, of_header
-from bitymi_ns.trust import json_of
+from bitymi_ns.trust import Refused, json_of, leads_inside
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
@@ -118,11 +118,13 @@ def write(folder: Path, source: Source, origin: Origin) -> None:
     These take no space where they can be linked; links to the photographs themselves stay links.
 
     Raises:
-        OSError: something cannot be written.
+        OSError: something cannot be written, or a name in the model leads out of its folder.
     """
     shutil.copytree(source.folder, folder / MODEL)
     if origin.photographs is None:
         for image in read_model(source.folder).images:
+            if not leads_inside(image.name):
+                raise Refused(f"{source.folder} names {image.name!r}, which leads out of its folder", folder)
             _link(source.photographs / image.name, folder / IMAGES / image.name)
     values = {"origin": asdict(origin), "left_out": dict(source.left_out)}
     (folder / ORIGIN).write_text(json.dumps(values, indent=2, ensure_ascii=False) + "\n", "utf8")

@@ -15,7 +15,8 @@ import pycolmap
 from PIL import Image
 
 from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.host.cameras import LITTLE_LEFT, NOTHING_LEFT, PANORAMAS
+from bitymi_ns.capture.panorama import PANORAMAS
+from bitymi_ns.host.cameras import LITTLE_LEFT, NOTHING_LEFT
 from bitymi_ns.host.errors import fail, warn
 from bitymi_ns.host.images import wrong_size
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,39 @@ from bitymi_ns.ply import Header, PlyError, read_header, read_rows, text_lines
 POINTS = "vertex"
 """The element of a point cloud."""
 _COLOURS = ("red", "green", "blue")
+_NAMES = (_COLOURS, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""What programs call the colours of points."""
+
+
+class Points(NamedTuple):
+    """Points to start from: positions [N, 3] float64, and colours [N, 3] uint8, or [0, 3] where they have none."""
+
+    xyz: npt.NDArray[np.float64]
+    rgb: npt.NDArray[np.uint8]
+
+
+def read_points(path: Path) -> tuple[Points, str]:
+    """The points of a file that `point_cloud.what_is_wrong_with` finds nothing wrong with.
+
+    Returns:
+        the points, and why they have no colours, in words that follow the name of the file; empty where they have.
+
+    Raises:
+        PlyError: its points have lists, or stand behind some.
+    """
+    header = read_header(path)
+    rows = read_rows(path, header, POINTS)
+    xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
+    names = next((names for names in _NAMES if set(names) <= set(header.elements[POINTS].names)), None)
+    if names is None:
+        return Points(xyz, np.zeros((0, 3), np.uint8)), "its points have none"
+    values = np.stack([rows[name] for name in names], -1)
+    if values.dtype == np.uint8:
+        return Points(xyz, values), ""
+    rgb = _as_bytes(values.astype(np.float64), values.dtype.kind == "f")
+    if isinstance(rgb, str):
+        return Points(xyz, np.zeros((0, 3), np.uint8)), rgb
+    return Points(xyz, rgb), ""
 
 
 def bad_line(path: Path, header: Header) -> str | None:
@@ -57,10 +91,16 @@ def colours(path: Path) -> npt.NDArray[np.uint8] | str | None:
         rows = read_rows(path, header, POINTS)
     except PlyError:
         return None
-    values = np.stack([rows[name] for name in _COLOURS], -1).astype(np.float64)
+    values = np.stack([rows[name] for name in _COLOURS], -1)
+    return _as_bytes(values.astype(np.float64), any(points.row[name].kind == "f" for name in _COLOURS))
+
+
+def _as_bytes(values: npt.NDArray[np.float64], floating: bool) -> npt.NDArray[np.uint8] | str:
+    """Colours as bytes, by which white they fit; or why they cannot be told."""
+    if not len(values):
+        return np.zeros((0, 3), np.uint8)
     values[~np.isfinite(values)] = 0.0
     low, high = values.min(), values.max()
-    floating = any(points.row[name].kind == "f" for name in _COLOURS)
     white = next((white for white in ((1.0, 255.0) if floating else (255.0, 65535.0)) if high <= white), None)
     if white is None or low < 0.0:
         return f"its colours lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"

@@ -23,6 +23,8 @@ FAR = 100.0
 TOO_FAR = 1000.0
 """So many times as far out, the others shrink to one place beside it."""
 
+FAR_OFF = 100.0
+"""Where cameras are so many times as far from the origin as from their middle, float32 blurs what lies between them."""
 OTHER_UNIT = 150.0
 """Points so many times as far away as the cameras lie apart, or so small a part of a picture: another unit."""
 
@@ -130,6 +132,22 @@ def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> N
         else:
             fail(f"{message} Beside it they are all at one place. Correct the pose or remove the frame.")
         return
+
+
+def is_far_off(centers: npt.NDArray[np.float64]) -> bool:
+    """Whether cameras [N, 3] are so far from the origin that float32 cannot tell their positions."""
+    middle = centers.mean(0)
+    spread = np.linalg.norm(centers - middle, axis=1).max()
+    return bool(0.0 < FAR_OFF * spread < np.linalg.norm(middle))
+
+
+def warn_of_far_off(path: object, centers: npt.NDArray[np.float64]) -> None:
+    """Say that nerfstudio's own readers cannot tell the positions of such cameras [N, 3]."""
+    if is_far_off(centers):
+        warn(
+            f"{path}: the cameras lie so far from the origin that nerfstudio's reader, which has seven digits, blurs "
+            "their positions. Read it with `bitymi-data`, the default, which centres the capture first."
+        )
 
 
 def check_cloud(

@@ -52,8 +52,8 @@ class DataOptions:
     """Rule by which photographs are held out, of nerfstudio's parsers."""
     eval_interval: int = 8
     """Of so many photographs one is held out, as is usual for 3D Gaussian splatting."""
-    load_3D_points: bool = True
-    """Start from the capture's points."""
+    points: Literal["auto", "triangulate", "random"] = "auto"
+    """Points to start from: the capture's or, where it has none, triangulated ones; triangulated ones; random ones."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """How photographs are kept in memory."""
 

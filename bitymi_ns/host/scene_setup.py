@@ -66,7 +66,7 @@ def new_scene(
     for sentence in bounds.start(report, train, pixels, config):
         say(sentence)
     if report.random:
-        say(f"The capture has no points: training starts from {report.random:,} random ones.")
+        say(f"Surfels are made of {report.random:,} random points.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
         warn(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,7 @@ from torch.nn import Parameter
 
 from bitymi_ns.host.cameras import normal_image, ray_distance, to_camera
 from bitymi_ns.host.device import kernel_device
+from bitymi_ns.host.errors import InputError, warn
 from bitymi_ns.host.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import as_float, over_background, reduce_image, reduce_mask
@@ -91,10 +93,34 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; the viewer's crop box is not supported and ignored."""
-        self._last_camera = to_camera(camera, self.device)
-        outputs = self.get_outputs(camera)
+        """Render a camera; a crop box is not supported, which is said.
+
+        In a thread, which is one of the viewer's, a camera that cannot be rendered gives an empty picture: a refusal
+        would end the thread, and the viewer would show nothing any more.
+        """
+        if obb_box is not None:
+            self._say_once("Crop boxes are not supported: the whole scene is rendered.")
+        try:
+            self._last_camera = to_camera(camera, self.device)
+            outputs = self.get_outputs(camera)
+        except InputError as error:
+            if threading.current_thread() is threading.main_thread():
+                raise
+            self._say_once(str(error))
+            return self._empty(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]))
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
+
+    def _say_once(self, message: str) -> None:
+        said: set[str] = self.__dict__.setdefault("_said", set())
+        if message not in said:
+            said.add(message)
+            warn(message)
+
+    def _empty(self, height: int, width: int) -> dict[str, Tensor]:
+        """The outputs of `get_outputs` where nothing is seen."""
+        black = torch.zeros(height, width, 3, device=self.device)
+        one = dict.fromkeys(("accumulation", "depth", "beta", "overdraw"), black[..., :1])
+        return {"rgb": black + self.background.to(black), "normal": black, **one}
 
     def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
         """[H, W, 3] the batch's photograph over the background, and [H, W, 1] its mask, at the size of a render."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import copy
 import functools
-import glob
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,9 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from bitymi_ns.capture.recognise import PHOTOGRAPHS, is_model
-from bitymi_ns.host.cameras import PANORAMAS
+from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.host.errors import fail, listed, warn
-from bitymi_ns.host.poses import rotations
+from bitymi_ns.host.poses import rotations, warn_of_far_off
 from bitymi_ns.trust import json_of, leads_inside
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
@@ -31,6 +29,8 @@ LONGEST_SIDE = 1 << 20
 """Largest width or height of a picture that is believed, in pixels."""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
+ANGLES = {"fl_x": ("camera_angle_x", "x_fov"), "fl_y": ("camera_angle_y", "y_fov", "camera_angle_x", "x_fov")}
+"""What may stand for a focal length: the angle that a picture spans."""
 
 
 Lists = dict[str, list[str]]
@@ -38,11 +38,8 @@ Lists = dict[str, list[str]]
 
 
 @contextmanager
-def corrected_files(
-    config: DataParserConfig, adapt: Callable[[Path, Any], None] = lambda path, meta: None
-) -> Iterator[None]:
-    """While it lasts, nerfstudio's reader of this kind of capture gets its JSON files as `load` gives them, changed by
-    `adapt`.
+def corrected_files(config: DataParserConfig) -> Iterator[None]:
+    """While it lasts, nerfstudio's reader of this kind of capture gets its JSON files as `load` gives them.
 
     The poses have to be right before nerfstudio orients, centres and scales the capture by them.
     """
@@ -55,9 +52,7 @@ def corrected_files(
 
     @functools.cache  # each split reads the file; what is wrong is said once
     def once(path: Path) -> Any:
-        meta = load(path, own_format)
-        adapt(path, meta)
-        return meta
+        return load(path, own_format)
 
     module.load_from_json = lambda path: copy.deepcopy(once(Path(path)))  # type: ignore[attr-defined]
     try:
@@ -66,13 +61,14 @@ def corrected_files(
         module.load_from_json = original  # type: ignore[attr-defined]
 
 
-def load(path: Path, own_format: bool, announce: bool = True) -> Any:
+def load(path: Path, own_format: bool, announce: bool = True, stock: bool = True) -> Any:
     """What a JSON file of a capture says, with poses that are rotations.
 
     Args:
         path: the file, in any Unicode encoding, with or without byte order mark.
         own_format: it is a transforms.json in nerfstudio's own format, of which more is known.
         announce: say what was corrected.
+        stock: it is for nerfstudio's reader, which knows less of what a file may say than that of this package.
 
     Raises:
         InputError: the file cannot be used; the message names the frame.
@@ -84,27 +80,34 @@ def load(path: Path, own_format: bool, announce: bool = True) -> Any:
     except (ValueError, OSError) as error:
         fail(f"{path} cannot be read: {error}. {HOW_TO_GET_ONE}", error)
     if own_format:
-        _check_frames(path, meta)
-        _check_camera(path, meta)
+        _check_frames(path, meta, least=2)
+        _check_camera(path, meta, stock)
         _distribute(path, meta, announce)
-        _check_transform(path, meta)
-        _check_lists(path, meta)
     elif isinstance(meta, dict):
         _check_other_format(path, meta)
+        if not stock:
+            _check_frames(path, meta, least=1)
+    if own_format or (not stock and isinstance(meta, dict)):
+        _check_transform(path, meta)
+        _check_lists(path, meta)
     frames = meta.get("frames") if isinstance(meta, dict) else None
-    if announce and isinstance(frames, list):
-        _tell_outside(path, frames)
+    if stock and announce and isinstance(frames, list):
+        keys = ("file_path", "mask_path", "depth_file_path")
+        names = [frame.get(key) for frame in frames if isinstance(frame, dict) for key in keys]
+        tell_outside(path, [name for name in names if isinstance(name, str) and not leads_inside(name)])
     if isinstance(frames, list) and all(isinstance(f, dict) and "transform_matrix" in f for f in frames):
         _correct_poses(path, frames, announce)
         _check_repeated(path, frames)
+        if stock and announce and frames:
+            warn_of_far_off(path, np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3])
     return meta
 
 
-def _check_frames(path: Path, meta: Any) -> None:
+def _check_frames(path: Path, meta: Any, least: int) -> None:
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames:
         fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE}")
-    if len(frames) == 1:
+    if len(frames) < least:
         fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
@@ -120,11 +123,8 @@ def _check_frames(path: Path, meta: Any) -> None:
         )
 
 
-def _tell_outside(path: Path, frames: list[Any]) -> None:
-    """Name pictures that lie elsewhere: nerfstudio reads them there, and what is made of the capture shows them."""
-    keys = ("file_path", "mask_path", "depth_file_path")
-    names = [frame.get(key) for frame in frames if isinstance(frame, dict) for key in keys]
-    outside = [name for name in names if isinstance(name, str) and not leads_inside(name)]
+def tell_outside(path: Path, outside: Sequence[object]) -> None:
+    """Name pictures that lie elsewhere: they are read there, and what is made of the capture shows them."""
     if outside:
         warn(f"{path} names pictures outside of its folder, which are read there: {listed(outside)}.")
 
@@ -146,7 +146,7 @@ def _check_other_format(path: Path, meta: dict[str, Any]) -> None:
     for key in ("camera_angle_x", "camera_angle_y"):
         if key not in meta or f"fl_{key[-1]}" in meta:
             continue  # nothing reads it
-        angle = meta[key] = _number(path, key, meta[key], "for all frames")
+        angle = meta[key] = check_number(path, key, meta[key], "for all frames")
         if not 0.0 < angle < math.pi:
             converted = f" ({angle:g} degrees are {math.radians(angle):.6g})" if math.pi <= angle < 180.0 else ""
             fail(f"{path}: {key} is {angle:g}, but lies between 0 and pi: it is in radians, not degrees{converted}.")
@@ -189,53 +189,6 @@ def take_lists(meta: dict[str, Any]) -> Lists:
     return {split: names for split, names in found.items() if names is not None}
 
 
-def without_endings(path: Path, meta: dict[str, Any]) -> None:
-    """Names of a Blender file as its reader expects them: it adds .png itself."""
-    for frame in meta["frames"]:
-        name = str(frame.get("file_path", ""))
-        if name.lower().endswith(".png") and (path.parent / name).is_file():
-            frame["file_path"] = name[: -len(".png")]
-
-
-def complete_instant_ngp(path: Path, meta: dict[str, Any]) -> None:
-    """What the format allows and its reader does not know: photographs of any ending or none, and two focal lengths.
-
-    Frames are put in the order of their names, so that the same photographs are held out as from other formats.
-    """
-    for key in ("equirectangular", "is_equirectangular", "latlong", "is_latlong"):
-        if meta.get(key):
-            fail(f"{path}: {key} is set. {PANORAMAS}")
-    frames = meta["frames"]
-    for i, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
-            fail(f"{path}: frame {i} has no file_path or no transform_matrix")
-        name = os.path.normpath(_file_name(path, i, "file_path", frame["file_path"]))
-        fitting = [name] if (path.parent / name).is_file() else _with_endings(path.parent, name)
-        if len(fitting) > 1:
-            fail(f"{path}: frame {i} is of {name}, but there are {listed(fitting)}. Write the ending of the right one.")
-        frame["file_path"] = fitting[0] if fitting else name
-    missing = [frame["file_path"] for frame in frames if not (path.parent / frame["file_path"]).is_file()]
-    if missing:
-        fail(
-            f"{path}: {len(missing)} of {len(frames)} photographs are missing: {listed(missing)}. Copy them there, "
-            "correct the names or remove the frames."
-        )
-    frames.sort(key=lambda frame: path.parent / frame["file_path"])
-    if "fl_y" in meta or "camera_angle_y" in meta or "y_fov" in meta:  # its reader looks for both or takes fl_x
-        meta.setdefault("camera_angle_y", math.radians(meta.get("y_fov", 0.0)))
-        meta.setdefault("y_fov", math.degrees(meta["camera_angle_y"]))
-
-
-def _with_endings(folder: Path, name: str) -> list[str]:
-    """Photographs of this name without its ending, seen from the folder."""
-    place = folder / name
-    return sorted(
-        path.relative_to(folder).as_posix()
-        for path in place.parent.glob(f"{glob.escape(place.name)}.*")
-        if path.suffix.lower() in PHOTOGRAPHS and path.stem == place.name
-    )
-
-
 def _check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
     """One photograph has one pose."""
     first: dict[str, int] = {}
@@ -250,24 +203,35 @@ def _check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
             )
 
 
-def _check_camera(path: Path, meta: dict[str, Any]) -> None:
+def _check_camera(path: Path, meta: dict[str, Any], stock: bool) -> None:
     """Numbers are numbers, and every frame has all that it needs."""
     frames = meta["frames"]
     for holder in (meta, *frames):
         whose = f"of {holder['file_path']}" if "file_path" in holder else "for all frames"
         for key in (*INTRINSICS, *COEFFICIENTS):
             if key in holder:
-                holder[key] = _number(path, key, holder[key], whose)
+                holder[key] = check_number(path, key, holder[key], whose)
     for key in INTRINSICS:
-        lacking = [frame["file_path"] for frame in frames if key not in meta and key not in frame]
+        ways = (key,) if stock else (key, *ANGLES.get(key, ()))
+        lacking = [frame["file_path"] for frame in frames if not any(way in meta or way in frame for way in ways)]
         if lacking:
             way_out = f"Add it once at the top of the file{'' if len(lacking) == len(frames) else ', or to each frame'}"
-            if "camera_angle_x" in meta:
+            if stock and "camera_angle_x" in meta:
                 way_out = (
                     "It has camera_angle_x, as files for instant-ngp and Blender's have: give the name of their "
                     "reader, `... instant-ngp-data --data <capture>` or `... blender-data --data <capture>`"
                 )
             fail(f"{path} gives no {key} for {listed(lacking)}: it is neither in the frame nor at the top. {way_out}.")
+    if not stock:
+        return
+    own = {repr(frame["camera_model"]) for frame in frames if "camera_model" in frame}
+    if own and (len(own) > 1 or any("camera_model" not in frame for frame in frames)):
+        fail(
+            f"{path} has frames with a camera_model of their own ({', '.join(sorted(own))}), but nerfstudio's reader "
+            "takes one for all frames, from the top of the file. Read it with `bitymi-data`, the default."
+        )
+    if own:  # which it would not see
+        meta["camera_model"] = frames[0]["camera_model"]
     model = meta.get("camera_model", "OPENCV")
     if model not in CAMERA_MODEL_TO_TYPE:
         fail(
@@ -276,7 +240,8 @@ def _check_camera(path: Path, meta: dict[str, Any]) -> None:
         )
 
 
-def _number(path: Path, key: str, value: Any, whose: str) -> float | int:
+def check_number(path: Path, key: str, value: Any, whose: str) -> float | int:
+    """The number that an entry is, also in quotes; stops where it is none. `whose` it is, for the message."""
     try:
         number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
@@ -319,7 +284,7 @@ def _check_transform(path: Path, meta: dict[str, Any]) -> None:
             )
         meta["applied_transform"] = transform[:3].tolist()
     if "applied_scale" in meta:
-        scale = _number(path, "applied_scale", meta["applied_scale"], "for all frames")
+        scale = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
         if not 0.0 < scale < math.inf:
             fail(f"{path}: applied_scale is {scale}, which is no positive number. Correct it or remove it.")
 

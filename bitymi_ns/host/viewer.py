@@ -32,6 +32,11 @@ def _ours_for(config: Any, start: Any) -> Any:
         if shown is not config:
             start(shown, *args)
             return
+        for pipeline in args[:1]:  # photographs that are gone are no hindrance to it
+            for name in ("train_dataset", "eval_dataset"):
+                dataset = getattr(getattr(pipeline, "datamanager", None), name, None)
+                if dataset is not None:
+                    dataset.shows_blanks = True
         if shown.viewer.websocket_host == ViewerConfig().websocket_host and not _host_given():
             shown.viewer.websocket_host = LOOPBACK
         CONSOLE.print("Ctrl-C ends the viewer.")

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from bitymi_ns.bundle.manifest import BundleError, Place
 
+FARTHEST = 10_000.0
+"""Units of the scene, whose cameras fit into a box from -1 to 1; so far from the origin float32 is off by 1/1,000."""
 _SLACK = 1e-4  # of a rotation that was stored with rounding
 
 
@@ -45,7 +47,8 @@ def to_capture(place: Place) -> Similarity:
     """What undoes x_scene = scale * (transform @ [x_capture, 1]).
 
     Raises:
-        BundleError: the transform is no similarity, so that discs would not stay discs.
+        BundleError: the transform is no similarity, so that discs would not stay discs; or it leads so far from the
+            origin that float32 cannot tell positions.
     """
     transform = torch.tensor(place.transform, dtype=torch.float64)
     matrix, offset = transform[:, :3], transform[:, 3]
@@ -59,4 +62,11 @@ def to_capture(place: Place) -> Similarity:
     u, _, v = torch.linalg.svd(turn)
     turn = u @ v  # the nearest orthogonal one
     scale = 1 / (stretch * place.scale)
-    return Similarity(turn.T, scale, -(turn.T @ offset) / stretch)
+    shift = -(turn.T @ offset) / stretch
+    if float(shift.norm()) > FARTHEST * scale:
+        raise BundleError(
+            f"the capture lies {float(shift.norm()):,.0f} of its units from the origin of its own frame, as "
+            "coordinates of a map do, and the numbers of such files have seven digits: the scene would be blurred. "
+            "Leave it in the scene's frame; world.transform and world.scale of bundle.json say where that lies"
+        )
+    return Similarity(turn.T, scale, shift)

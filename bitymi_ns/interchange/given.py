@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -58,6 +58,14 @@ class Given:
     held_out: list[View] = field(default_factory=list)
 
 
+class NamedCamera(NamedTuple):
+    """A camera of a capture: the name of its photograph, whether that was held out, and the camera."""
+
+    name: str
+    held_out: bool
+    camera: Camera
+
+
 def given_with(folder: str | Path, info: Manifest) -> Given:
     """What cameras.json of a bundle says, and the photographs that it names; nothing, where it has no such file.
 
@@ -71,15 +79,24 @@ def given_with(folder: str | Path, info: Manifest) -> Given:
     if CAMERAS not in info.files:
         return Given()
     with parts_of(folder) as parts:
-        rows = _rows(parts.bundle / CAMERAS, read_file(parts, info, CAMERAS))
+        rows = _rows(parts, info)
         held_out = [_view(parts, info, row) for row in rows if row.held_out and row.photograph is not None]
     return Given([row.camera() for row in rows if not row.held_out], held_out)
 
 
-def _rows(path: Path, data: bytes | bytearray) -> list[_Row]:
+def named_cameras(folder: str | Path, info: Manifest) -> list[NamedCamera]:
+    """The cameras of the capture that a bundle was made of, as cameras.json has them; see `given_with`."""
+    if CAMERAS not in info.files:
+        return []
+    with parts_of(folder) as parts:
+        return [NamedCamera(row.name, row.held_out, row.camera()) for row in _rows(parts, info)]
+
+
+def _rows(parts: Parts, info: Manifest) -> list[_Row]:
     """What stands in the file, up to the first row that is wrong, which is refused."""
+    path = parts.bundle / CAMERAS
     try:
-        value = strict_json.loads(data)
+        value = strict_json.loads(read_file(parts, info, CAMERAS))
     except ValueError as error:
         raise BundleError(f"{path} cannot be read as JSON ({error})") from error
     found = value.get("cameras") if isinstance(value, dict) else None

@@ -51,9 +51,10 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
         most, first = config.densify.max_surfels, config.first_surfels
         by_steps = first is not None and (most <= 0 or first < most)
         option, most = ("first-surfels", first) if by_steps else ("densify.max-surfels", most)
+        what = f"{points.random:,} random points" if points.random else f"{points.given:,} points of the capture"
         found.append(
-            f"Training starts from {most:,} surfels: {points.over_cap:,} of {points.given:,} points of the capture are "
-            f"left out by lot (--pipeline.model.train.{option})."
+            f"Training starts from {most:,} surfels: {points.over_cap:,} of {what} are left out by lot "
+            f"(--pipeline.model.train.{option})."
         )
     size = default_table_size(image_pixels)
     if scene.texture == "hash" and scene.log2_table_size is None and table_size_of(image_pixels) > size:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from bitymi_ns import files
-from bitymi_ns.capture import SfmOptions, find_poses
+from bitymi_ns.capture import KnownView, SfmOptions, find_poses, triangulate
 from bitymi_ns.capture.cache import read_from
+from bitymi_ns.capture.sfm import process
+from bitymi_ns.capture.sfm.job import Job
+from bitymi_ns.capture.types import CaptureError
 
 
 @pytest.fixture
@@ -72,3 +77,67 @@ def test_what_is_read_from_stays(photographs: Path, kept: Callable[..., Path]) -
     touch(photographs, 20)
     kept(photographs)
     assert not first.exists() and not second.exists()
+
+
+@pytest.fixture
+def triangulated(photographs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Triangulates points, without looking for any; returns the folder of the work."""
+    runs: list[Job] = []
+    monkeypatch.setattr(process, "run", lambda job, *told: runs.append(job))
+
+    def find(**masks: Path) -> Path:
+        pinhole = (64.0, 64.0, 32.0, 24.0)
+        files = sorted(photographs.glob("*.png"))
+        views = [KnownView(file, "PINHOLE", 64, 48, pinhole, np.eye(4)[:3], **masks) for file in files]
+        before = len(runs)
+        model = triangulate(photographs, views)
+        find.anew = len(runs) > before  # type: ignore[attr-defined]
+        return model.parent
+
+    return find
+
+
+def test_points_of_photographs_as_they_were_are_removed_and_poses_stay(
+    photographs: Path, kept: Callable[..., Path], triangulated: Any
+) -> None:
+    poses, first = kept(photographs), triangulated()
+    assert first.name.startswith("points-") and triangulated.anew
+    assert triangulated() == first and not triangulated.anew
+    touch(photographs, 10)
+    second = triangulated()
+    assert second.is_dir() and not first.exists() and poses.is_dir()
+    kept(photographs)
+    assert not poses.exists() and second.is_dir()
+
+
+@pytest.mark.parametrize("place", ["", "beside"])
+def test_points_in_a_folder_of_others_are_not_read(
+    place: str, photographs: Path, kept: Callable[..., Path], triangulated: Any, tmp_path: Path
+) -> None:
+    work = triangulated()
+    if place:
+        work.parent.rename(tmp_path / "theirs")
+        work.parent.symlink_to(tmp_path / "theirs")
+    else:
+        work.chmod(0o777)
+    assert triangulated().is_relative_to(tmp_path / "cache") and triangulated.anew
+
+
+def test_masks_of_points_are_not_written_through_links(
+    photographs: Path, kept: Callable[..., Path], triangulated: Any, tmp_path: Path
+) -> None:
+    mask, victim = tmp_path / "mask.png", tmp_path / "precious"
+    Image.new("L", (64, 48), 255).save(mask)
+    victim.write_text("precious")
+    work = triangulated(mask=mask)
+    (work / "points").unlink()
+    (work / "masks").mkdir()
+    (work / "masks/000000.png.png").symlink_to(victim)
+    assert triangulated(mask=mask) == work and triangulated.anew and victim.read_text() == "precious"
+
+
+def test_photographs_that_are_none_give_no_points(photographs: Path, triangulated: Any) -> None:
+    with pytest.raises(CaptureError, match=r"precious.png cannot be read as a picture"):
+        mask = photographs.parent / "precious.png"
+        Image.new("RGB", (64, 48)).save(mask, "EPS")
+        triangulated(mask=mask)

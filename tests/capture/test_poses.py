@@ -102,7 +102,8 @@ def test_names_that_are_not_utf8_are_refused_before_the_work(copied: Copy, tmp_p
     with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
         find_poses(folder, progress=never)
     with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
-        triangulate(folder, [KnownView(f"photo_{i}.png", 9, 9, 9, 9, 5, 5, np.eye(4)[:3]) for i in (1, 2)], never)
+        known = [KnownView(folder / f"photo_{i}.png", "PINHOLE", 9, 9, (9, 9, 5, 5), np.eye(4)[:3]) for i in (1, 2)]
+        triangulate(folder, known, never)
 
 
 def never(step: str, done: int, total: int) -> None:
@@ -184,14 +185,15 @@ def test_points_are_triangulated_for_known_poses(arc: Path, views: list[View], c
         pose = np.vstack([view.camera_to_world[:3], [0, 0, 0, 1]]).astype(float)
         pose[:3, 1:3] *= -1
         inverse = np.linalg.inv(pose)[:3]
-        known.append(KnownView(f"photo_{i + 1}.png", 288, 216, view.focal, view.focal, 144, 108, inverse))
+        pinhole = (view.focal, view.focal, 144.0, 108.0)
+        known.append(KnownView(folder / f"photo_{i + 1}.png", "PINHOLE", 288, 216, pinhole, inverse))
     model = pycolmap.Reconstruction(triangulate(folder, known))
     points = np.array([point.xyz for point in model.points3D.values()])
     assert len(points) > 50
     inside = (points > [-3.1, -2.6, -0.1]) & (points < [3.1, 2.6, 2.7])
     assert inside.all(axis=1).mean() > 0.8  # the rest is the landscape outside the window
     for view in known:
-        found = model.find_image_with_name(view.name).cam_from_world().matrix()
+        found = model.find_image_with_name(view.file.name).cam_from_world().matrix()
         np.testing.assert_allclose(found, view.world_to_camera, atol=1e-9)
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
-from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, recognise
+from bitymi_ns.capture.photos import find_photos, photo_folder
+from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, passed_over, recognise
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/a.jpg", "transform_matrix": POSE}
@@ -186,3 +189,40 @@ def test_a_format_that_is_not_there(tmp_path: Path) -> None:
     model(tmp_path / "sparse/1")
     with pytest.raises(NotRecognised, match="does not exist. Give `--colmap-path sparse/1`"):
         recognise(tmp_path, colmap_path=Path("sparse/0"))
+
+
+@pytest.mark.parametrize(
+    ("files", "searched"),
+    [
+        (["images/CLIP/a.jpg", "images/CLIP/b.jpg"], "."),
+        (["images/left/a.jpg", "images/right/a.jpg"], "."),
+        (["DCIM/100GOPRO/a.JPG", "DCIM/100GOPRO/b.JPG"], "DCIM/100GOPRO"),
+        (["DCIM/100MEDIA/a.JPG", "DCIM/101MEDIA/a.JPG"], "DCIM"),
+        (["a/b/c/d/1.png", ".bitymi/poses-1/result/cameras.png"], "a/b/c/d"),
+        (["rgb/1.jpg", "Depth/1.png", "confidence/1.png", "normals/1.png", "thumbnail.jpg"], "rgb"),
+    ],
+)
+def test_photographs_in_nested_folders(tmp_path: Path, files: list[str], searched: str) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    found = recognise(tmp_path)
+    assert (found.format, found.path) == ("photographs", tmp_path / searched)
+    given = [name for name in files if not re.search("cameras|Depth|confidence|normals|thumb", name)]
+    folder = photo_folder(found.path)
+    assert sorted(str((folder / name).relative_to(tmp_path)) for name in find_photos(folder)) == given
+
+
+def test_several_captures_in_one_folder(tmp_path: Path) -> None:
+    for name in ("garden", "kitchen"):
+        (tmp_path / name / "images").mkdir(parents=True)
+        Image.new("RGB", (8, 8)).save(tmp_path / name / "images/a.jpg")
+    with pytest.raises(NotRecognised, match="It holds 2 captures: give one of them, as .*garden"):
+        recognise(tmp_path)
+
+
+def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
+    for name in ("rgb/1.jpg", "depth/1.png", "depth/2.png", "sub/Masks/1.png", "thumbnail.jpg", ".hidden/masks/1.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    assert passed_over(tmp_path) == ["depth (2 depth maps)", "thumbnail.jpg (a thumbnail)", "sub/Masks (1 masks)"]

@@ -143,7 +143,7 @@ def test_a_capture_without_points_starts_at_random(
     config = start(data=pointless(room, tmp_path))
     config.max_num_iterations, config.pipeline.model.train.random_points = 2, 300
     ns_train.main(config)
-    assert "starts from 300 random ones" in " ".join(capsys.readouterr().out.split())
+    assert "Surfels are made of 300 random points" in " ".join(capsys.readouterr().out.split())
 
 
 def test_no_points_and_an_empty_scene_box(room: Path, start: Start, tmp_path: Path) -> None:

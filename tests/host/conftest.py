@@ -11,8 +11,19 @@ import pytest
 
 pytest.importorskip("nerfstudio")
 
+import bitymi_ns.capture
 from bitymi_ns.sample import generate
 from tests.host.captures import colmap_model
+
+
+@pytest.fixture(autouse=True)
+def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Captures without points start from random ones: COLMAP would take seconds in each test that has such a one."""
+
+    def triangulate(*given: Any) -> Path:
+        raise bitymi_ns.capture.CaptureError("not in this test")
+
+    monkeypatch.setattr(bitymi_ns.capture, "triangulate", triangulate, raising=False)
 
 
 @pytest.fixture(scope="session")

@@ -90,7 +90,7 @@ def test_a_pose_that_is_none_is_named_itself(model: Path, pose: str) -> None:
     lines = path.read_text().split("\n")
     lines[6] = f"4 {pose} 1 frame_00004.png"
     path.write_text("\n".join(lines))
-    with expect(r"images.txt: the pose of image 4 \(frame_00004.png\) is not finite, or its rotation is zero"):
+    with expect(r"images.txt, line 7: the pose of image 4 \(frame_00004.png\) is not finite, or its rotation is zero"):
         load_model(model)
 
 

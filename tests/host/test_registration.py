@@ -73,7 +73,7 @@ def test_the_help_explains_every_option_that_does_something(capsys: pytest.Captu
 
 def test_the_protocol_is_that_of_3dgs() -> None:
     dataparser = methods.bitymi.config.pipeline.datamanager.dataparser
-    assert (dataparser.eval_mode, dataparser.eval_interval, dataparser.load_3D_points) == ("interval", 8, True)
+    assert (dataparser.eval_mode, dataparser.eval_interval, dataparser.points) == ("interval", 8, "auto")
 
 
 def fresh() -> config.BitymiTrainerConfig:

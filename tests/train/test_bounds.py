@@ -44,6 +44,12 @@ def test_points_that_do_not_fit_are_announced() -> None:
         assert f"train.{option})" in sentence
 
 
+def test_random_points_that_do_not_fit_are_counted_themselves() -> None:
+    config = TrainConfig(first_surfels=5_000)
+    (sentence,) = bounds.start(PointReport(given=0, random=20_000, over_cap=15_000), config, 1, SceneConfig())
+    assert "from 5,000 surfels: 15,000 of 20,000 random points are left out" in sentence
+
+
 def test_nothing_is_said_of_a_field_where_there_is_none() -> None:
     (sentence,) = bounds.short_run(Schedule(TrainConfig(), 1200), views=43, field=False)
     assert "field" not in sentence

@@ -58,7 +58,8 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
             for text in process.stdout:
                 line = json.loads(text)
                 if "failure" in line:
-                    raise CaptureError(f"no camera poses can be found in {source}: {line['failure']}")
+                    wanted = "points" if job.poses else "camera poses"
+                    raise CaptureError(f"no {wanted} can be found in {source}: {line['failure']}")
                 if "result" in line:
                     return line["result"]
                 watch.end()

@@ -1,0 +1,54 @@
+"""Colours of points that have none, from the photographs that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from bitymi_ns.host.images import read_image
+from bitymi_ns.host.ply import Points
+from bitymi_ns.host.views import Photograph
+from bitymi_ns.train.views import spread
+
+LOOKED_AT = 24
+"""Photographs, spread over all, in which colours are looked up."""
+AT_ONCE = 100_000
+"""Points that are coloured together."""
+GREY = 128
+
+
+def coloured(points: Points, photographs: Sequence[Photograph]) -> Points:
+    """The points, each with the median of its colours in the photographs whose picture it falls into; grey where there
+    is none. What hides a point in some of them does not matter to a median."""
+    chosen = [photographs[i] for i in spread(len(photographs), LOOKED_AT)]
+    pictures = [np.asarray(read_image(photograph.file).convert("RGB")) for photograph in chosen]
+    rgb = np.full((len(points.xyz), 3), GREY, np.uint8)
+    for start in range(0, len(rgb), AT_ONCE):
+        xyz = points.xyz[start : start + AT_ONCE]
+        seen = np.stack([_sampled(xyz, *each) for each in zip(chosen, pictures, strict=True)])
+        known = np.isfinite(seen[..., 0]).any(0)
+        rgb[start : start + AT_ONCE][known] = np.nanmedian(seen[:, known], 0).astype(np.uint8)
+    return Points(points.xyz, rgb)
+
+
+def _sampled(
+    xyz: npt.NDArray[np.float64], photograph: Photograph, picture: npt.NDArray[np.uint8]
+) -> npt.NDArray[np.float32]:
+    """[N, 3] colours of points in a picture; NaN where they are not in it."""
+    camera = photograph.camera
+    found = np.full((len(xyz), 3), np.nan, np.float32)
+    local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
+    front = np.flatnonzero(local[:, 2] > 0.0)
+    if not len(front):
+        return found
+    lens = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+    pixels = lens.img_from_cam(local[front] / local[front, 2:])
+    height, width = picture.shape[:2]
+    pixels = np.nan_to_num(pixels * [width / camera.width, height / camera.height], nan=-1.0, posinf=-1.0, neginf=-1.0)
+    inside = ((pixels >= 0.0) & (pixels < (width, height))).all(1)
+    x, y = pixels[inside].astype(int).T
+    found[front[inside]] = picture[y, x]
+    return found

@@ -1,0 +1,101 @@
+"""Pictures of all directions at once are told from photographs of the same shape."""
+
+from __future__ import annotations
+
+import zlib
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bitymi_ns.capture import CaptureError, find_poses
+from bitymi_ns.capture.panorama import says_so, shows_so
+from bitymi_ns.sample.room import Room
+
+XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+    b'GPano:ProjectionType="equirectangular"/></rdf:RDF></x:xmpmeta>'
+)
+
+
+def panorama(turn: float = 0.0, height: int = 256, centre: tuple[float, float, float] = (0.0, 0.0, 1.2)) -> np.ndarray:
+    """[h, 2 h, 3] what is seen of the sample room all round, rows from the zenith to the nadir."""
+    theta, phi = np.meshgrid(
+        (np.arange(height) + 0.5) / height * np.pi, turn + (np.arange(2 * height) + 0.5) / height * np.pi, indexing="ij"
+    )
+    rays = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    return shaded(rays, centre)
+
+
+def photograph(turn: float, height: int = 256) -> np.ndarray:
+    """[h, 2 h, 3] a photograph of that shape."""
+    y, x = np.meshgrid((np.arange(height) + 0.5) / height - 0.5, np.arange(2 * height) / height - 1.0, indexing="ij")
+    forward = np.array([np.cos(turn), np.sin(turn), -0.1])
+    right = np.array([np.sin(turn), -np.cos(turn), 0.0])
+    rays = forward + x[..., None] * right - y[..., None] * np.array([0.0, 0.0, 1.0])
+    return shaded(rays / np.linalg.norm(rays, axis=-1, keepdims=True), (0.0, 0.0, 1.2))
+
+
+@cache
+def room_of_tests() -> Room:
+    return Room(0)
+
+
+def shaded(rays: np.ndarray, centre: tuple[float, float, float]) -> np.ndarray:
+    room, flat = room_of_tests(), rays.reshape(-1, 3).astype(np.float32)
+    origin, direction = tuple(np.full(len(flat), c, np.float32) for c in centre), tuple(flat.T)
+    colours = np.asarray(room.colour(origin, direction, room.hit(origin, direction)))
+    colours = colours if colours.shape[-1] == 3 else colours.T
+    return np.uint8(np.clip(colours, 0.0, 1.0) * 255.0 + 0.5).reshape(rays.shape)
+
+
+def grey(pixels: np.ndarray) -> np.ndarray:
+    return np.asarray(Image.fromarray(pixels).convert("L").resize((256, 128), Image.Resampling.BOX), np.float32)
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.2])
+def test_what_pictures_show(turn: float) -> None:
+    assert shows_so(grey(panorama(turn, centre=(0.5, -0.4, 1.3))))
+    assert not shows_so(grey(photograph(turn)))
+    assert not shows_so(grey(panorama(turn))[:, 8:-8])  # another shape
+
+
+def test_other_pictures_of_that_shape() -> None:
+    y, x = np.mgrid[:128, :256]
+    product = np.where(np.hypot(x - 128, y - 64) < 40, 90.0, 245.0)  # on a white background
+    sea = np.where(y < 60, 200.0 - y, 90.0) + np.random.default_rng(0).normal(0, 12, (128, 256)) * (y > 60)
+    for pixels in (product, sea, np.zeros((128, 256)), np.random.default_rng(1).uniform(0, 255, (128, 256))):
+        assert not shows_so(pixels.astype(np.float32))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_what_metadata_say(tmp_path: Path, suffix: str) -> None:
+    plain, marked = tmp_path / f"plain{suffix}", tmp_path / f"marked{suffix}"
+    image = Image.new("RGB", (64, 32))
+    image.save(plain)
+    data = plain.read_bytes()
+    if suffix == ".jpg":
+        body = b"http://ns.adobe.com/xap/1.0/\0" + XMP
+        data = data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:]
+    else:
+        chunk = b"iTXtXML:com.adobe.xmp\0\0\0\0\0" + XMP
+        data = (
+            data[:33] + (len(chunk) - 4).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big") + data[33:]
+        )
+    marked.write_bytes(data)
+    Image.open(marked).load()
+    assert says_so(marked) and not says_so(plain) and not says_so(tmp_path / "none.jpg")
+
+
+def test_they_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "walk").mkdir()
+    for i in range(4):
+        Image.fromarray(panorama(0.3 * i, 128 if i else 256, centre=(0.5 + 0.1 * i, -0.4, 1.3))).save(
+            tmp_path / f"walk/{i}.png"
+        )
+    with pytest.raises(CaptureError, match="4 of 4 photographs .* show all directions at once .*Cut them into"):
+        find_poses(tmp_path / "walk")

@@ -1,0 +1,177 @@
+"""Runs and bundles whose capture was moved or is gone, and nerfstudio's commands that cannot work on surfels."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.scripts import exporter, render
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+
+from bitymi_ns.bundle import strict_json
+from bitymi_ns.host.commands import REFUSED
+from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.host.errors import InputError
+from tests.e2e.exports import evaluate
+
+
+@pytest.fixture
+def alone(copied: Path) -> Path:
+    """A bundle whose capture is gone."""
+    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path("/no/longer/there")
+    (copied / "config.yml").write_text(yaml.dump(config))
+    return copied
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The cameras of the trajectories that were to be rendered."""
+    trajectories: list[Any] = []
+    monkeypatch.setattr(render, "_render_trajectory_video", lambda pipeline, cameras, **_: trajectories.append(cameras))
+    monkeypatch.setattr(render.install_checks, "check_ffmpeg_installed", lambda: None)
+    return trajectories
+
+
+def test_a_bundle_alone_has_the_cameras_of_its_capture(bundle: Path, alone: Path) -> None:
+    before, now = (eval_setup(each / "config.yml")[1].datamanager for each in (bundle, alone))
+    for name in ("train_dataset", "eval_dataset"):
+        a, b = getattr(before, name), getattr(now, name)
+        assert [path.name for path in a.image_filenames] == [path.name for path in b.image_filenames]
+        assert torch.allclose(a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, atol=1e-5)
+        assert torch.equal(a.cameras.fx, b.cameras.fx) and torch.equal(a.cameras.width, b.cameras.width)
+
+
+def test_names_of_a_bundle_alone_lead_nowhere_else(alone: Path, tmp_path: Path) -> None:
+    info = json.loads((alone / "bundle.json").read_text())
+    cameras = json.loads((alone / "cameras.json").read_text())
+    cameras["cameras"][0]["name"] = "../../somewhere.png"
+    data = json.dumps(cameras).encode()
+    (alone / "cameras.json").write_bytes(data)
+    info["files"]["cameras.json"].update(bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
+    info.pop("digest")
+    (alone / "bundle.json").write_text(json.dumps({**info, "digest": strict_json.digest(info)}))
+    with pytest.raises(InputError, match=r"cameras.json: the name '../../somewhere.png' leads elsewhere"):
+        eval_setup(alone / "config.yml")
+
+
+def test_trajectories_need_a_bundle_alone(alone: Path, drawn: list[Any]) -> None:
+    render.RenderInterpolated(load_config=alone / "config.yml", pose_source="train", interpolation_steps=2).main()
+    assert len(drawn[0]) > 2
+
+
+def test_the_viewer_needs_a_bundle_alone(alone: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    shown = []
+
+    def start_viewer(config: Any, pipeline: Any, step: int) -> None:
+        shown.append((config.get_base_dir(), pipeline.datamanager.train_dataset[0]["image"]))
+
+    monkeypatch.setattr(run_viewer, "_start_viewer", start_viewer)
+    monkeypatch.chdir(tmp_path)
+    run_viewer.RunViewer(load_config=alone / "config.yml").main()
+    ((folder, image),) = shown
+    assert folder == alone and image.shape == (36, 48, 3) and image.std() == 0
+    assert not (tmp_path / "no").exists()
+
+
+def test_cameras_of_a_bundle_alone(alone: Path, tmp_path: Path) -> None:
+    exporter.ExportCameraPoses(load_config=alone / "config.yml", output_dir=tmp_path / "cameras").main()
+    assert len(list((tmp_path / "cameras").iterdir())) == 2
+
+
+def test_what_needs_photographs_says_how_to_name_them(
+    alone: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match="/no/longer/there/frame.* the capture is gone. .* `BITYMI_DATA=/where/it/is`"):
+        evaluate(alone / "config.yml", tmp_path / "out.json")
+    moved = Path(shutil.copytree(room, tmp_path / "moved"))
+    monkeypatch.setenv("BITYMI_DATA", str(moved))
+    assert evaluate(alone / "config.yml", tmp_path / "out.json")["psnr"] > 10
+    monkeypatch.setenv("BITYMI_DATA", str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match="BITYMI_DATA says that the capture is .*nowhere, which does not exist"):
+        eval_setup(alone / "config.yml")
+
+
+def test_a_run_whose_capture_was_moved(
+    trained: BitymiTrainerConfig, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "run"))
+    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = Path("/no/longer/there")
+    config.output_dir = Path("outputs")  # seen from where it was trained
+    (run / "config.yml").write_text(yaml.dump(config))
+    with pytest.raises(InputError) as refused:
+        eval_setup(run / "config.yml")
+    assert "/no/longer/there does not exist. If it was moved, say where it is now: `BITYMI_DATA" in str(refused.value)
+    assert "--data" not in str(refused.value)
+    monkeypatch.setenv("BITYMI_DATA", str(room))
+    config, pipeline, _, _ = eval_setup(run / "config.yml")
+    assert config.get_base_dir() == run and len(pipeline.datamanager.eval_dataset) == 2
+
+
+COMMANDS = [
+    render.SpiralRender,
+    exporter.ExportPointCloud,
+    exporter.ExportTSDFMesh,
+    exporter.ExportPoissonMesh,
+    exporter.ExportMarchingCubesMesh,
+    exporter.ExportGaussianSplat,
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("of", ["run", "bundle"])
+def test_commands_that_cannot_work_on_surfels(
+    command: Any, of: str, bundle: Path, trained: BitymiTrainerConfig, tmp_path: Path
+) -> None:
+    assert {each.__name__ for each in COMMANDS} == REFUSED.keys()
+    config = (bundle if of == "bundle" else trained.get_base_dir()) / "config.yml"
+    options = {} if command is render.SpiralRender else {"output_dir": tmp_path}
+    with pytest.raises(InputError, match="ns-(render|export) .*(bitymi extras|ns-render interpolate)"):
+        command(load_config=config, **options).main()
+
+
+def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, pipeline, _, _ = eval_setup(bundle / "config.yml")
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    seen = pipeline.model.get_outputs_for_camera(camera)
+    camera.camera_type[:] = CameraType.EQUIRECTANGULAR.value
+    with pytest.raises(InputError, match="equirectangular cannot be rendered"):
+        pipeline.model.get_outputs_for_camera(camera)
+    with ThreadPoolExecutor(1) as thread:
+        outputs = [thread.submit(pipeline.model.get_outputs_for_camera, camera).result() for _ in range(2)]
+    assert {name: value.shape for name, value in outputs[1].items()} == {n: v.shape for n, v in seen.items()}
+    assert capsys.readouterr().out.count("equirectangular cannot be rendered") == 1
+
+
+def test_a_crop_that_is_not_heeded_is_said(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, pipeline, _, _ = eval_setup(bundle / "config.yml")
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    for _ in range(2):
+        pipeline.model.get_outputs_for_camera(pipeline.datamanager.eval_dataset.cameras[:1], obb_box=box)
+    assert capsys.readouterr().out.count("Crop boxes are not supported") == 1
+
+
+def test_photographs_through_a_lens_are_rendered(
+    bundle: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = Path(shutil.copytree(room, tmp_path / "room"))
+    meta = json.loads((capture / "transforms.json").read_text())
+    (capture / "transforms.json").write_text(json.dumps({**meta, "k1": 0.08, "k2": -0.01}))
+    monkeypatch.setenv("BITYMI_DATA", str(capture))
+    render.DatasetRender(load_config=bundle / "config.yml", output_path=tmp_path / "out", split="test").main()
+    (picture,) = [path for path in (tmp_path / "out").rglob("*frame_00009*") if "gt-rgb" in str(path)]
+    (drawn,) = [path for path in (tmp_path / "out").rglob("*frame_00009*") if path.parent.name == "rgb"]
+    sizes = {Image.open(path).size for path in (picture, drawn)}
+    assert len(sizes) == 1 and sizes.pop()[0] < 48  # the edges are beyond the photograph

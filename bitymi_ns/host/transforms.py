@@ -23,7 +23,13 @@ from bitymi_ns.host.poses import rotations, warn_of_far_off
 from bitymi_ns.trust import json_of, leads_inside
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
+HOW_TO_MEND = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write the file anew."
 SIZES = ("w", "h")
+OPTIONAL = (
+    "mask_path", "depth_file_path", "ply_file_path", "applied_transform", "applied_scale", "orientation_override",
+    "distortion_params",
+)  # fmt: skip
+"""Entries that may be null, which is as if they were not there."""
 INTRINSICS = (*SIZES, "fl_x", "fl_y", "cx", "cy")
 LONGEST_SIDE = 1 << 20
 """Largest width or height of a picture that is believed, in pixels."""
@@ -78,7 +84,8 @@ def load(path: Path, own_format: bool, announce: bool = True, stock: bool = True
     except FileNotFoundError as error:
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
     except (ValueError, OSError) as error:
-        fail(f"{path} cannot be read: {error}. {HOW_TO_GET_ONE}", error)
+        fail(f"{path} cannot be read: {error}. {HOW_TO_MEND if path.is_file() else HOW_TO_GET_ONE}", error)
+    _drop_nulls(meta)
     if own_format:
         _check_frames(path, meta, least=2)
         _check_camera(path, meta, stock)
@@ -101,6 +108,16 @@ def load(path: Path, own_format: bool, announce: bool = True, stock: bool = True
         if stock and announce and frames:
             warn_of_far_off(path, np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3])
     return meta
+
+
+def _drop_nulls(meta: Any) -> None:
+    """Remove entries that say nothing: programs write null, or an empty name, for what a frame does not have."""
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    holders = [meta, *frames] if isinstance(frames, list) else [meta]
+    for holder in (each for each in holders if isinstance(each, dict)):
+        for key, value in list(holder.items()):
+            if (value is None and key in OPTIONAL) or (value == "" and key in ("mask_path", "depth_file_path")):
+                del holder[key]
 
 
 def _check_frames(path: Path, meta: Any, least: int) -> None:
@@ -180,7 +197,7 @@ def colmap_points(path: Path) -> Path | None:
         meta = json_of(path.read_bytes())
     except (OSError, ValueError):
         return None  # what is wrong is said where it is read
-    return None if not isinstance(meta, dict) or "ply_file_path" in meta else model
+    return None if not isinstance(meta, dict) or meta.get("ply_file_path") is not None else model
 
 
 def take_lists(meta: dict[str, Any]) -> Lists:
@@ -281,6 +298,11 @@ def _check_transform(path: Path, meta: dict[str, Any]) -> None:
             fail(
                 f"{path}: applied_transform is not a matrix of 3 x 4 finite numbers. Correct it, or remove it: then "
                 "exports are in the frame of this file."
+            )
+        if abs(np.linalg.det(transform[:3, :3])) < 1e-12:
+            fail(
+                f"{path}: applied_transform maps the capture to a plane, a line or a point, which cannot be undone. "
+                "Correct it, or remove it: then exports are in the frame of this file."
             )
         meta["applied_transform"] = transform[:3].tolist()
     if "applied_scale" in meta:

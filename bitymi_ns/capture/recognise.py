@@ -33,17 +33,6 @@ one, EPS, is a program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP model usually lies in a capture, the most usual place first."""
-BESIDES = {
-    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
-    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
-    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
-    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
-    "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
-    "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
-}  # fmt: skip
-"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
-BESIDE = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
-"""The same for files, without their endings, that lie beside folders of photographs."""
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries that a transforms.json has from nerfstudio alone."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
@@ -285,7 +274,7 @@ def _folders_in(folder: Path) -> list[Path]:
 
 
 def _may_hold_photographs(name: str) -> bool:
-    return not name.startswith(".") and name.lower() not in BESIDES
+    return not name.startswith(".") and name.lower() not in unread.FOLDERS
 
 
 def _has_photographs(folder: Path, below: bool = False) -> bool:
@@ -317,7 +306,7 @@ def passed_over(folder: Path) -> list[str]:
     found = []
     for place, below, names in os.walk(folder):
         for name in sorted(below):
-            what = BESIDES.get(name.lower()) or _copies(name, below)
+            what = unread.FOLDERS.get(name.lower()) or _copies(name, below)
             if what and _pictures(Path(place, name)):
                 found.append(f"{Path(place, name).relative_to(folder)} ({_pictures(Path(place, name))} {what})")
         below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
@@ -346,7 +335,7 @@ def is_photograph(path: Path) -> bool:
 def _beside(path: Path) -> str:
     """What a picture beside photographs is, by its name; empty = a photograph."""
     stem = path.stem.lower()
-    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else BESIDE.get(stem, "")
+    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else unread.FILES.get(stem, "")
 
 
 def is_picture(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""What cameras and other programs leave in a capture that nothing here reads: pictures and poses, to be named."""
+"""What cameras and other programs leave in a capture that nothing here reads as photographs or poses, to be named."""
 
 from __future__ import annotations
 
@@ -27,6 +27,17 @@ POSES = {
 """Files of poses, in lower case, and the programs that write them."""
 METASHAPE = b"<camera "
 """What the XML file has in it to which Metashape exports cameras, whatever its name."""
+FOLDERS = {
+    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
+    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
+    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
+    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
+    "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
+    "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+}  # fmt: skip
+"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
+FILES = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
+"""The same for files, without their endings, that lie beside folders of photographs."""
 
 
 def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:

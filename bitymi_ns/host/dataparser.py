@@ -38,7 +38,7 @@ from bitymi_ns.host.scanner_views import scanned
 from bitymi_ns.host.starting_points import Choice, are_wanted, starting_points
 from bitymi_ns.host.transforms import Lists, colmap_points
 from bitymi_ns.host.transforms_views import Transforms, missing_photographs, read_transforms
-from bitymi_ns.host.views import Photograph, Place, Views, views_of_capture
+from bitymi_ns.host.views import Photograph, Place, Views, in_proportion, views_of_capture
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model, which is found for those that come without."""
@@ -230,6 +230,7 @@ class BitymiDataParser(DataParser):
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * float(meta.get("aabb_scale", 1))
             place = Place(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
+            place = in_proportion(place, read.photographs, str(read.path))
         elif "orientation_override" in meta:
             place = replace(place, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {place.orientation_method}.")
@@ -309,9 +310,12 @@ class BitymiDataParser(DataParser):
         self._tell(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
         own = None if config.ply_path is None else points_of_file(found.path / config.ply_path, train.photographs)
         points = starting_points(own, config.points, train.photographs, found.folder, str(train.path))
+        place = Place(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
+        if config.scale_factor == 1.0:  # else somebody has decided
+            place = in_proportion(place, train.photographs, str(train.path))
         outputs = views_of_capture(
             [each for part in parts.values() for each in part],
-            Place(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE),
+            place,
             points,
             str(train.path),
             config.downscale_factor or 1,

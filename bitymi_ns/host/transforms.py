@@ -122,13 +122,17 @@ def _drop_nulls(meta: Any) -> None:
 
 def _check_frames(path: Path, meta: Any, least: int) -> None:
     frames = meta.get("frames") if isinstance(meta, dict) else None
+    if isinstance(frames, dict):
+        fail(f"{path}: frames is an object with names, not a list. Write its values as a list, in brackets.")
     if not isinstance(frames, list) or not frames:
         fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE}")
     if len(frames) < least:
         fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
     for i, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
-            fail(f"{path}: frame {i} has no file_path or no transform_matrix")
+        there = frame.keys() if isinstance(frame, dict) else ()
+        lacking = [key for key in ("file_path", "transform_matrix") if key not in there]
+        if lacking:
+            fail(f"{path}: frame {i} (counted from 0) has no {' and no '.join(lacking)}. Add that or remove the frame.")
         for key in ("file_path", "mask_path", "depth_file_path"):
             if key in frame:
                 frame[key] = _file_name(path, i, key, frame[key])

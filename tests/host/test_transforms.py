@@ -328,3 +328,15 @@ def test_a_photograph_is_no_mask(capture: Path, edit: Any) -> None:
     edit(capture, change)
     with expect("the mask /home/me/masks/images/frame_.* is missing"):
         load_any(capture)
+
+
+def test_frames_that_are_none(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta["frames"].insert(1, {"file_path": "images/a.png"}))
+    with expect("frame 1 .counted from 0. has no transform_matrix. Add that or remove the frame"):
+        load_any(capture)
+    edit(capture, lambda meta: meta["frames"].__setitem__(1, None))
+    with expect("frame 1 .* has no file_path and no transform_matrix"):
+        load_any(capture)
+    edit(capture, lambda meta: meta.update(frames=dict(enumerate(meta["frames"]))))
+    with expect("frames is an object with names, not a list"):
+        load_any(capture)

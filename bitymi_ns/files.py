@@ -8,6 +8,7 @@ process left under them is found, and put back or removed, by the next one that 
 
 from __future__ import annotations
 
+import codecs
 import errno
 import fcntl
 import os
@@ -75,6 +76,13 @@ def explained(path: Path, kind: type[Exception]) -> Iterator[None]:
         if error.errno is None:  # of our own making: it says what is wrong
             raise
         raise kind(f"{path} cannot be written: {reason(error, path)}") from error
+
+
+def encoding_of(path: Path) -> str:
+    """The encoding of a text file by its byte order mark, which editors and shells of Windows write; UTF-8 without."""
+    with open(path, "rb") as file:
+        start = file.read(2)
+    return "utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
 def free_bytes(path: Path) -> int:

@@ -8,14 +8,16 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, finished, take_place, work_folder
 from bitymi_ns.capture.masks import counted
-from bitymi_ns.capture.photos import PLAIN_SUFFIXES, check_names, eight_bits
+from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
@@ -23,6 +25,7 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
+T = TypeVar("T")
 DONE = "points"
 """File that is written when the model is whole."""
 
@@ -106,11 +109,12 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
     names, poses = {}, {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
         suffix = view.file.suffix.lower()
-        plain = f"{i:06d}{suffix if suffix in PLAIN_SUFFIXES else '.png'}"
-        if suffix in PLAIN_SUFFIXES:
+        converted = _read(view.file, partial(_converted, file=view.file))
+        plain = f"{i:06d}{suffix if converted is None else '.png'}"
+        if converted is None:
             (links / plain).symlink_to(view.file.resolve())
         else:
-            _read(view.file, lambda image: eight_bits(image).convert("RGB")).save(links / plain)
+            converted.save(links / plain)
         groups[view.camera].append(plain)
         names[plain] = name
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
@@ -131,7 +135,12 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
     )
 
 
-def _read(path: Path, what: Callable[[Image.Image], Image.Image]) -> Image.Image:
+def _converted(image: Image.Image, file: Path) -> Image.Image | None:
+    """What COLMAP reads instead of a photograph; None = the file itself."""
+    return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
+
+
+def _read(path: Path, what: Callable[[Image.Image], T]) -> T:
     """What is made of a picture."""
     try:
         with open_picture(path) as image:

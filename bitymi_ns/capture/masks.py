@@ -67,7 +67,9 @@ def mask_of(masks: Path, name: str) -> Path | None:
     """The mask of a photograph: NAME.png after the whole name, as COLMAP has it, or the same name with any suffix of an
     image, as nerfstudio has it. That of an upright copy is that of the photograph."""
     stem = str(PurePosixPath(name).with_suffix(""))
-    candidates = [f"{name}.png", *(stem + suffix for suffix in (".png", *PHOTOGRAPHS))]
+    endings = (".png", *PHOTOGRAPHS)
+    candidates = [f"{name}.png", *(stem + ending for ending in endings), f"{name}.PNG"]
+    candidates += [stem + ending.upper() for ending in endings]
     found = next((masks / c for c in candidates if (masks / c).is_file()), None)
     is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
     return mask_of(masks, stem) if is_copy else found

@@ -7,10 +7,12 @@ import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
 from bitymi_ns.capture.panorama import says_so, shows_so
@@ -19,8 +21,10 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import is_text
 
-PLAIN_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
-"""What COLMAP and nerfstudio read as it is."""
+PLAIN = {
+    "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),
+}  # fmt: skip
+"""What COLMAP and nerfstudio read as it is, by the file's content, if it has the ending of that."""
 COPY = ".jpg"
 """What the name of an upright copy has at its end, after that of the photograph."""
 THUMB = 256
@@ -131,7 +135,7 @@ def read_photo(folder: Path, name: str) -> Photo:
             exif = read_exif(image)
             orientation = image.getexif().get(0x0112, 1)
             width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
-            mode = image.mode
+            mode, plain = image.mode, is_plain(image, path)
             if image.format == "JPEG":
                 image.draft("L", (SHARPNESS_SIZE, SHARPNESS_SIZE))  # decodes at a half, a quarter or an eighth
             grey = ImageOps.exif_transpose(eight_bits(image).convert("L"))
@@ -146,8 +150,7 @@ def read_photo(folder: Path, name: str) -> Photo:
         raise CaptureError(f"it cannot be read ({_first_line(error)}): the file is damaged or not an image") from error
     if min(width, height) < 32:
         raise CaptureError(f"it is only {width} x {height} pixels")
-    suffix = path.suffix.lower()
-    plain = orientation in (0, 1) and suffix in PLAIN_SUFFIXES and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
+    plain = orientation in (0, 1) and plain and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
     thumb = np.asarray(_reduced(grey, THUMB), np.float32)
     detail = np.asarray(_reduced(grey, SHARPNESS_SIZE), np.float32)
     panorama = says_so(path) or shows_so(thumb)
@@ -181,6 +184,38 @@ def eight_bits(image: Image.Image) -> Image.Image:
     return grey
 
 
+def is_plain(image: Image.Image, path: Path) -> bool:
+    """Whether the opened file is in a format that everything reads, and named so."""
+    return path.suffix.lower() in PLAIN.get(image.format or "", ())
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """The image in the colours of screens, where it has a profile of other ones, as photographs of phones (Display P3)
+    and of cameras (Adobe RGB) do: their numbers, taken as they are, are pale."""
+    profile = image.info.get("icc_profile")
+    convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
+    if convert is None:
+        return image
+    converted = convert.apply(image.convert("RGB"))
+    if image.mode == "RGBA":
+        converted.putalpha(image.getchannel("A"))
+    return converted
+
+
+@lru_cache(maxsize=8)
+def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
+    """From the colours of a profile; None where that changes next to nothing, or it is no profile of such colours."""
+    try:
+        source = ImageCms.ImageCmsProfile(BytesIO(profile))
+        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError):
+        return None
+    levels = np.array([0, 64, 128, 192, 255], np.uint8)
+    probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(5, 25, 3)
+    changed = np.asarray(convert.apply(Image.fromarray(probe)), int)
+    return convert if np.abs(changed - probe).max() > 4 else None
+
+
 def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
@@ -207,4 +242,4 @@ def sharpness(grey: np.ndarray) -> float:
 def upright(photo: Photo) -> Image.Image:
     """The photograph as an upright RGB image of 8 bits."""
     with open_picture(photo.path) as image:
-        return ImageOps.exif_transpose(eight_bits(image)).convert("RGB")
+        return in_srgb(ImageOps.exif_transpose(eight_bits(image))).convert("RGB")

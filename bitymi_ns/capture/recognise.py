@@ -14,6 +14,8 @@ from typing import Any, Literal, get_args
 import pillow_heif
 from PIL import Image
 
+from bitymi_ns.capture import unread
+from bitymi_ns.files import encoding_of
 from bitymi_ns.trust import json_of
 
 Format = Literal[
@@ -22,7 +24,7 @@ Format = Literal[
 
 pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
 
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
 FORMATS_OF_PICTURES = (
     "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
 )  # fmt: skip
@@ -31,20 +33,12 @@ one, EPS, is a program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a COLMAP model usually lies in a capture, the most usual place first."""
-BESIDES = {
-    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
-    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
-    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
-    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
-    "stereo": "a model", "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
-}  # fmt: skip
-"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
-BESIDE = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
-"""The same for files, without their endings, that lie beside folders of photographs."""
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries that a transforms.json has from nerfstudio alone."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 """Folders of Polycam's pictures and of the cameras that belong to them, the better ones first."""
+SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+"""Files of a Blender data set."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 
@@ -68,12 +62,14 @@ class Found:
             the folder of the model; photographs: the folder; video: the file.
         folder: of the capture, to which the names in its files are relative.
         others: what is there besides and is not read, with its format.
+        unread: files of poses that cannot be read, with the program that wrote each.
     """
 
     format: Format
     path: Path
     folder: Path
     others: tuple[tuple[Format, Path], ...] = ()
+    unread: tuple[tuple[Path, str], ...] = ()
 
     def how_to_choose(self) -> str:
         """A sentence on what is not read and how to have it read; empty where there is nothing else."""
@@ -84,7 +80,7 @@ class Found:
             option = f"--format {format}"
             if format == "colmap" and self.format == "colmap":
                 option = f"--colmap-path {path.relative_to(self.folder)}"
-            elif format == "video":
+            elif format == "video" or (path.suffix == ".json" and path.name != "transforms.json"):
                 option = f"--data {path}"
             ways.append(f"{_seen_from(path, self.folder)} (`bitymi-data {option}`)")
         more = f" and {len(ways) - 3} more" if len(ways) > 3 else ""
@@ -111,6 +107,10 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
     fitting = [each for each in candidates if format in ("auto", each[0])]
+    if data.is_dir() and all(found in ("photographs", "video") for found, _ in fitting):
+        within = _capture_within(data, format)
+        if within is not None:
+            return recognise(within, format)
     if format == "instant-ngp" and not fitting:  # the user knows better than the entries of the file
         fitting = [("instant-ngp", path) for found, path in candidates if found == "nerfstudio"]
     elif format == "nerfstudio" and not fitting:
@@ -119,7 +119,21 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         raise NotRecognised(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
     others = tuple(each for each in candidates if each[1] != path and _is_another(chosen, each[0]))
-    return Found(chosen, path, path if chosen == "blender" else folder, others)
+    poses = tuple(unread.poses_in(folder)) if chosen in ("photographs", "video") else ()
+    return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
+
+
+def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
+    """The one folder of this one that is a capture with poses, as an archive leaves it that was unpacked into a folder
+    of its own; None = there is none or are several, or photographs beside it."""
+    if _has_photographs(folder):
+        return None
+    found = []
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and _may_hold_photographs(path.name)):
+        candidates = [*_transforms_in(path), *_scanned(path)]
+        if any(format in ("auto", each) for each, _ in candidates):
+            found.append(path)
+    return found[0] if len(found) == 1 else None
 
 
 def _is_another(chosen: Format, other: Format) -> bool:
@@ -129,7 +143,7 @@ def _is_another(chosen: Format, other: Format) -> bool:
 
 def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
     suffix = file.suffix.lower()
-    if file.name.startswith("transforms_") and suffix == ".json":
+    if file.name in SPLITS:
         yield "blender", file.parent
     elif suffix == ".json":
         yield _kind_of(file), file
@@ -141,10 +155,7 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
 
 def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Everything there is, in the order in which it is preferred."""
-    if (folder / "transforms.json").is_file():
-        yield _kind_of(folder / "transforms.json"), folder / "transforms.json"
-    if (folder / "transforms_train.json").is_file():
-        yield "blender", folder
+    yield from _transforms_in(folder)
     for model in models_in(folder):
         yield "colmap", folder / model
     yield from _scanned(folder)
@@ -153,6 +164,19 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
         yield "photographs", photographs
     for video in sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()):
         yield "video", video
+
+
+def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
+    """transforms.json and its relatives; where there is neither, files of other names with the same content."""
+    usual = folder / "transforms.json"
+    if usual.is_file():
+        yield _kind_of(usual), usual
+    if (folder / SPLITS[0]).is_file():
+        yield "blender", folder
+    elif not usual.is_file():
+        for path in sorted(folder.glob("*.json")):
+            if path.name not in SPLITS and b'"transform_matrix"' in path.read_bytes():
+                yield _kind_of(path), path
 
 
 def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -221,7 +245,7 @@ def image_count(model: Path) -> int:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as file:
                 return int(struct.unpack("<Q", file.read(8))[0])
-        with open(model / "images.txt", encoding="utf8", errors="replace") as text:
+        with open(model / "images.txt", encoding=encoding_of(model / "images.txt"), errors="replace") as text:
             return sum(1 for line in text if line.strip() and not line.startswith("#")) // 2
     except (OSError, struct.error):
         return 0
@@ -250,7 +274,7 @@ def _folders_in(folder: Path) -> list[Path]:
 
 
 def _may_hold_photographs(name: str) -> bool:
-    return not name.startswith(".") and name.lower() not in BESIDES
+    return not name.startswith(".") and name.lower() not in unread.FOLDERS
 
 
 def _has_photographs(folder: Path, below: bool = False) -> bool:
@@ -282,7 +306,7 @@ def passed_over(folder: Path) -> list[str]:
     found = []
     for place, below, names in os.walk(folder):
         for name in sorted(below):
-            what = BESIDES.get(name.lower()) or _copies(name, below)
+            what = unread.FOLDERS.get(name.lower()) or _copies(name, below)
             if what and _pictures(Path(place, name)):
                 found.append(f"{Path(place, name).relative_to(folder)} ({_pictures(Path(place, name))} {what})")
         below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
@@ -290,6 +314,9 @@ def passed_over(folder: Path) -> list[str]:
             path = Path(place, name)
             if is_picture(path) and not is_photograph(path):
                 found.append(f"{path.relative_to(folder)} ({_beside(path)})")
+        read = [name for name in names if is_picture(Path(place, name))]
+        for ending, count in unread.pictures_among(names, read).items():
+            found.append(f"{count} {ending} of {place} ({unread.PICTURES[ending]}, which is not read)")
     return found
 
 
@@ -308,7 +335,7 @@ def is_photograph(path: Path) -> bool:
 def _beside(path: Path) -> str:
     """What a picture beside photographs is, by its name; empty = a photograph."""
     stem = path.stem.lower()
-    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else BESIDE.get(stem, "")
+    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else unread.FILES.get(stem, "")
 
 
 def is_picture(path: Path) -> bool:
@@ -334,6 +361,8 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         there = f" It holds {_listed(data, candidates)}: leave --format out." if candidates else ""
         return f"{data} holds nothing of the format {format}.{there}"
     if not data.is_dir():
+        if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
+            return f"{data} is an archive. Unpack it, and give the folder."
         if data.suffix.lower() in PHOTOGRAPHS:
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
         return (
@@ -347,6 +376,10 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
+    counts = unread.pictures_among([path.name for path in data.rglob("*")], [])
+    if counts and not several:
+        most = max(counts, key=counts.__getitem__)
+        hint = f" It holds {counts[most]} files {most} ({unread.PICTURES[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."

@@ -72,9 +72,12 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     numbers = {seen[i] for i in chosen}
     with complete_folder(target) as folder:
         written = 0
+        shape = _shape_of_pixels(video)
         for number, frame, turn in _frames(video):
             if number in numbers:
-                _upright(frame, turn).save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
+                _upright(frame, turn, shape).save(
+                    folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0
+                )
                 written += 1
                 progress("writing frames", written, len(numbers))
                 if written == len(numbers):
@@ -155,7 +158,7 @@ def _pace(video: Path) -> tuple[float, float, int]:
     """Seconds from one frame that is looked at to the next one at least, the mean rate in frames per second, and how
     many frames there are, roughly."""
     with _opened(video) as container:
-        stream = container.streams.video[0]
+        stream = _pictures(container)
         rate = float(stream.average_rate or 30)
         length = float(container.duration or 0) / 1e6
         total = max(1, stream.frames or round(rate * length))
@@ -176,10 +179,15 @@ def _opened(video: Path) -> av.container.InputContainer:
     return container
 
 
+def _pictures(container: av.container.InputContainer) -> av.VideoStream:
+    """The film among the streams of a file: a cover stands before it in some, as a stream of one picture."""
+    return container.streams.best("video") or container.streams.video[0]
+
+
 def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
     """Number, frame, and the degrees by which it is turned to be seen; a broken end is passed over."""
     with _opened(video) as container:
-        stream = container.streams.video[0]
+        stream = _pictures(container)
         stream.thread_type = "AUTO"
         number = 0
         try:
@@ -198,7 +206,17 @@ def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:
     return max(16, round(frame.width * scale)), max(16, round(frame.height * scale))
 
 
-def _upright(frame: av.VideoFrame, turn: int) -> Image.Image:
-    """The frame as it is seen: `turn` is counter-clockwise, as ffmpeg's display matrix has it."""
+def _shape_of_pixels(video: Path) -> float:
+    """Width of a pixel over its height, by which films of camcorders and of anamorphic lenses are stretched."""
+    with _opened(video) as container:
+        shape = float(_pictures(container).sample_aspect_ratio or 1.0)
+    return shape if 0.25 < shape < 4.0 else 1.0
+
+
+def _upright(frame: av.VideoFrame, turn: int, shape: float = 1.0) -> Image.Image:
+    """The frame as it is seen: `turn` is counter-clockwise, as ffmpeg's display matrix has it; `shape` is the width of
+    its pixels over their height."""
     image = ordinary(frame) if is_hdr(frame) else frame.to_image()
+    if shape != 1.0:  # cameras of COLMAP with one focal length have square pixels
+        image = image.resize((round(image.width * shape), image.height), Image.Resampling.LANCZOS)
     return image.rotate(turn, expand=True) if turn % 360 else image

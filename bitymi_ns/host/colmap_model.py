@@ -8,6 +8,7 @@ and entry; camera models and their geometry are pycolmap's (`host/lens.py`).
 from __future__ import annotations
 
 import functools
+import math
 import os
 import struct
 from collections.abc import Iterator
@@ -18,10 +19,14 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from bitymi_ns.capture.recognise import image_count
+from bitymi_ns.files import encoding_of
 from bitymi_ns.host.colmap import check_cameras, check_images, parameter_count, reading
 from bitymi_ns.host.errors import fail, warn
-from bitymi_ns.host.ply import read_points
+from bitymi_ns.host.ply import as_bytes, read_points
 from bitymi_ns.host.point_cloud import what_is_wrong_with
+
+FORMS = (".txt", ".bin")
 
 
 class ModelCamera(NamedTuple):
@@ -49,24 +54,27 @@ class Model(NamedTuple):
         cameras: by number.
         images: in the order of their names.
         xyz: [N, 3] float64, the points.
-        rgb: [N, 3] uint8, their colours.
+        rgb: [N, 3] uint8, their colours; [0, 3] where they have none.
+        without_colours: why they have none, in words that follow the name of the file; empty where they have.
     """
 
     cameras: dict[int, ModelCamera]
     images: list[ModelImage]
     xyz: npt.NDArray[np.float64]
     rgb: npt.NDArray[np.uint8]
+    without_colours: str = ""
 
 
 def read_model(folder: Path) -> Model:
-    """Read the model in this folder, binary or text; the text where there are both, as nerfstudio does.
+    """Read the model in this folder, binary or text; the text where both are there, as nerfstudio does.
 
-    A model is read once, also where several commands of a run ask for it.
+    Where they differ, that is said. A model is read once, also where several commands of a run ask for it.
 
     Raises:
         InputError: what is wrong with it, by file and entry.
     """
-    files = [*(_file(folder, name) for name in ("cameras", "images", "points3D")), folder / "points3D.ply"]
+    names = [f"{name}{form}" for name in ("cameras", "images", "points3D") for form in FORMS]
+    files = [*(folder / name for name in names), folder / "points3D.ply"]
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
     return _read_model(folder, stamps)
 
@@ -88,30 +96,56 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
                 f"{path}: images {first[image.name]} and {number} are both of {image.name}. Correct the name of one of "
                 "them or remove it."
             )
+    _tell_other_form(folder, cameras, len(images))
     path = _file(folder, "points3D")
-    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    xyz, rgb, without_colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
     if path.is_file():
         with reading(path):
-            xyz, rgb = _points_text(path) if path.suffix == ".txt" else _points_binary(path)
+            xyz, rgb, without_colours = _points_text(path) if path.suffix == ".txt" else (*_points_binary(path), "")
             kept = np.isfinite(xyz).all(1)
         if not kept.all():
             warn(
                 f"{path}: {np.sum(~kept):,} of {len(xyz):,} points, the first is point {np.argmin(kept) + 1}, are not "
                 "finite. They are left out."
             )
-            xyz, rgb = xyz[kept], rgb[kept]
+            xyz, rgb = xyz[kept], rgb[kept] if len(rgb) else rgb
     elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
         wrong = what_is_wrong_with(cloud)
         if wrong is not None:
             fail(f"the point cloud {cloud} {wrong}. Copy it again, or move it away to have points triangulated.")
-        xyz, rgb = read_points(cloud)[0]
+        (xyz, rgb), without_colours = read_points(cloud)
     # nerfstudio sorts paths, not text: so the same photographs are held out
-    return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb)
+    return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colours)
 
 
 def _file(folder: Path, name: str) -> Path:
-    text = folder / f"{name}.txt"
-    return text if text.is_file() else folder / f"{name}.bin"
+    """A file of a model. All are of one form where one is whole: a single file of the other form is of another time."""
+
+    def is_whole(form: str) -> bool:
+        return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))
+
+    preferred = sorted(FORMS, key=is_whole, reverse=True)  # the text first, of two that are whole or are not
+    return next((file for form in preferred if (file := folder / f"{name}{form}").is_file()), folder / f"{name}.bin")
+
+
+def _tell_other_form(folder: Path, cameras: dict[int, ModelCamera], images: int) -> None:
+    """Say what a binary model that is not read, because there is one in text, has that this has not."""
+    if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
+        return
+    differing = []
+    count = image_count(folder)  # of the binary one, where that is there
+    if count != images:
+        differing.append(f"{images} images in text and {count} in binary form")
+    path = folder / "cameras.bin"
+    if path.is_file():
+        with reading(path):
+            if dict(_cameras_binary(path)) != cameras:
+                differing.append("other cameras in text than in binary form")
+    if differing:
+        warn(
+            f"{folder} holds two models: {' and '.join(differing)}. The text is read. To have the binary one read, "
+            "move cameras.txt, images.txt and points3D.txt away."
+        )
 
 
 class _Binary:
@@ -172,7 +206,7 @@ def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.
 
 
 def _lines(path: Path) -> Iterator[str]:
-    with open(path, encoding="utf8", errors="surrogateescape") as file:
+    with open(path, encoding=encoding_of(path), errors="surrogateescape") as file:
         for line in file:
             if not line.startswith("#"):
                 yield line.strip()
@@ -187,19 +221,37 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, ModelCamera]]:
 
 
 def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    lines = _lines(path)
-    for line in lines:
-        if not line:
-            continue
-        number, *pose, camera, name = line.split(maxsplit=9)
-        numbers = np.array(list(map(float, pose)))
-        yield int(number), ModelImage(name, int(camera), numbers[:4], numbers[4:])
-        observations = next(lines, "").split()
-        if len(observations) % 3:
-            raise ValueError(f"the 2D points of image {number} are no triples")
+    """The images; those of programs that leave the second line of an image out, too."""
+    number = None
+    for line in _lines(path):
+        if number is not None and _are_observations(line):
+            number = None
+        elif line:
+            words = line.split(maxsplit=9)
+            if number is not None and len(words) < 10:
+                raise ValueError(f"the 2D points of image {number} are no triples")
+            number, *pose, camera, name = words
+            numbers = np.array(list(map(float, pose)))
+            yield int(number), ModelImage(name, int(camera), numbers[:4], numbers[4:])
 
 
-def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+def _are_observations(line: str) -> bool:
+    """Whether it is the second line of an image: triples of numbers, or nothing."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
+
+
+def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], str]:
+    """Positions, colours, and why there are none."""
     rows = [[float(word) for word in line.split(maxsplit=7)[1:7]] for line in _lines(path) if line]
-    values = np.array(rows).reshape(-1, 6)
-    return values[:, :3], values[:, 3:].astype(np.uint8)
+    counts = {len(row) for row in rows}
+    if not counts <= {3, 6} or len(counts) > 1:
+        raise ValueError("a point has a number, three coordinates and three colours")
+    values = np.array(rows).reshape(len(rows), -1)
+    if values.shape[1] < 6:
+        return values[:, :3].reshape(-1, 3), np.zeros((0, 3), np.uint8), "its points have none" * bool(rows)
+    rgb = as_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))
+    return (values[:, :3], np.zeros((0, 3), np.uint8), rgb) if isinstance(rgb, str) else (values[:, :3], rgb, "")

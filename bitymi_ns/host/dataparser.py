@@ -19,7 +19,8 @@ from nerfstudio.utils.colors import get_color
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.host import finding, holdout, kept_poses
+from bitymi_ns.files import encoding_of
+from bitymi_ns.host import conventions, finding, holdout, kept_poses
 from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.colmap_views import (
     TO_NERFSTUDIO,
@@ -32,14 +33,12 @@ from bitymi_ns.host.colmap_views import (
 from bitymi_ns.host.dataset import views_of
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.kept_poses import KeptPoses
-from bitymi_ns.host.ply import Points, read_points
-from bitymi_ns.host.point_colours import coloured
+from bitymi_ns.host.point_colours import points_of_file, with_colours
 from bitymi_ns.host.scanner_views import scanned
 from bitymi_ns.host.starting_points import Choice, are_wanted, starting_points
 from bitymi_ns.host.transforms import Lists, colmap_points
 from bitymi_ns.host.transforms_views import Transforms, missing_photographs, read_transforms
-from bitymi_ns.host.views import Photograph, Place, Views, views_of_capture
-from bitymi_ns.ply import PlyError
+from bitymi_ns.host.views import Photograph, Place, Views, in_proportion, views_of_capture
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model, which is found for those that come without."""
@@ -194,6 +193,12 @@ class BitymiDataParser(DataParser):
     def splits(self) -> dict[str, DataparserOutputs]:
         """Training and held-out views (val, test), read once."""
         found = self.config.find()
+        if found.unread:
+            named = listed([f"{path.name} ({program})" for path, program in found.unread])
+            warn(
+                f"{found.folder} holds poses that cannot be read: {named}. Poses are found anew from the photographs. "
+                "To have those used, export a COLMAP model, or convert them with `ns-process-data`."
+            )
         if found.format == "blender":
             return self._blender(found)
         self.poses_report = None if read_frame(found.folder) is None else found.folder
@@ -225,6 +230,7 @@ class BitymiDataParser(DataParser):
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * float(meta.get("aabb_scale", 1))
             place = Place(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
+            place = in_proportion(place, read.photographs, str(read.path))
         elif "orientation_override" in meta:
             place = replace(place, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {place.orientation_method}.")
@@ -234,11 +240,14 @@ class BitymiDataParser(DataParser):
         own = None
         if config.points == "auto":
             if meta.get("ply_file_path"):
-                own = _points_of_file(found.folder / meta["ply_file_path"], read.photographs)
+                own = points_of_file(found.folder / meta["ply_file_path"], read.photographs)
             elif model is not None:
                 own = points_of(read_model(model), np.eye(4) if before is None else before)
+                own = with_colours(own, read_model(model).without_colours, read.photographs, model)
                 what += f", points of {model}"
         self._tell(found, what)
+        if own is not None and look and are_wanted():
+            conventions.check_conventions(own, read.photographs, conventions.JSON, str(found.path))
         points = starting_points(own, config.points, read.photographs, found.folder, str(found.path))
         outputs = views_of_capture(
             read.photographs,
@@ -264,6 +273,9 @@ class BitymiDataParser(DataParser):
             tell_left_out(source, model)
         photographs = photographs_of(source, look)
         own = points_of(model, TO_NERFSTUDIO)
+        if look and are_wanted() and config.points == "auto":
+            own = with_colours(own, model.without_colours, photographs, source.folder)
+            conventions.check_conventions(own, photographs, conventions.COLMAP, str(source.folder), TO_NERFSTUDIO)
         points = starting_points(own, config.points, photographs, found.folder, str(source.folder))
         outputs = views_of_capture(
             photographs, config.place(), points, str(source.folder), source.reduction, look, before=TO_NERFSTUDIO
@@ -296,11 +308,14 @@ class BitymiDataParser(DataParser):
                 parts[name] = _present(part) if look else part.photographs
         there = [name for name in ("val", "test") if parts.get(name)]
         self._tell(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
-        own = None if config.ply_path is None else _points_of_file(found.path / config.ply_path, train.photographs)
+        own = None if config.ply_path is None else points_of_file(found.path / config.ply_path, train.photographs)
         points = starting_points(own, config.points, train.photographs, found.folder, str(train.path))
+        place = Place(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
+        if config.scale_factor == 1.0:  # else somebody has decided
+            place = in_proportion(place, train.photographs, str(train.path))
         outputs = views_of_capture(
             [each for part in parts.values() for each in part],
-            Place(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE),
+            place,
             points,
             str(train.path),
             config.downscale_factor or 1,
@@ -331,11 +346,9 @@ class BitymiDataParser(DataParser):
         if not lists:
             return holdout.by_mode(names, config.eval_mode, config.eval_interval, config.train_split_fraction)
         where = "the capture's own lists"
-        full = set(names)
 
         def numbers(split: str) -> list[int]:  # reduced photographs lie in another folder than the lists say
-            wanted = [name if found.folder / name in full else Path(name).name for name in lists.get(split, [])]
-            return sorted(set(holdout.find(names, wanted, where)))
+            return sorted(set(holdout.find(names, lists.get(split, []), where, anywhere=True)))
 
         held_out = sorted({*numbers("val"), *numbers("test")})
         rest = [i for i in range(len(names)) if i not in set(held_out)]
@@ -348,18 +361,6 @@ def _applied(meta: dict[str, Any], folder: Path) -> np.ndarray | None:
     if rows is None and (folder / "colmap/sparse/0").is_dir():
         rows = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # what its tool applied before it stated that
     return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
-
-
-def _points_of_file(path: Path, photographs: Sequence[Photograph]) -> Points:
-    """The points of a PLY file; those without colours get them of the photographs, where a scene starts from them."""
-    try:
-        points, without_colours = read_points(path)
-    except PlyError as error:
-        fail(f"the point cloud {path} cannot be read: {error}. Write its points without lists.", error)
-    if not without_colours or not len(points.xyz) or not are_wanted():
-        return points
-    say(f"The points of {path} get the colours of the photographs that see them: {without_colours}.")
-    return coloured(points, photographs)
 
 
 def _present(part: Transforms) -> list[Photograph]:
@@ -378,5 +379,5 @@ def _lists_in(folder: Path) -> Lists:
     for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
         path = folder / f"{name}_list.txt"
         if path.is_file():
-            lists[split] = [line.strip() for line in path.read_text("utf8").splitlines() if line.strip()]
+            lists[split] = [line.strip() for line in path.read_text(encoding_of(path)).splitlines() if line.strip()]
     return lists

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePath
 from typing import Literal, NamedTuple
 
 import numpy as np
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filename, get_train_eval_split_fraction
 
+from bitymi_ns.files import encoding_of
 from bitymi_ns.host.errors import fail, listed
+from bitymi_ns.host.names import folded, without_ending
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 
@@ -73,15 +76,37 @@ def by_names(names: Sequence[Path], wanted: Sequence[str], where: str) -> Split:
     return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {where}")
 
 
-def find(names: Sequence[Path], wanted: Sequence[str], where: str) -> list[int]:
-    """The numbers of the photographs of these names; see `by_names`."""
-    numbers: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        numbers.setdefault(name.name, []).append(i)
+def find(names: Sequence[Path], wanted: Sequence[str], where: str, anywhere: bool = False) -> list[int]:
+    """The numbers of the photographs of these names, which may differ in case, the form of Unicode, or their ending.
+
+    Args:
+        names, wanted, where: see `by_names`.
+        anywhere: wanted names may have leading folders that the photographs do not lie in.
+    """
+    forms: list[Callable[[str], tuple[str, ...]]] = [
+        lambda name: PurePath(name.replace("\\", "/")).parts,
+        folded,
+        lambda name: without_ending(folded(name) or ("",)),
+    ]
+    whole = [[form(str(name)) for name in names] for form in forms]
+    numbers: list[dict[str, list[int]]] = [defaultdict(list) for _ in forms]
+    for table, keys in zip(numbers, whole, strict=True):
+        for i, key in enumerate(keys):
+            table[key[-1]].append(i)
+
+    def fitting_names(name: str) -> list[int]:
+        for form, table, keys in zip(forms, numbers, whole, strict=True):
+            parts = form(name)
+            for start in range(len(parts) if anywhere else min(1, len(parts))):
+                tail = parts[start:]
+                fitting = [i for i in table.get(tail[-1], []) if keys[i][-len(tail) :] == tail]
+                if fitting:
+                    return fitting
+        return []
+
     unknown, found = [], []
     for name in wanted:
-        parts = PurePath(name.replace("\\", "/")).parts
-        fitting = [i for i in numbers.get(parts[-1] if parts else "", []) if names[i].parts[-len(parts) :] == parts]
+        fitting = fitting_names(name)
         if len(fitting) > 1:
             fail(
                 f"{where}: {name} is the name of {len(fitting)} photographs, {listed([names[i] for i in fitting])}. "
@@ -103,7 +128,7 @@ def read_names(given: Sequence[str]) -> tuple[str, ...]:
         return tuple(given)
     path = Path(os.path.expanduser(given[0]))
     try:
-        lines = path.read_text("utf8").splitlines()
+        lines = path.read_text(encoding_of(path)).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         fail(f"--eval-names: {path} cannot be read: {error}. Give names, or a text file with one per line.", error)
     names = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
 from bitymi_ns.capture.masks import counted, has_transparency
-from bitymi_ns.capture.photos import eight_bits
+from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.host.errors import fail, listed, warn
 
@@ -73,7 +73,8 @@ def _is_too_large(path: Path) -> bool:
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
     """The photograph with 8 bits per channel, RGB or, where it has transparency, RGBA.
 
-    PIL's own conversion clips what has more bits: a grey picture of 16 bits would come out white.
+    PIL's own conversion clips what has more bits: a grey picture of 16 bits would come out white. Colours are those of
+    screens; see `in_srgb`.
 
     Args:
         path: of the file.
@@ -90,7 +91,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
                 fail(wrong_size(path, file.size, stored))
             if wanted is not None:
                 file.draft(None, wanted)
-            return eight_bits(file).convert("RGBA" if has_transparency(file) else "RGB")
+            picture = in_srgb(eight_bits(file))
+            return picture.convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

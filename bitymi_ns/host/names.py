@@ -27,7 +27,8 @@ def folded(name: str) -> Parts:
     return tuple(part for part in plain.split("/") if part not in ("", "."))
 
 
-def _without_ending(parts: Parts) -> Parts:
+def without_ending(parts: Parts) -> Parts:
+    """A folded name without the ending of a picture."""
     stem, ending = os.path.splitext(parts[-1])
     return (*parts[:-1], stem if ending in PHOTOGRAPHS else parts[-1])
 
@@ -41,11 +42,13 @@ class Files:
     Args:
         folder: to which the names are relative.
         outside: names may lead out of the folder; else only files in it are found.
+        endings: of the files, in lower case.
     """
 
-    def __init__(self, folder: Path, outside: bool = False) -> None:
+    def __init__(self, folder: Path, outside: bool = False, endings: tuple[str, ...] = PHOTOGRAPHS) -> None:
         self.folder = folder
         self.outside = outside
+        self.endings = endings
 
     def find(self, name: str) -> Path | None:
         """The file of a name; None = there is none, or more than one."""
@@ -55,7 +58,7 @@ class Files:
         parts = folded(name)
         if not parts:
             return None
-        other = (parts, _without_ending(parts))  # one more than it has, or another one
+        other = (parts, without_ending(parts))  # one more than it has, or another one
         return self._like(parts) or next(filter(None, (self._like(each, endings=True) for each in other)), None)
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
@@ -87,7 +90,7 @@ class Files:
 
     def ambiguous(self, name: str) -> list[str]:
         """The files that a name without its ending may mean, where they are several."""
-        files = self._stems.get(_without_ending(folded(name)), [])
+        files = self._stems.get(without_ending(folded(name)), [])
         return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
 
     def nearest(self, name: str) -> str:
@@ -121,13 +124,13 @@ class Files:
     def _stems(self) -> dict[Parts, list[Path]]:
         table: dict[Parts, list[Path]] = defaultdict(list)
         for parts, files in self._whole.items():
-            table[_without_ending(parts)] += files
+            table[without_ending(parts)] += files
         return dict(table)
 
     def _walk(self) -> Iterator[Path]:
         for folder, below, files in os.walk(self.folder):
             below[:] = [name for name in below if not name.startswith(".")]
-            yield from (Path(folder, name) for name in files if name.lower().endswith(PHOTOGRAPHS))
+            yield from (Path(folder, name) for name in files if name.lower().endswith(self.endings))
 
 
 def renamed(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:

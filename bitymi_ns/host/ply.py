@@ -47,7 +47,7 @@ def read_points(path: Path) -> tuple[Points, str]:
     values = np.stack([rows[name] for name in names], -1)
     if values.dtype == np.uint8:
         return Points(xyz, values), ""
-    rgb = _as_bytes(values.astype(np.float64), values.dtype.kind == "f")
+    rgb = as_bytes(values.astype(np.float64), values.dtype.kind == "f")
     if isinstance(rgb, str):
         return Points(xyz, np.zeros((0, 3), np.uint8)), rgb
     return Points(xyz, rgb), ""
@@ -92,11 +92,11 @@ def colours(path: Path) -> npt.NDArray[np.uint8] | str | None:
     except PlyError:
         return None
     values = np.stack([rows[name] for name in _COLOURS], -1)
-    return _as_bytes(values.astype(np.float64), any(points.row[name].kind == "f" for name in _COLOURS))
+    return as_bytes(values.astype(np.float64), any(points.row[name].kind == "f" for name in _COLOURS))
 
 
-def _as_bytes(values: npt.NDArray[np.float64], floating: bool) -> npt.NDArray[np.uint8] | str:
-    """Colours as bytes, by which white they fit; or why they cannot be told."""
+def as_bytes(values: npt.NDArray[np.float64], floating: bool) -> npt.NDArray[np.uint8] | str:
+    """Colours as bytes, by which white they fit; or why they cannot be told. `floating`: they may lie in 0 to 1."""
     if not len(values):
         return np.zeros((0, 3), np.uint8)
     values[~np.isfinite(values)] = 0.0

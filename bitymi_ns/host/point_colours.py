@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from bitymi_ns.host.errors import fail, say
 from bitymi_ns.host.images import read_image
-from bitymi_ns.host.ply import Points
+from bitymi_ns.host.ply import Points, read_points
+from bitymi_ns.host.starting_points import are_wanted
 from bitymi_ns.host.views import Photograph
+from bitymi_ns.ply import PlyError
 from bitymi_ns.train.views import spread
 
 LOOKED_AT = 24
@@ -18,6 +22,32 @@ LOOKED_AT = 24
 AT_ONCE = 100_000
 """Points that are coloured together."""
 GREY = 128
+
+
+def points_of_file(path: Path, photographs: Sequence[Photograph]) -> Points:
+    """The points of a PLY file; those without colours get them of the photographs, where a scene starts from them."""
+    try:
+        points, without_colours = read_points(path)
+    except PlyError as error:
+        fail(f"the point cloud {path} cannot be read: {error}. Write its points without lists.", error)
+    return with_colours(points, without_colours, photographs, path)
+
+
+def with_colours(points: Points, without: str, photographs: Sequence[Photograph], where: Path) -> Points:
+    """The points, with the colours of the photographs where they have none and a scene starts from them.
+
+    Args:
+        points: in the frame of the photographs.
+        without: why they have none; empty where they have.
+        photographs: see `coloured`.
+        where: they are from, for the message.
+    """
+    if not without and not points.rgb.any():
+        without = "its own are all black"
+    if not without or not len(points.xyz) or not are_wanted():
+        return points
+    say(f"The points of {where} get the colours of the photographs that see them: {without}.")
+    return coloured(points, photographs)
 
 
 def coloured(points: Points, photographs: Sequence[Photograph]) -> Points:
@@ -28,13 +58,13 @@ def coloured(points: Points, photographs: Sequence[Photograph]) -> Points:
     rgb = np.full((len(points.xyz), 3), GREY, np.uint8)
     for start in range(0, len(rgb), AT_ONCE):
         xyz = points.xyz[start : start + AT_ONCE]
-        seen = np.stack([_sampled(xyz, *each) for each in zip(chosen, pictures, strict=True)])
+        seen = np.stack([sampled(xyz, *each) for each in zip(chosen, pictures, strict=True)])
         known = np.isfinite(seen[..., 0]).any(0)
         rgb[start : start + AT_ONCE][known] = np.nanmedian(seen[:, known], 0).astype(np.uint8)
     return Points(points.xyz, rgb)
 
 
-def _sampled(
+def sampled(
     xyz: npt.NDArray[np.float64], photograph: Photograph, picture: npt.NDArray[np.uint8]
 ) -> npt.NDArray[np.float32]:
     """[N, 3] colours of points in a picture; NaN where they are not in it."""

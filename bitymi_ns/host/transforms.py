@@ -23,7 +23,13 @@ from bitymi_ns.host.poses import rotations, warn_of_far_off
 from bitymi_ns.trust import json_of, leads_inside
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
+HOW_TO_MEND = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write the file anew."
 SIZES = ("w", "h")
+OPTIONAL = (
+    "mask_path", "depth_file_path", "ply_file_path", "applied_transform", "applied_scale", "orientation_override",
+    "distortion_params",
+)  # fmt: skip
+"""Entries that may be null, which is as if they were not there."""
 INTRINSICS = (*SIZES, "fl_x", "fl_y", "cx", "cy")
 LONGEST_SIDE = 1 << 20
 """Largest width or height of a picture that is believed, in pixels."""
@@ -78,7 +84,8 @@ def load(path: Path, own_format: bool, announce: bool = True, stock: bool = True
     except FileNotFoundError as error:
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
     except (ValueError, OSError) as error:
-        fail(f"{path} cannot be read: {error}. {HOW_TO_GET_ONE}", error)
+        fail(f"{path} cannot be read: {error}. {HOW_TO_MEND if path.is_file() else HOW_TO_GET_ONE}", error)
+    _drop_nulls(meta)
     if own_format:
         _check_frames(path, meta, least=2)
         _check_camera(path, meta, stock)
@@ -103,15 +110,29 @@ def load(path: Path, own_format: bool, announce: bool = True, stock: bool = True
     return meta
 
 
+def _drop_nulls(meta: Any) -> None:
+    """Remove entries that say nothing: programs write null, or an empty name, for what a frame does not have."""
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    holders = [meta, *frames] if isinstance(frames, list) else [meta]
+    for holder in (each for each in holders if isinstance(each, dict)):
+        for key, value in list(holder.items()):
+            if (value is None and key in OPTIONAL) or (value == "" and key in ("mask_path", "depth_file_path")):
+                del holder[key]
+
+
 def _check_frames(path: Path, meta: Any, least: int) -> None:
     frames = meta.get("frames") if isinstance(meta, dict) else None
+    if isinstance(frames, dict):
+        fail(f"{path}: frames is an object with names, not a list. Write its values as a list, in brackets.")
     if not isinstance(frames, list) or not frames:
         fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE}")
     if len(frames) < least:
         fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
     for i, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
-            fail(f"{path}: frame {i} has no file_path or no transform_matrix")
+        there = frame.keys() if isinstance(frame, dict) else ()
+        lacking = [key for key in ("file_path", "transform_matrix") if key not in there]
+        if lacking:
+            fail(f"{path}: frame {i} (counted from 0) has no {' and no '.join(lacking)}. Add that or remove the frame.")
         for key in ("file_path", "mask_path", "depth_file_path"):
             if key in frame:
                 frame[key] = _file_name(path, i, key, frame[key])
@@ -180,7 +201,7 @@ def colmap_points(path: Path) -> Path | None:
         meta = json_of(path.read_bytes())
     except (OSError, ValueError):
         return None  # what is wrong is said where it is read
-    return None if not isinstance(meta, dict) or "ply_file_path" in meta else model
+    return None if not isinstance(meta, dict) or meta.get("ply_file_path") is not None else model
 
 
 def take_lists(meta: dict[str, Any]) -> Lists:
@@ -281,6 +302,11 @@ def _check_transform(path: Path, meta: dict[str, Any]) -> None:
             fail(
                 f"{path}: applied_transform is not a matrix of 3 x 4 finite numbers. Correct it, or remove it: then "
                 "exports are in the frame of this file."
+            )
+        if abs(np.linalg.det(transform[:3, :3])) < 1e-12:
+            fail(
+                f"{path}: applied_transform maps the capture to a plane, a line or a point, which cannot be undone. "
+                "Correct it, or remove it: then exports are in the frame of this file."
             )
         meta["applied_transform"] = transform[:3].tolist()
     if "applied_scale" in meta:

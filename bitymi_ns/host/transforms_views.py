@@ -92,7 +92,11 @@ def read_transforms(
         other = renamed(names, files, path.parent)
         if other:
             say(f"{path}: {other}")
-    masks = [path.parent / frame["mask_path"] if "mask_path" in frame else None for frame in frames]
+    masks = _masks(path.parent, [frame.get("mask_path") for frame in frames], files, look)
+    cloud = meta.get("ply_file_path")
+    if isinstance(cloud, str) and cloud and not (path.parent / cloud).is_file():
+        there = Files(path.parent, endings=(".ply",)).find(cloud)
+        meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
     if announce and look:
         folder = os.path.normpath(path.parent)
         pictures = [Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None]
@@ -147,6 +151,16 @@ def _files(path: Path, names: Sequence[str], look: bool) -> list[Path]:
         if several:
             fail(f"{path}: frame {i} is of {name}, but there are {listed(several)}. Write the ending of the right one.")
     return [Path(os.path.normpath(file or folder / name)) for name, file in zip(names, found, strict=True)]
+
+
+def _masks(folder: Path, names: Sequence[str | None], photographs: Sequence[Path], look: bool) -> list[Path | None]:
+    """The masks of these names; those that are missing under the names that the file has for them. One may serve
+    several photographs."""
+    files = Files(folder, outside=True)
+    found = {name: files.find(name) if look else None for name in dict.fromkeys(names) if name is not None}
+    taken = set(photographs)
+    paths = {name: folder / name if path is None or path in taken else path for name, path in found.items()}
+    return [None if name is None else paths[name] for name in names]
 
 
 def missing_photographs(path: Path, photographs: Iterable[Photograph]) -> None:

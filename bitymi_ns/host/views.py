@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +23,9 @@ from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.ply import Points
 from bitymi_ns.host.poses import check_spread, is_far_off, oriented
 
+USUAL_RATIO, LARGEST_RATIO = 2.5, 25.0
+"""Distance of cameras from their middle, in half sides of the scene's box: of NeRF-Synthetic, and from which on a
+capture is in another unit."""
 ALONE = "without photographs"
 """Entry of the metadata of views whose photographs are gone."""
 
@@ -57,6 +60,29 @@ class Place:
     center_method: Literal["poses", "focus", "none"] = "poses"
     auto_scale_poses: bool = True
     scene_scale: float = 1.0
+
+
+def in_proportion(place: Place, photographs: Sequence[Photograph], where: str) -> Place:
+    """The place for a capture that is not scaled by its cameras, with a scale at which these do not lie far outside of
+    the box of the scene: in millimetres they would, and random points would all be in a spot of the pictures.
+
+    Args:
+        place: the usual one of the format.
+        photographs: of the capture.
+        where: their poses are from, for the message.
+    """
+    centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
+    spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    ratio = spread * place.scale_factor / place.scene_scale
+    if ratio <= LARGEST_RATIO:
+        return place
+    scale = place.scale_factor * USUAL_RATIO / ratio
+    say(
+        f"The cameras of {where} lie {spread:,.4g} units from their middle, where those of this format usually lie "
+        f"{USUAL_RATIO * place.scene_scale / place.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
+        "state that."
+    )
+    return replace(place, scale_factor=scale)
 
 
 class Views(DataparserOutputs):

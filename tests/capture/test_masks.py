@@ -64,6 +64,8 @@ def test_a_folder_of_smaller_masks_alone(tmp_path: Path) -> None:
     [
         ("a.png", "a.jpg"),
         ("a.jpg.png", "a.jpg"),
+        ("a.PNG", "a.jpg"),
+        ("a.jpg.PNG", "a.jpg"),
         ("a.jpg", "a.png"),
         ("b/a.png", "b/a.jpg"),
         ("a.png", "a.heic.jpg"),  # an upright copy

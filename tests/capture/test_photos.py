@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from bitymi_ns.capture.photos import find_photos, natural, photo_folder, read_photo, read_photos, upright
+from bitymi_ns.capture.photos import find_photos, in_srgb, natural, photo_folder, read_photo, read_photos, upright
 from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.types import CaptureError
+from tests.profiles import DISPLAY_P3, SRGB
 
 
 def silent(step: str, done: int, total: int) -> None: ...
@@ -111,3 +112,32 @@ def test_a_file_of_several_pictures_is_not_used_as_it_is(tmp_path: Path, picture
     first.save(tmp_path / "a.tif", save_all=True, append_images=[second])
     photo = read_photo(tmp_path, "a.tif")
     assert not photo.plain and np.array_equal(np.asarray(upright(photo)), pictures[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "format"), [("a.jpg", "HEIF"), ("a.jpg", "WEBP"), ("a.png", "JPEG2000"), ("a.jpeg", "PNG")]
+)
+def test_a_file_that_is_not_what_its_name_says_is_converted(tmp_path: Path, name: str, format: str) -> None:
+    Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(tmp_path / name, format)
+    assert not read_photo(tmp_path, name).plain
+
+
+def test_colours_of_another_profile_are_those_of_screens() -> None:
+    pixels = np.full((4, 4, 4), (200, 100, 80, 60), np.uint8)
+    for mode in ("RGB", "RGBA"):
+        image = Image.fromarray(pixels[..., : len(mode)])
+        image.info["icc_profile"] = DISPLAY_P3
+        result = np.asarray(in_srgb(image))
+        assert np.abs(result[0, 0, :3] - np.array([215, 92, 73])).max() <= 2  # by the matrices of both
+        assert (result[..., 3:] == 60).all() and result.shape[-1] == len(mode)
+        for same in (SRGB, b"no profile"):
+            image.info["icc_profile"] = same
+            assert in_srgb(image) is image
+    grey = Image.new("L", (4, 4))
+    grey.info["icc_profile"] = DISPLAY_P3
+    assert in_srgb(grey) is grey
+
+
+def test_upright_copies_have_the_colours_of_screens(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 64), (200, 100, 80)).save(tmp_path / "a.webp", lossless=True, icc_profile=DISPLAY_P3)
+    assert upright(read_photo(tmp_path, "a.webp")).getpixel((9, 9))[0] > 205

@@ -226,3 +226,71 @@ def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(tmp_path / name)
     assert passed_over(tmp_path) == ["depth (2 depth maps)", "thumbnail.jpg (a thumbnail)", "sub/Masks (1 masks)"]
+
+
+@pytest.mark.parametrize("wrapped", ["room", "room/room"])
+def test_a_capture_in_a_folder_of_its_own(tmp_path: Path, wrapped: str) -> None:
+    """As an archive leaves it that is unpacked into a new folder."""
+    folder = tmp_path / wrapped
+    photograph(folder / "images")
+    photograph(tmp_path / "__MACOSX/images", "._a.jpg")
+    path = transforms(folder, **PINHOLE)
+    found = recognise(tmp_path)
+    if wrapped == "room":
+        assert (found.format, found.path, found.folder) == ("nerfstudio", path, folder)
+        photograph(tmp_path)
+        assert recognise(tmp_path).format == "photographs"  # they are what is meant
+    else:
+        assert found.format == "photographs"  # one folder, not a disk, is searched
+
+
+def test_two_captures_with_poses_in_one_folder(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        photograph(tmp_path / name / "images")
+        transforms(tmp_path / name, **PINHOLE)
+    with pytest.raises(NotRecognised, match=f"It holds 2 captures: give one of them, as {tmp_path}/left"):
+        recognise(tmp_path)
+
+
+def test_poses_in_a_file_of_another_name(tmp_path: Path) -> None:
+    photograph(tmp_path / "images")
+    path = transforms(tmp_path, "transforms_undistorted.json", **PINHOLE)
+    (tmp_path / "notes.json").write_text("{}")
+    for data in (tmp_path, path):
+        found = recognise(data)
+        assert (found.format, found.path) == ("nerfstudio", path)
+    other = transforms(tmp_path, "views.json", **PINHOLE)
+    assert f"views.json (`bitymi-data --data {other}`)" in recognise(tmp_path).how_to_choose()
+    usual = transforms(tmp_path, **PINHOLE)
+    assert (recognise(tmp_path).path, recognise(tmp_path).others) == (usual, ())
+
+
+def test_poses_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    photograph(tmp_path / "images")
+    (tmp_path / "poses_bounds.npy").touch()
+    assert recognise(tmp_path).unread == ((tmp_path / "poses_bounds.npy", "LLFF"),)
+    transforms(tmp_path, **PINHOLE)
+    assert recognise(tmp_path).unread == ()
+
+
+def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    for name in ("a.CR2", "b.CR2", "c.jxl"):
+        photograph(tmp_path / "photos", name)
+    with pytest.raises(NotRecognised, match="holds 2 files .cr2 .raw data of a camera.: save them as JPEG or TIFF"):
+        recognise(tmp_path)
+    for name in ("a.JPG", "b.JPG"):
+        photograph(tmp_path / "photos", name)
+    assert passed_over(tmp_path) == [f"1 .jxl of {tmp_path}/photos (JPEG XL, which is not read)"]
+
+
+def test_outputs_and_thumbnails_are_no_photographs(tmp_path: Path) -> None:
+    photograph(tmp_path)
+    for folder in ("outputs/room/bitymi", "renders", "@eaDir/a.jpg"):
+        photograph(tmp_path / folder, "SYNOPHOTO_THUMB_XL.jpg")
+    assert find_photos(tmp_path) == ["a.jpg"]
+
+
+def test_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "room.zip").touch()
+    with pytest.raises(NotRecognised, match="room.zip is an archive. Unpack it"):
+        recognise(tmp_path / "room.zip")

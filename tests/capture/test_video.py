@@ -199,3 +199,32 @@ def test_a_video_of_a_scene_gives_poses(tmp_path: Path, pictures: list[np.ndarra
     assert poses.given >= 6 and poses.registered >= poses.given - 1
     assert poses.images.parent.parent == tmp_path / ".bitymi"
     assert all(path.name.startswith("frame_") for path in poses.images.iterdir())
+
+
+def test_a_cover_is_not_the_film(tmp_path: Path, wide: np.ndarray) -> None:
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 64, 64, "yuvj420p"
+        film = container.add_stream("mpeg4", rate=10)
+        film.width, film.height, film.pix_fmt = 320, 240, "yuv420p"
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), format="rgb24")))
+        for frame in pan(wide, [0] + [20] * 20):
+            container.mux(film.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
+        container.mux(film.encode())
+    folder = extract_frames(path, tmp_path, None, silent)
+    assert {Image.open(frame).size for frame in folder.iterdir()} == {(320, 240)}
+    assert len(numbers(folder)) > 3
+
+
+def test_pixels_that_are_not_square_are_stretched(tmp_path: Path, wide: np.ndarray) -> None:
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for frame in pan(wide, [0] + [20] * 10):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
+        container.mux(stream.encode())
+    folder = extract_frames(path, tmp_path, 3, silent)
+    assert {Image.open(frame).size for frame in folder.iterdir()} == {(427, 240)}

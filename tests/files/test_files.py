@@ -168,3 +168,12 @@ def test_a_read_only_and_a_full_disk(small_disk: Path) -> None:
     with pytest.raises(ValueError, match="the file system is read-only: give a place on another one"):
         with files.explained(small_disk / "b", ValueError):
             files.check_writable(small_disk / "b")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+def test_text_says_how_it_is_encoded(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text(("\ufeff" if encoding == "utf-16-le" else "") + "# \u00fc\n", encoding)
+    assert path.read_text(files.encoding_of(path)) == "# \u00fc\n"
+    path.write_bytes(b"")
+    assert path.read_text(files.encoding_of(path)) == ""

@@ -150,7 +150,7 @@ def test_no_frames(capture: Path, edit: Any) -> None:
 
 def test_a_frame_without_pose(capture: Path, edit: Any) -> None:
     edit(capture, lambda meta: meta["frames"][2].pop("transform_matrix"))
-    with expect("frame 2 has no file_path or no transform_matrix"):
+    with expect("frame 2 .counted from 0. has no transform_matrix. Add that or remove the frame"):
         load(capture)
 
 

@@ -399,3 +399,16 @@ def test_what_needs_no_photographs_opens_none(capture: Path) -> None:
     config = methods._specification("bitymi").config.pipeline.datamanager
     config.data = capture
     assert len(config.setup(device="cpu", test_mode="inference").train_dataset) == 10
+
+
+@pytest.mark.parametrize("change", [str.upper, lambda name: Path(name).stem, lambda name: f"C:\\room\\{name}"])
+def test_lists_of_names_that_differ_as_those_of_the_photographs_do(capture: Path, edit: Any, change: Any) -> None:
+    def spoil(meta: dict[str, Any]) -> None:
+        names = [change(frame["file_path"]) for frame in meta["frames"]]
+        for frame, name in zip(meta["frames"], names, strict=True):
+            frame["file_path"] = name
+        meta.update(train_filenames=names[2:], val_filenames=names[:2])
+
+    edit(capture, spoil)
+    manager = load_any(capture)
+    assert list(manager.eval_dataset.image_filenames) == images_of(capture)[:2]

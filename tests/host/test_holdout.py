@@ -62,3 +62,22 @@ def test_names_from_a_file(tmp_path: Path) -> None:
 
 def test_nothing_held_out_is_said() -> None:
     assert "none is held out" in holdout.Split([0, 1], [], "by lists").told(NAMES[:2])
+
+
+def test_names_in_another_case_or_with_another_ending() -> None:
+    assert holdout.find(TWINS, ["RIGHT/A.JPG", "b c.png", "a\u0308", "Left\\a"], "the lists") == [2, 1, 3, 0]
+    with expect("a.png is the name of 2 photographs"):
+        holdout.find(TWINS, ["a.png"], "the lists")
+
+
+def test_names_of_another_machine() -> None:
+    names = ["D:\\scan\\left\\a.jpg", "/home/me/scan/right/a.jpg", "b c.jpg"]
+    assert holdout.find(TWINS, names, "the lists", anywhere=True) == [0, 2, 1]
+    with expect("2 of 3 names are of no photograph"):  # a name that a user gives is meant as it is
+        holdout.find(TWINS, names, "--eval-names")
+
+
+def test_a_file_of_names_with_a_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "held out.txt"
+    path.write_text("00.jpg\n08.jpg\n", "utf-16")
+    assert holdout.read_names([str(path)]) == ("00.jpg", "08.jpg")

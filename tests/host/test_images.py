@@ -18,6 +18,7 @@ from bitymi_ns.host import duplicates
 from bitymi_ns.host.datamanager import BitymiDataManager
 from bitymi_ns.host.images import Note, note, read_image, read_mask
 from tests.host.captures import expect, images_of, load, said
+from tests.profiles import DISPLAY_P3
 
 
 @pytest.fixture
@@ -259,3 +260,9 @@ def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
     declared(path, 60000, 60000)
     with expect(f"{path.name} has more than 1,000,000,000 pixels. Make it smaller"):
         load(capture)
+
+
+def test_colours_are_those_of_screens(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8), (200, 100, 80)).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
+    red, green, _ = read_image(tmp_path / "a.png").getpixel((2, 2))
+    assert red > 205 and green < 100

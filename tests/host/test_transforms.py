@@ -17,7 +17,7 @@ from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.host import point_cloud
 from bitymi_ns.host.cameras import check_cameras
 from bitymi_ns.host.errors import InputError, say, warn
-from tests.host.captures import expect, images_of, load, load_with, said
+from tests.host.captures import expect, images_of, load, load_any, load_with, said
 from tests.host.test_cameras import cameras
 
 
@@ -261,3 +261,82 @@ def test_lists_of_two_splits_are_enough(capture: Path, edit: Any, given: str) ->
     manager = load(capture)
     assert [path.name for path in manager.eval_dataset.image_filenames] == ["frame_00001.png", "frame_00002.png"]
     assert len(manager.train_dataset) == 10
+
+
+def test_null_is_what_a_capture_does_not_have(capture: Path, edit: Any) -> None:
+    def change(meta: dict[str, Any]) -> None:
+        meta.update(applied_transform=None, applied_scale=None, orientation_override=None, distortion_params=None)
+        for i, frame in enumerate(meta["frames"]):
+            frame.update(mask_path="" if i else None, depth_file_path=None)
+
+    edit(capture, change)
+    for read in (load, load_any):
+        manager = read(capture)
+        assert len(manager.train_dataset) == 10 and "mask" not in manager.train_dataset.get_data(0)
+    edit(capture, lambda meta: meta.update(ply_file_path=None))
+    assert "points3D_xyz" not in load_any(capture).train_dataset.metadata
+
+
+def test_a_transform_that_cannot_be_undone(capture: Path, edit: Any) -> None:
+    flat = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]
+    edit(capture, lambda meta: meta.update(applied_transform=flat))
+    with expect("transforms.json: applied_transform maps the capture to a plane, .*remove it: then exports are"):
+        load_any(capture)
+
+
+@pytest.mark.parametrize("change", [lambda text: f"// by hand\n{text}", lambda text: f"{text.rstrip()[:-1]},}}"])
+def test_what_is_no_json_is_to_be_corrected(capture: Path, change: Any) -> None:
+    path = capture / "transforms.json"
+    path.write_text(change(path.read_text("utf8")), "utf8")
+    with expect(r"transforms.json cannot be read: Expecting .*line \d+ .*Correct it there \(JSON has neither comments"):
+        load_any(capture)
+
+
+@pytest.mark.parametrize("name", ["points\\Cloud.ply", "/home/me/room/points/cloud.ply", "C:\\room\\CLOUD.PLY"])
+def test_a_point_cloud_by_its_name_on_another_machine(capture: Path, edit: Any, name: str) -> None:
+    (capture / "points").mkdir()
+    (capture / "sparse_pc.ply").rename(capture / "points/cloud.ply")
+    edit(capture, lambda meta: meta.update(ply_file_path=name))
+    if "points" in name:
+        assert len(load_any(capture).train_dataset.metadata["points3D_xyz"]) == 200
+    else:  # it is in no such folder
+        with expect("the point cloud .* does not exist"):
+            load_any(capture)
+
+
+@pytest.mark.parametrize("place", ["masks\\", "/home/me/room/masks/", "D:\\room\\Masks\\"])
+def test_masks_by_their_names_on_another_machine(capture: Path, edit: Any, place: str) -> None:
+    (capture / "masks").mkdir()
+    for i, image in enumerate(images_of(capture)):
+        Image.new("L", (48, 36), 255 if i else 0).save(capture / "masks" / f"{image.stem}.png")
+
+    def change(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            frame["mask_path"] = f"{place}{Path(frame['file_path']).stem}.PNG"
+
+    edit(capture, change)
+    manager = load_any(capture)
+    assert manager.train_dataset.get_data(0)["mask"].all()
+    assert len(manager.eval_dataset) == 1  # the mask of the first photograph, which is held out, is black
+
+
+def test_a_photograph_is_no_mask(capture: Path, edit: Any) -> None:
+    def change(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            frame["mask_path"] = f"/home/me/masks/{frame['file_path']}"
+
+    edit(capture, change)
+    with expect("the mask /home/me/masks/images/frame_.* is missing"):
+        load_any(capture)
+
+
+def test_frames_that_are_none(capture: Path, edit: Any) -> None:
+    edit(capture, lambda meta: meta["frames"].insert(1, {"file_path": "images/a.png"}))
+    with expect("frame 1 .counted from 0. has no transform_matrix. Add that or remove the frame"):
+        load_any(capture)
+    edit(capture, lambda meta: meta["frames"].__setitem__(1, None))
+    with expect("frame 1 .* has no file_path and no transform_matrix"):
+        load_any(capture)
+    edit(capture, lambda meta: meta.update(frames=dict(enumerate(meta["frames"]))))
+    with expect("frames is an object with names, not a list"):
+        load_any(capture)

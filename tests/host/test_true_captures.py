@@ -399,3 +399,34 @@ def test_held_out_views_of_blender_without_photographs(
     text = said(capsys)
     what = "all" if lacking == "all" else "3"
     assert f"transforms_test.json lacks {what} of its 4 photographs, left out: {capture}/test/r_" in text
+
+
+# another unit
+
+
+@pytest.mark.parametrize("form", [instant_ngp, blender])
+def test_millimetres_where_the_format_has_no_scale(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = form(capture)
+    load_any(capture)
+    assert "the capture is scaled by" not in said(capsys)
+
+    def change(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 1000.0
+
+    rewrite(path, change)
+    manager = load_any(capture)
+    assert "units from their middle, where those of this format usually lie" in (text := said(capsys))
+    assert "the capture is scaled by 0.0" in text
+    box = float(manager.train_dataset.scene_box.aabb[1, 0])
+    centers = manager.train_dataset.cameras.camera_to_worlds[:, :, 3]
+    assert 1.0 < float((centers - centers.mean(0)).norm(dim=1).median()) / box < 4.0
+    parser = manager.dataparser
+    original = parser.splits["train"].transform_poses_to_original_space(manager.train_dataset.cameras.camera_to_worlds)
+    assert original[:, :, 3].abs().max() > 1000.0
+    if form is blender:
+        load_any(capture, scale_factor=0.5)
+        assert "the capture is scaled by" not in said(capsys)

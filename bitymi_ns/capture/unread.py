@@ -1,0 +1,57 @@
+"""What cameras and other programs leave in a capture that nothing here reads as photographs or poses, to be named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+RAW = "raw data of a camera"
+PICTURES = {
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), RAW),
+    ".jxl": "JPEG XL",
+    ".exr": "OpenEXR",
+    ".hdr": "Radiance HDR",
+    ".psd": "Photoshop",
+}
+"""Endings of pictures, and what they are."""
+POSES = {
+    "poses_bounds.npy": "LLFF",
+    "cameras_sphere.npz": "NeuS",
+    "cameras.npz": "IDR",
+    "cameras.sfm": "Meshroom",
+    "sfm_data.json": "OpenMVG",
+    "reconstruction.json": "OpenSfM",
+    "bundle.out": "Bundler",
+    "bundle.rd.out": "Bundler",
+}
+"""Files of poses, in lower case, and the programs that write them."""
+METASHAPE = b"<camera "
+"""What the XML file has in it to which Metashape exports cameras, whatever its name."""
+FOLDERS = {
+    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
+    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
+    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
+    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
+    "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
+    "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+}  # fmt: skip
+"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
+FILES = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
+"""The same for files, without their endings, that lie beside folders of photographs."""
+
+
+def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Files of poses in a folder, each with the program that wrote it."""
+    for path in sorted(path for path in folder.iterdir() if path.is_file()):
+        if path.name.lower() in POSES:
+            yield path, POSES[path.name.lower()]
+        elif path.suffix.lower() == ".xml" and METASHAPE in path.read_bytes():
+            yield path, "Metashape"
+
+
+def pictures_among(names: Sequence[str], read: Sequence[str]) -> dict[str, int]:
+    """How many of the files of a folder are pictures that are not read, by their endings. A camera's raw data beside a
+    photograph of the same name, one of those that are `read`, do not count."""
+    stems = {Path(name).stem.lower() for name in read}
+    endings = [path.suffix.lower() for path in map(Path, names) if path.stem.lower() not in stems]
+    return {ending: endings.count(ending) for ending in PICTURES if ending in endings}

@@ -70,7 +70,7 @@ def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
     assert first.parser == () and first.hold_out == 8
     assert second.parser == ("blender-data", "--ply-path", "hull_pc.ply")
     with pytest.raises(BenchError, match="is not a capture"):
-        local_scenes([tmp_path / "captures"])
+        local_scenes([tmp_path / "captures" / "fox" / "images"])
     with pytest.raises(BenchError, match="different names"):
         local_scenes([lego, lego])
     with pytest.raises(BenchError, match="give --data"):

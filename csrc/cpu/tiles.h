@@ -2,6 +2,7 @@
 #pragma once
 
 #include "core/kernel.h"
+#include "core/visibility.h"
 #include "cpu/kernels.h"
 #include "cpu/packs.h"
 
@@ -98,7 +99,10 @@ struct TileState {
     constexpr S kHalf = S(0.5 * (kPackSide - 1));
     const P x = middle_x - P(cx), y = middle_y - P(cy);
     const S half_x = cell_half(kHalf, cx, S(kTile)), half_y = cell_half(kHalf, cy, S(kTile));
-    const uint32_t box = bits((abs_(x) < P(radius[0] + half_x)) & (abs_(y) < P(radius[1] + half_y)));
+    // the centre of a disc without a box may lie further away than its radii say
+    const bool boxless = max_(radius[0], radius[1]) >= S(kBoxless);
+    const uint32_t box =
+        boxless ? ~uint32_t(0) : bits((abs_(x) < P(radius[0] + half_x)) & (abs_(y) < P(radius[1] + half_y)));
     if (filtered<Kernel>(g)) return {box, 0};
     const ReachedCells r = reached_cells(g, x, y, half_x, half_y, level);
     return {box & r.support, box & r.centre};

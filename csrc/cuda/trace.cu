@@ -59,9 +59,12 @@ __global__ void __launch_bounds__(kTileThreads)
       id = surfel[own];
       const S cx = geom[int64_t(id) * kGeom + kCx], cy = geom[int64_t(id) * kGeom + kCy];
       const S rx = radii[2 * int64_t(id)], ry = radii[2 * int64_t(id) + 1];
-      meets = cx + rx >= S(s.left) && cx - rx <= S(s.left + kWarpWidth) && cy + ry >= S(s.top) &&
-              cy - ry <= S(s.top + kWarpHeight);
-      if (meets && max_(rx, ry) >= S(kBoxless)) meets = reached_by_warp<Kernel>(geom + int64_t(id) * kGeom, s);
+      // the centre of a disc without a box may lie further away than its radii say
+      if (max_(rx, ry) >= S(kBoxless))
+        meets = reached_by_warp<Kernel>(geom + int64_t(id) * kGeom, s);
+      else
+        meets = cx + rx >= S(s.left) && cx - rx <= S(s.left + kWarpWidth) && cy + ry >= S(s.top) &&
+                cy - ry <= S(s.top + kWarpHeight);
     }
     unsigned todo = __ballot_sync(kFullMask, meets);
     uint32_t mark = 0;

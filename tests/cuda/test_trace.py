@@ -24,6 +24,7 @@ from tests.ops.golden import (
     SceneCase,
     crossing_scene,
     extreme_scenes,
+    far_floor,
     load_golden,
     random_scene,
     reference,
@@ -386,3 +387,11 @@ def test_free_memory_is_looked_up_for_longer_lists_and_now_and_then(monkeypatch:
     with pytest.raises(ops.TooManyFragments, match=f"there is room for {few:,}"):
         trace_cuda.check_capacity(card, view, 2 * few, 0)
     assert len(asked) == 3
+
+
+def test_a_disc_whose_centre_is_a_million_pixels_away(device: torch.device) -> None:
+    case = far_floor()
+    values = [case.params[name].to(device) for name in SURFEL_KEYS]
+    fragments = ops.trace(ops.project(*values, Camera(case.viewmat, case.K, case.width, case.height)), EXACT_RIM)
+    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    assert fragments.surfel.shape[0] == int((want > 0).sum()) > 300

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from bitymi_ns.measure.stability.scenes import (
     SceneCase,
     crossing_scene,
     extreme_scenes,
+    quaternions,
     random_scene,
 )
 from bitymi_ns.ops.fragment_list import Places
@@ -34,6 +35,7 @@ __all__ = [
     "crossing_scene",
     "dense",
     "extreme_scenes",
+    "far_floor",
     "load_golden",
     "random_scene",
     "reference",
@@ -113,6 +115,19 @@ def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False
     """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
+
+
+def far_floor() -> SceneCase:
+    """A floor below the camera whose centre lies beside it, just behind the near plane: millions of pixels away."""
+    case = replace(crossing_scene(1, 0, width=40, height=30), viewmat=torch.eye(4, dtype=torch.float64))
+    x, z = torch.eye(3, dtype=torch.float64)[[0, 2]]
+    case.params |= {
+        "means": torch.tensor([[9000.0, 0.5, 0.21]], dtype=torch.float64),
+        "quats": quaternions(torch.stack([x, z, torch.linalg.cross(x, z)], dim=1)[None]),
+        "log_scales": torch.full((1, 2), 8.5, dtype=torch.float64),
+        "opacity_logits": torch.zeros(1, dtype=torch.float64),
+    }
+    return case
 
 
 def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:

@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 
 from bitymi_ns.measure.stability.scenes import quaternions
 from bitymi_ns.ops import backend
-from tests.ops.golden import SURFEL_KEYS, crossing_scene, dense, random_scene, reference, tiles_reached, traced
+from tests.ops.golden import (
+    SURFEL_KEYS,
+    crossing_scene,
+    dense,
+    far_floor,
+    random_scene,
+    reference,
+    tiles_reached,
+    traced,
+)
 
 
 @pytest.mark.parametrize("prefilter", [False, True], ids=["low pass", "prefilter"])
@@ -89,3 +98,12 @@ def test_a_disc_out_of_view_keeps_its_low_pass() -> None:
     want = reference(case, values).weight
     assert (want > 0).sum() == 7 and 2 < float(projection.radii.max()) < 3
     torch.testing.assert_close(dense(fragments, fragments.weight, 1), want, rtol=1e-9, atol=1e-12)
+
+
+def test_a_disc_whose_centre_is_a_million_pixels_away() -> None:
+    case = far_floor()
+    values = [case.params[name] for name in SURFEL_KEYS]
+    fragments, projection = traced(case, values)
+    want = reference(case, values).weight
+    assert (want > 0).sum() > 300 and float(projection.geom[0, 0]) > 1e6
+    torch.testing.assert_close(dense(fragments, fragments.weight, 1), want, rtol=1e-7, atol=1e-10)

@@ -107,9 +107,12 @@ fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
     high = -low;
   }
   for (var k = 0u; k < count; k++) {
-    let at = corners[k].xy / corners[k].z;
-    low = min(low, at - 0.5);
-    high = max(high, at + 0.5);
+    let depth = corners[k].z;
+    let at = corners[k].xy / depth;
+    // a corner is what is left of differences of the disc's axes, divided by a depth that may be small
+    let lost = 5e-7 * (abs(p) + abs(q) + abs(at) * (abs(c.x) + abs(c.y) + 1.0)) / depth;
+    low = min(low, at - 0.5 - lost);
+    high = max(high, at + 0.5 + lost);
   }
   var r = finish(s.center, vec2f(1.0, 0.0), low, high);
   r.visible = count > 0 || blur > 0.0;
@@ -124,9 +127,10 @@ fn rectangle(s: Seen) -> Rectangle {
   let r2 = level_radius2(log(max(ratio, 1.0)) + 1e-5, s.beta);
   // where the kernel is larger than the low pass everywhere, the low pass needs no room
   let blur2 = 1.0 / low_pass_sharp();
-  let least = s.w0 - LOW_PASS_REACH * sqrt(blur2) * (abs(s.w.x) + abs(s.w.y));
+  let change = LOW_PASS_REACH * sqrt(blur2) * (abs(s.w.x) + abs(s.w.y));
+  let least = s.w0 - change;
   let slope = dot(s.u, s.u) + dot(s.v, s.v);
-  let covered = -s.area <= 1.0 && least > 0.0
+  let covered = -s.area <= 1.0 && least > 0.0 && s.w0 * s.z > frame.near * (s.w0 + change)
     && SUPPORT2 * least * least >= (s.beta + LOW_PASS_REACH * LOW_PASS_REACH) * blur2 * 1.001 * slope;
   var blur = 0.0;
   if !covered && blurred >= almost { blur = sqrt((log(max(blurred, 1.0)) + 1e-5) * blur2) + 0.01; }

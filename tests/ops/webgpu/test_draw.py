@@ -105,6 +105,17 @@ def test_discs_across_the_camera_plane_are_drawn_where_they_show(seed: int, phot
     assert sum(drawn) <= 1.25 * sum(boxes)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_discs_far_larger_than_their_depth_are_drawn_whole(seed: int) -> None:
+    """Their corners are differences of numbers as large as the disc, divided by a small depth."""
+    case = crossing_scene(40, seed, 320, 240)
+    case.params["log_scales"] += 5.0 + seed
+    scene, camera = scene_of(case, near=0.02), camera_of(case)
+    counts = on_device.SceneOnDevice(scene).draw(camera, "overdraw", 1)[..., 0]
+    want = draw_on_cpu(scene, [camera], None, ("overdraw",))["overdraw"][0, ..., 0].numpy()
+    assert np.abs(counts - want).max() <= 1 and (np.abs(counts - want) > 0.5).mean() < 1e-3
+
+
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
 @pytest.mark.parametrize("lean", [False, True], ids=["all terms", "lean"])
 def test_view_colours(kind: str, lean: bool) -> None:

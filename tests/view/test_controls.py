@@ -334,7 +334,13 @@ def test_screenshot_link_resolution_and_theme(bundle: Path, tmp_path: Path) -> N
     named = len(page.steps) - 1
     before = page.ask("location.hash")
     page.do(["key", "l"])
-    after, told = page.ask("location.hash"), page.ask("document.getElementById('notice').textContent")
+    # copying takes a moment; the notice before it says that no graphics card draws
+    notice = "document.getElementById('notice').textContent"
+    told = page.ask(
+        f"new Promise((give) => {{ const look = () => {notice}.includes('link') ? give({notice}) : setTimeout(look, 20);"
+        " look(); })"
+    )
+    after = page.ask("location.hash")
     sizes = []
     for share in ("0.25", "0.5", "0.75", "1"):
         page.do(["select", "#resolution", share], ["settle"])

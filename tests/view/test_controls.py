@@ -337,8 +337,8 @@ def test_screenshot_link_resolution_and_theme(bundle: Path, tmp_path: Path) -> N
     # copying takes a moment; the notice before it says that no graphics card draws
     notice = "document.getElementById('notice').textContent"
     told = page.ask(
-        f"new Promise((give) => {{ const look = () => {notice}.includes('link') ? give({notice}) : setTimeout(look, 20);"
-        " look(); })"
+        "new Promise((give) => { const look = () => "
+        f"{notice}.includes('link') ? give({notice}) : setTimeout(look, 20); look(); }})"
     )
     after = page.ask("location.hash")
     sizes = []

@@ -14,7 +14,7 @@ from bitymi_ns.bundle.surfel_table import TERMS
 from bitymi_ns.files import size_text
 
 HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
-"""Bytes from the start of a file that `check_head` looks at."""
+"""Bytes from the start of a file that `check_head` reads."""
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
 """Of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million texels 67
 with their pages."""

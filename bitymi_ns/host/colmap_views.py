@@ -18,7 +18,7 @@ from bitymi_ns.host.colmap_model import Model, read_model
 from bitymi_ns.host.errors import fail, listed, say, warn
 from bitymi_ns.host.names import Files, renamed
 from bitymi_ns.host.ply import Points
-from bitymi_ns.host.views import Photograph
+from bitymi_ns.host.views import OPENCV_AXES, Photograph
 from bitymi_ns.trust import leads_inside
 
 
@@ -152,9 +152,9 @@ def _photographs(
         bases += [path for path in folder.parents if path.is_relative_to(capture) and path != capture]
     if folder == capture:
         bases += folder.parents[:3]
-    places = [base / name for base in bases for name in USUAL_FOLDERS]
-    places += [path for base in bases[:1] for path in sorted(base.iterdir()) if path.is_dir()]
-    places += bases
+    folders = [base / name for base in bases for name in USUAL_FOLDERS]
+    folders += [path for base in bases[:1] for path in sorted(base.iterdir()) if path.is_dir()]
+    folders += bases
 
     def both(place: Path) -> list[Path]:
         return [each for each in (place, place.with_name(f"{place.name}_{reduction}")) if each.is_dir()]
@@ -168,12 +168,12 @@ def _photographs(
         found = (Files(each).find_all(names) for each in both(place))
         return max((sum(path is not None for path in files) for files in found), default=0)
 
-    best = max(places, key=present)  # the first of equals
+    best = max(folders, key=present)  # the first of equals
     if not look or present(best) == len(names):
         return best
     # a folder above the capture may be the root of a disk, which is not searched
-    searched = [place for place in places if place.is_relative_to(capture) or place.name in USUAL_FOLDERS]
-    counts = {place: alike(place) for place in dict.fromkeys(searched)}
+    searched = [each for each in folders if each.is_relative_to(capture) or each.name in USUAL_FOLDERS]
+    counts = {each: alike(each) for each in dict.fromkeys(searched)}
     other = max(counts, key=counts.__getitem__)
     if counts[other] > present(best):
         return other
@@ -281,4 +281,4 @@ def _camera_to_world(qvec: np.ndarray, tvec: np.ndarray) -> np.ndarray:
     rotation = qvec2rotmat(qvec / np.linalg.norm(qvec))
     c2w = np.eye(4)
     c2w[:3, :3], c2w[:3, 3] = rotation.T, -rotation.T @ tvec
-    return c2w @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return c2w @ OPENCV_AXES

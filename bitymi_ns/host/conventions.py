@@ -14,12 +14,10 @@ from bitymi_ns.host.errors import warn
 from bitymi_ns.host.images import read_image
 from bitymi_ns.host.ply import Points
 from bitymi_ns.host.point_colours import sampled
-from bitymi_ns.host.views import Photograph
+from bitymi_ns.host.views import OPENCV_AXES, Photograph
 from bitymi_ns.train.views import spread
 
 Pose = npt.NDArray[np.float64]
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between OpenGL's axes of a camera and OpenCV's."""
 LOOKED_AT = 8
 """Photographs, spread over all, into which points are projected."""
 POINTS = 2000
@@ -37,28 +35,30 @@ ALIKE = 0.4
 
 def _other_order(pose: Pose) -> Pose:
     """Camera to world of a COLMAP model whose quaternions are x, y, z, w, from what it is read as."""
-    written = np.linalg.inv(pose @ FLIP)
+    written = np.linalg.inv(pose @ OPENCV_AXES)
     meant = np.eye(4)
     # read as w, x, y, z; SciPy's order is x, y, z, w
     meant[:3, :3] = Rotation.from_quat(Rotation.from_matrix(written[:3, :3]).as_quat()[[3, 0, 1, 2]]).as_matrix()
     meant[:3, 3] = written[:3, 3]
-    return np.linalg.inv(meant) @ FLIP
+    return np.linalg.inv(meant) @ OPENCV_AXES
 
 
 JSON: dict[str, Callable[[Pose], Pose]] = {
-    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda pose: pose @ FLIP,
+    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda pose: (
+        pose @ OPENCV_AXES
+    ),
     "they are world to camera: invert them": np.linalg.inv,
     "they are world to camera with OpenCV's axes: invert them, then negate the second and third column": lambda pose: (
-        np.linalg.inv(pose) @ FLIP
+        np.linalg.inv(pose) @ OPENCV_AXES
     ),
     "they are left-handed, as Unity's: negate the third column": lambda pose: pose @ np.diag([1.0, 1.0, -1.0, 1.0]),
 }
 """What a matrix of a transforms.json, which should be camera to world with OpenGL's axes, may be; and what it then
 means."""
 COLMAP: dict[str, Callable[[Pose], Pose]] = {
-    "the cameras have OpenGL's axes (y up, z backward)": lambda pose: pose @ FLIP,
-    "they are camera to world: invert them": lambda pose: FLIP @ np.linalg.inv(pose) @ FLIP,
-    "they are camera to world with OpenGL's axes": lambda pose: FLIP @ np.linalg.inv(pose),
+    "the cameras have OpenGL's axes (y up, z backward)": lambda pose: pose @ OPENCV_AXES,
+    "they are camera to world: invert them": lambda pose: OPENCV_AXES @ np.linalg.inv(pose) @ OPENCV_AXES,
+    "they are camera to world with OpenGL's axes": lambda pose: OPENCV_AXES @ np.linalg.inv(pose),
     "the quaternions are in the order x, y, z, w: write w first": _other_order,
 }
 """The same for a COLMAP model, whose poses should be world to camera with OpenCV's axes."""

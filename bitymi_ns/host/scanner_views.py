@@ -16,15 +16,13 @@ from bitymi_ns.host.colmap_model import ModelCamera
 from bitymi_ns.host.errors import fail, listed, warn
 from bitymi_ns.host.lens import rescaled
 from bitymi_ns.host.poses import rotations
-from bitymi_ns.host.views import Photograph, size_of
+from bitymi_ns.host.views import OPENCV_AXES, Photograph, size_of
 from bitymi_ns.trust import json_of
 
 Row = tuple[Path, npt.NDArray[np.float64], tuple[float, ...], tuple[int, int] | None]
 """A photograph, its pose [4, 4] with nerfstudio's axes, fx, fy, cx, cy, and the size these are for; None = its own."""
 Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """From ARKit's world, in which y is up, to one in which z is."""
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From a camera with OpenCV's axes to one with nerfstudio's."""
 
 
 def scanned(found: Found, look: bool) -> list[Photograph]:
@@ -127,7 +125,7 @@ def _pose_files(folder: Path) -> list[Row]:
         if not np.isfinite(pose).all():
             lost.append(name)
             continue
-        rows.append((files[name], pose @ FLIP, pinhole, None))
+        rows.append((files[name], pose @ OPENCV_AXES, pinhole, None))
     if lost:
         warn(f"{len(lost)} photographs of {folder} have no pose, and are left out: {listed(lost)}.")
     return rows

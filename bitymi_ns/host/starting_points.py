@@ -15,12 +15,10 @@ from bitymi_ns.host.colmap_model import read_model
 from bitymi_ns.host.errors import say, warn
 from bitymi_ns.host.lens import rescaled
 from bitymi_ns.host.ply import Points
-from bitymi_ns.host.views import Photograph, size_of
+from bitymi_ns.host.views import OPENCV_AXES, Photograph, size_of
 
 Choice = Literal["auto", "triangulate", "random"]
 """auto = those of the capture, triangulated ones where it has none; triangulate = in any case; random = in any case."""
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From a camera with nerfstudio's axes to one with OpenCV's."""
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 _wanted: ContextVar[bool] = ContextVar("points are wanted", default=False)
@@ -74,7 +72,7 @@ def triangulated(photographs: Sequence[Photograph], home: Path, where: str) -> P
         camera = photograph.camera
         size = (camera.width, camera.height)
         stored = (size_of(photograph.file) or size) if photograph.smaller else size
-        c2w = photograph.pose @ FLIP
+        c2w = photograph.pose @ OPENCV_AXES
         turn = (mirror @ c2w[:3, :3]).T
         shift = -turn @ mirror @ (c2w[:3, 3] - middle)
         params = rescaled(camera.model, camera.params, size, stored)

@@ -23,6 +23,8 @@ from bitymi_ns.host.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.host.ply import Points
 from bitymi_ns.host.poses import check_spread, is_far_off, oriented
 
+OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+"""[4, 4] from a camera with OpenCV's axes to one with nerfstudio's, which are OpenGL's, and back."""
 USUAL_RATIO, LARGEST_RATIO = 2.5, 25.0
 """Distance of cameras from their middle, in half sides of the scene's box: of NeRF-Synthetic, and from which on a
 capture is in another unit."""

@@ -14,6 +14,7 @@ from torch import Tensor
 from .backend import function, module, on_device, require
 from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual
 from .bc7 import decode_bc7
+from .constants import TILE
 from .project import GEOMETRY, Camera
 from .tile_levels import tile_levels
 from .view_color import LEAN, check_lean, check_view_color, lettered
@@ -179,7 +180,7 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
 
 def tiles_of(views: int, width: int, height: int) -> int:
     """Screen tiles of all views."""
-    return -(-width // 16) * -(-height // 16) * views
+    return -(-width // TILE) * -(-height // TILE) * views
 
 
 def slots_per_tile(capacity: int, tiles: int) -> int:

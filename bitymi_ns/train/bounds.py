@@ -53,7 +53,7 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
         option, most = ("first-surfels", first) if by_steps else ("densify.max-surfels", most)
         what = f"{points.random:,} random points" if points.random else f"{points.given:,} points of the capture"
         found.append(
-            f"Training starts from {most:,} surfels: {points.over_cap:,} of {what} are left out by lot "
+            f"Training starts from {most:,} surfels: {points.over_cap:,} of {what} are left out at random "
             f"(--pipeline.model.train.{option})."
         )
     size = default_table_size(image_pixels)

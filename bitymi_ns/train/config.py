@@ -216,7 +216,7 @@ class TrainConfig:
     init_opacity: float = 0.1
     """Opacity of the first surfels."""
     first_surfels: int | None = None
-    """Most surfels that training starts with; more points are thinned by lot. Not given: in ns-train one for every
+    """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
     1,000 pixels that the run looks at, because a surfel costs time in every step, and short runs on small pictures
     cannot place more; else all points."""
     random_points: int = 20_000

@@ -3,7 +3,7 @@
 At each densification, in this order:
 - surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);
 - surfels with many bad pixels and a large gradient are cloned or split;
-- up to half of the candidates for pruning, drawn by lot, are removed;
+- up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
 Between 60 and 90 % of the run, four final prunes remove what is transparent or in the way. docs/training.md states the
 published rules.

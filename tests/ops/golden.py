@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,6 @@ from bitymi_ns.measure.stability.scenes import (
     SURFEL_KEYS,
     SV_KEYS,
     SceneCase,
-    crossing_scene,
     extreme_scenes,
     quaternions,
     random_scene,
@@ -115,6 +115,20 @@ def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False
     """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
+
+
+def crossing_scene(n: int, seed: int, width: int = 96, height: int = 80) -> SceneCase:
+    """n faint surfels whose discs cross the camera's plane: centres in front of it, most of them beside the view."""
+    case = random_scene(n, seed, width, height, name="crossing")
+    g = torch.Generator().manual_seed(seed)
+    depth = 0.25 + 1.25 * torch.rand(n, generator=g, dtype=torch.float64)
+    turn = 2 * math.pi * torch.rand(n, generator=g, dtype=torch.float64)
+    lateral = torch.exp(2.5 * torch.rand(n, generator=g, dtype=torch.float64) - 0.7)  # 0.5 to 6 depths off the axis
+    camera = depth[:, None] * torch.stack([lateral * turn.cos(), lateral * turn.sin(), torch.ones_like(turn)], dim=-1)
+    case.params["means"] = (camera - case.viewmat[:3, 3]) @ case.viewmat[:3, :3]
+    size = depth.log()[:, None] + 0.4 * torch.randn(n, 2, generator=g, dtype=torch.float64)
+    case.params |= {"log_scales": size, "opacity_logits": case.params["opacity_logits"] - 3.0}
+    return case
 
 
 def far_floor() -> SceneCase:

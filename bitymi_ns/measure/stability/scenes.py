@@ -62,20 +62,6 @@ def random_scene(
     return SceneCase(name, params, viewmat, K, width, height, background)
 
 
-def crossing_scene(n: int, seed: int, width: int = 96, height: int = 80) -> SceneCase:
-    """n faint surfels whose discs cross the camera's plane: centres in front of it, most of them beside the view."""
-    case = random_scene(n, seed, width, height, name="crossing")
-    g = torch.Generator().manual_seed(seed)
-    depth = 0.25 + 1.25 * torch.rand(n, generator=g, dtype=torch.float64)
-    turn = 2 * math.pi * torch.rand(n, generator=g, dtype=torch.float64)
-    lateral = torch.exp(2.5 * torch.rand(n, generator=g, dtype=torch.float64) - 0.7)  # 0.5 to 6 depths off the axis
-    camera = depth[:, None] * torch.stack([lateral * turn.cos(), lateral * turn.sin(), torch.ones_like(turn)], dim=-1)
-    case.params["means"] = (camera - case.viewmat[:3, 3]) @ case.viewmat[:3, :3]
-    size = depth.log()[:, None] + 0.4 * torch.randn(n, 2, generator=g, dtype=torch.float64)
-    case.params |= {"log_scales": size, "opacity_logits": case.params["opacity_logits"] - 3.0}
-    return case
-
-
 def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: float) -> SceneCase:
     """A random scene seen by a camera at the origin without rotation, so that camera coordinates are world ones."""
     case = random_scene(n, seed, width, height, **kwargs)

@@ -47,11 +47,11 @@ from bitymi_ns.bake.learn import stored
 from bitymi_ns.bundle import Bundle, export, read_bundle
 from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.host.compact_options import CompactOptions
-from bitymi_ns.host.export import STEPS_AFTER_LEARNING
-from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.measure.bench.machine import commit
 from bitymi_ns.measure.report.pareto import front
+from bitymi_ns.plugin.export.command import STEPS_AFTER_LEARNING
+from bitymi_ns.plugin.export.compact_options import CompactOptions
+from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene

@@ -28,10 +28,10 @@ from PIL import Image
 from plain_capture import Capture
 from torch import Tensor
 
-from bitymi_ns.host.metrics import image_metrics
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.gaussians import Gaussians, read_gaussians
 from bitymi_ns.interchange.splat import draw_gaussians
+from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import as_float
 

@@ -46,7 +46,7 @@ from gpu_common import (
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.bake.packing import pack
+from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene.field import Shading
 from bitymi_ns.scene.scene import GEOMETRY

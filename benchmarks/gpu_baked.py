@@ -38,8 +38,8 @@ from gpu_common import (
     with_launches,
 )
 
-from bitymi_ns.bake.packing import pack
 from bitymi_ns.bundle import read_bundle
+from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.baked_cuda import Stage
 from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer

@@ -27,7 +27,7 @@ from plain_capture import Capture, load_capture
 
 from bitymi_ns import bundle
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
-from bitymi_ns.host.preset import Preset, PresetError, load_preset
+from bitymi_ns.plugin.run.preset import Preset, PresetError, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene

@@ -58,7 +58,7 @@ import torch
 from common import number, page, publish, say, table
 
 from bitymi_ns import ops
-from bitymi_ns.bake.packing import pack
+from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.trace_cpu import tracers
 from bitymi_ns.scene.baked import BakedScene

@@ -33,7 +33,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.photographed import photographed
+from bitymi_ns.bake.photo_resolution import photographed
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene

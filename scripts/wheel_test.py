@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 SITE_PACKAGES = Path(sysconfig.get_path("purelib"))
 KERNELS = "tests/ops/test_kernels.py"
-TESTS = ("tests/test_presets.py", "tests/ops/test_backend.py", KERNELS, "tests/host/test_registration.py")
+TESTS = ("tests/test_presets.py", "tests/ops/test_backend.py", KERNELS, "tests/plugin/test_registration.py")
 
 WHERE = """
 import sys

@@ -9,7 +9,7 @@ from typing import Any
 
 from bitymi_ns.bake import BakeOptions
 from bitymi_ns.capture.types import SfmOptions
-from bitymi_ns.host.preset import load_preset
+from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.train.config import TrainConfig
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,5 +1,5 @@
-"""A layer imports only what stands below it, no two modules import each other, and nerfstudio is known to `host` and to
-what measures it alone."""
+"""A layer imports only what stands below it, no two modules import each other, and nerfstudio is known to `plugin`
+and to what measures it alone."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import pytest
 import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
-ORDER = ["ops", "scene", "train", "bake", "bundle", "interchange", "view", "host", "measure"]
+ORDER = ["ops", "scene", "codec", "train", "bake", "bundle", "interchange", "view", "plugin", "measure"]
 BESIDE = ["files", "interpreter", "ply", "presets", "progress", "sample", "capture", "trust"]
 """ORDER has the innermost first. These stand beside them and import none of them."""
-KNOW_NERFSTUDIO = ("host", "measure/knobs.py", "measure/pictures.py")
+KNOW_NERFSTUDIO = ("plugin", "host", "measure/knobs.py", "measure/pictures.py")
 
 
 def name_of(path: Path) -> str:
@@ -71,7 +71,7 @@ def test_what_stands_beside_the_layers_imports_none_of_them(name: str) -> None:
             assert ".".join(imported.split(".")[:2]) not in layers, f"{path} imports {imported}"
 
 
-def test_nerfstudio_is_known_to_the_host_and_to_what_measures_it_alone() -> None:
+def test_nerfstudio_is_known_to_the_plugin_and_to_what_measures_it_alone() -> None:
     for path in PACKAGE.rglob("*.py"):
         knows = path.relative_to(PACKAGE).as_posix().startswith(KNOW_NERFSTUDIO)
         names = [name for name, _ in imports(path) if name.split(".")[0] == "nerfstudio"]
@@ -98,9 +98,9 @@ def test_the_guard_sees_every_kind_of_import() -> None:
 from typing import TYPE_CHECKING
 from . import blend
 from .. import scene
-from ..bake.plan import Plan
+from ..bake.field.plan import Plan
 if TYPE_CHECKING:
-    from bitymi_ns.host import model
+    from bitymi_ns.plugin.run import model
 def late():
     import bitymi_ns.train.fit
 """
@@ -108,8 +108,8 @@ def late():
         ("typing.TYPE_CHECKING", True),
         ("bitymi_ns.ops.blend", True),
         ("bitymi_ns.scene", True),
-        ("bitymi_ns.bake.plan.Plan", True),
-        ("bitymi_ns.host.model", False),
+        ("bitymi_ns.bake.field.plan.Plan", True),
+        ("bitymi_ns.plugin.run.model", False),
         ("bitymi_ns.train.fit", False),
     }
 

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.errors import listed_errors
-from bitymi_ns.bake.footprint import closest_pixels
+from bitymi_ns.bake.field.footprint import closest_pixels
+from bitymi_ns.bake.field.plan import Shown
 from bitymi_ns.bake.options import STEPS
-from bitymi_ns.bake.pages import listed_texels
 from bitymi_ns.bake.pipeline import Baked
-from bitymi_ns.bake.plan import Shown
 from bitymi_ns.bake.statistics import MARKS, Certificate
+from bitymi_ns.codec.pages import listed_texels
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 

@@ -9,10 +9,10 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked, encoded_pages
-from bitymi_ns.bake.quantise import EncodedAtlas
-from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
+from bitymi_ns.codec.pages import listed_texels, paged_texels
+from bitymi_ns.codec.quantise import EncodedAtlas
+from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
 from bitymi_ns.ops import TexelTiles
 
 TO_START = 0.93

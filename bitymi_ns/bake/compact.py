@@ -9,18 +9,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.codes import Codes
-from bitymi_ns.bake.looks import FEWEST_VIEWS, set_aside
+from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, set_aside
 from bitymi_ns.bake.methods import Tiles
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.pages import listed_texels, paged_texels
 from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.statistics import Rounding, ViewColorError
-from bitymi_ns.bake.surfel_codes import code_surfels
-from bitymi_ns.bake.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.bake.texel_scene import TexelScene
-from bitymi_ns.bake.worthwhile_color import color_choices
+from bitymi_ns.bake.view_color_rate import color_choices
+from bitymi_ns.codec.codes import Codes
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.pages import listed_texels, paged_texels
+from bitymi_ns.codec.surfel_codes import code_surfels
+from bitymi_ns.codec.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.views import View

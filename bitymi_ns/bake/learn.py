@@ -9,13 +9,13 @@ from torch import Tensor
 
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
+from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.learned import learned
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
-from bitymi_ns.bake.polish import PolishOptions, polish_scene
-from bitymi_ns.bake.texel_codes import TexelCodeOptions
+from bitymi_ns.bake.trained_texels import learned
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
+from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bitymi_ns.bake.limits import EXTENTS
-from bitymi_ns.bake.packing import check_page
-from bitymi_ns.bake.quantise import BYTES_PER_TEXEL, Format, Profile, RangeRule, bc7_encoder
+from bitymi_ns.codec.limits import EXTENTS
+from bitymi_ns.codec.packing import check_page
+from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, Format, Profile, RangeRule, bc7_encoder
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.tile_sizes import check_sides
 

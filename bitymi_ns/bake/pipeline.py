@@ -10,18 +10,18 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.codes import Codes
 from bitymi_ns.bake.errors import tile_errors
+from bitymi_ns.bake.field.plan import Field, paper_texels
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable
 from bitymi_ns.bake.methods import BakeMethod, FineBake, Tiles, bake_method, reduced_tiles
 from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.packing import Packing, pack
-from bitymi_ns.bake.pages import moved_texels, tile_means
-from bitymi_ns.bake.photographed import photographed
-from bitymi_ns.bake.plan import Field, paper_texels
-from bitymi_ns.bake.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
+from bitymi_ns.bake.photo_resolution import photographed
 from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
-from bitymi_ns.bake.texel_codes import TexelCodes, pages
+from bitymi_ns.codec.codes import Codes
+from bitymi_ns.codec.packing import Packing, pack
+from bitymi_ns.codec.pages import moved_texels, tile_means
+from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
+from bitymi_ns.codec.texel_codes import TexelCodes, pages
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.surfel_codes import PARAMETERS, REFERENCE, SurfelCodes, code_surfels, reordered, term_numbers
+from bitymi_ns.codec.surfel_codes import PARAMETERS, REFERENCE, SurfelCodes, code_surfels, reordered, term_numbers
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.losses import psnr

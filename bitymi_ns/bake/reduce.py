@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.errors import weighted_rms
-from bitymi_ns.bake.packing import Packing
-from bitymi_ns.bake.pages import texel_index
-from bitymi_ns.bake.plan import Shown
-from bitymi_ns.bake.reference import Reference
+from bitymi_ns.bake.field.plan import Shown
+from bitymi_ns.bake.field.reference import Reference
 from bitymi_ns.bake.resample import fit, fitted, interpolation, read_at
+from bitymi_ns.codec.packing import Packing
+from bitymi_ns.codec.pages import texel_index
 from bitymi_ns.progress import Progress, no_progress
 
 _FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a grid may be for it to be tried

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import streams
-from bitymi_ns.bake.packing import Packing, pack
-from bitymi_ns.bake.streams import StreamError
-from bitymi_ns.bake.surfel_codes import PLACE_BITS, REFERENCE, Codes, Frame, SurfelCodes, term_numbers
-from bitymi_ns.bake.texel_codes import GRADES, TexelCodes, blocks_of
 from bitymi_ns.bundle.manifest import COMPACT_SURFELS, Atlas, Column, Surfels
+from bitymi_ns.codec import streams
+from bitymi_ns.codec.packing import Packing, pack
+from bitymi_ns.codec.streams import StreamError
+from bitymi_ns.codec.surfel_codes import PLACE_BITS, REFERENCE, Codes, Frame, SurfelCodes, term_numbers
+from bitymi_ns.codec.texel_codes import GRADES, TexelCodes, blocks_of
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 __all__ = [

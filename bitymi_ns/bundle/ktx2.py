@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bitymi_ns.bake.quantise import Format
+from bitymi_ns.codec.quantise import Format
 
 IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 

@@ -18,8 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.limits import EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.bundle.ply import PlyError
+from bitymi_ns.codec.limits import EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
 from bitymi_ns.ops.sphere import fibonacci_sphere

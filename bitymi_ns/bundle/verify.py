@@ -12,18 +12,18 @@ from torch import Tensor
 
 from bitymi_ns.bake.certificate import marks, marks_of, measured_rms
 from bitymi_ns.bake.errors import tile_errors
+from bitymi_ns.bake.field.plan import Field
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bake.methods import bake_method
 from bitymi_ns.bake.options import STEPS, BakeOptions
-from bitymi_ns.bake.packing import Packing
-from bitymi_ns.bake.pages import listed_texels
-from bitymi_ns.bake.plan import Field
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
 from bitymi_ns.bundle.parts import Parts, parts_of
 from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
 from bitymi_ns.bundle.write import World
+from bitymi_ns.codec.packing import Packing
+from bitymi_ns.codec.pages import listed_texels
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField

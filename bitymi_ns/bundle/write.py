@@ -14,9 +14,7 @@ import numpy.typing as npt
 import torch
 
 from bitymi_ns import __version__
-from bitymi_ns.bake.limits import RESIDUAL_LIMIT
 from bitymi_ns.bake.pipeline import Baked, Codes
-from bitymi_ns.bake.quantise import EncodedAtlas
 from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import (
@@ -44,6 +42,8 @@ from bitymi_ns.bundle.surfel_table import (
     term_columns,
     to_columns,
 )
+from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS

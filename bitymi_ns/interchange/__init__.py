@@ -1,5 +1,6 @@
 """Baked scenes for other programs: as 3D Gaussians, and as a textured mesh; and how those would draw them."""
 
+from bitymi_ns.interchange.bundle_cameras import Given, given_with
 from bitymi_ns.interchange.extras import (
     FILES,
     Frame,
@@ -10,7 +11,6 @@ from bitymi_ns.interchange.extras import (
     place_of,
     write_extras,
 )
-from bitymi_ns.interchange.given import Given, given_with
 
 __all__ = [
     "FILES",

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.directions import view_directions
+from bitymi_ns.bake.field.texels import texel_centres
 from bitymi_ns.bake.lean_color import shown_at
-from bitymi_ns.bake.pages import size_classes, texel_index
-from bitymi_ns.bake.texels import texel_centres
+from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
 from bitymi_ns.ops.sphere import fibonacci_sphere

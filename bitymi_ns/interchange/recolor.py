@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.pages import size_classes, texel_index
+from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.interchange.draw_quads import nearest
 from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress

@@ -16,12 +16,12 @@ from torch.nn.functional import interpolate
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, baked_and_reduced, rich_progress
 from bitymi_ns.bake.options import STEPS
-from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.errors import fail, say
-from bitymi_ns.host.export import load_trained, replace_file
-from bitymi_ns.host.target import see_writable
 from bitymi_ns.measure.bench.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.errors import fail, say
+from bitymi_ns.plugin.export.command import load_trained, replace_file
+from bitymi_ns.plugin.export.target import see_writable
 from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField

@@ -12,13 +12,13 @@ from PIL import Image
 from torch import Tensor
 
 from bitymi_ns.files import reason
-from bitymi_ns.host.errors import fail, say
-from bitymi_ns.host.export import load_trained, replace_file
-from bitymi_ns.host.metrics import image_metrics
-from bitymi_ns.host.surfel_model import OVERDRAW_SCALE
-from bitymi_ns.host.target import see_writable
 from bitymi_ns.measure.report.views import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.ops import composite
+from bitymi_ns.plugin.errors import fail, say
+from bitymi_ns.plugin.export.command import load_trained, replace_file
+from bitymi_ns.plugin.export.target import see_writable
+from bitymi_ns.plugin.run.metrics import image_metrics
+from bitymi_ns.plugin.run.surfel_model import OVERDRAW_SCALE
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.rotations import tangents

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.quantise import EncodedAtlas
 from bitymi_ns.bundle import write_bundle
+from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.scene.baked import BakedScene
 

@@ -17,8 +17,8 @@ from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake
 from bitymi_ns.bake.certificate import certified, marks, marks_of, marks_text, measured_rms, texel_rms
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.errors import listed_errors
-from bitymi_ns.bake.footprint import averaged, cells_per_pixel, closest_pixels
-from bitymi_ns.bake.plan import Shown
+from bitymi_ns.bake.field.footprint import averaged, cells_per_pixel, closest_pixels
+from bitymi_ns.bake.field.plan import Shown
 from bitymi_ns.bake.statistics import MARKS, Certificate
 from bitymi_ns.bundle import check_field, check_files, export
 from bitymi_ns.scene.visibility import visibility

@@ -21,8 +21,8 @@ from bitymi_ns.bake.compact import (
     with_coded_texels,
 )
 from bitymi_ns.bake.precision import PER_BIT
-from bitymi_ns.bake.texel_codes import TexelCodeOptions
 from bitymi_ns.bundle import check_files, export
+from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, photographs, render, waving
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 
-from bitymi_ns.bake.codes import Codes
-from bitymi_ns.bake.limits import EXTENTS
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import Range, encode
-from bitymi_ns.bake.surfel_codes import REFERENCE, code_surfels
-from bitymi_ns.bake.texel_codes import TexelCodeOptions, TexelCoder, pages
 from bitymi_ns.bundle import write_bundle
+from bitymi_ns.codec.codes import Codes
+from bitymi_ns.codec.limits import EXTENTS
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import Range, encode
+from bitymi_ns.codec.surfel_codes import REFERENCE, code_surfels
+from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, pages
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import Range, encode
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import Range, encode
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
 from tests.ops.test_view_color import lean_parameters

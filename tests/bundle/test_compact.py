@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.pages import coverage
-from bitymi_ns.bake.quantise import encode
-from bitymi_ns.bake.texel_codes import pages
 from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, sizes, write_bundle
 from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.bundle.sizes import least_memory
 from bitymi_ns.cli import main
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.pages import coverage
+from bitymi_ns.codec.quantise import encode
+from bitymi_ns.codec.texel_codes import pages
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import FINEST, RANGE, make_codes, scene_of, write_compact

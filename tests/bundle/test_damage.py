@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import encode
 from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.manifest import parse
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import encode
 from tests.bake.scenes import write
 from tests.bundle.damage import amend, signed
 from tests.bundle.made import make

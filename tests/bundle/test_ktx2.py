@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import decode_pages, encode
 from bitymi_ns.bundle.ktx2 import Ktx2Error, layer_bytes, parse_ktx2, write_ktx2
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import decode_pages, encode
 
 FORMATS = ["bc7", "uint8", "fp16"]
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from bitymi_ns.bake.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
 from bitymi_ns.bundle import check_files, strict_json
 from bitymi_ns.bundle.manifest import Atlas, BundleError, describe, dump, parse
 from bitymi_ns.bundle.single import write_single
+from bitymi_ns.codec.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
 from bitymi_ns.ops.view_color import MAX_TERMS
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.damage import amend, signed

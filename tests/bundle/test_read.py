@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import encode
 from bitymi_ns.bundle import check_files, ktx2, read_bundle
 from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import parts_of
 from bitymi_ns.cli import main
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import encode
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
 from tests.bundle.damage import amend, change_columns, signed

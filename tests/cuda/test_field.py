@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.texels import evaluate_tiles
+from bitymi_ns.bake.field.texels import evaluate_tiles
+from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene import Camera, HashField, SceneConfig

@@ -13,7 +13,7 @@ pytest.importorskip("nerfstudio")
 
 from nerfstudio.scripts import train as ns_train
 
-from bitymi_ns.host.config import BitymiTrainerConfig, method_config
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
 from bitymi_ns.sample import generate
 from tests.e2e.exports import TOLERANCE, run_export
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from nerfstudio.scripts.eval import ComputePSNR
 
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.export import ExportAtlas
+from bitymi_ns.plugin.export.command import ExportAtlas
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 TOLERANCE = 0.02
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 import yaml
 
-from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 Start = Callable[..., BitymiTrainerConfig]
 

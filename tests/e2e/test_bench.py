@@ -11,13 +11,13 @@ import torch
 from PIL import Image
 
 from bitymi_ns import cli
-from bitymi_ns.host.cameras import to_camera
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.export import load_trained
 from bitymi_ns.measure import knobs as host_knobs
 from bitymi_ns.measure.knobs import measure_to_file
 from bitymi_ns.measure.pictures import KINDS, decompose, draw_worst, residual_parts
+from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export.command import load_trained
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 
 @pytest.fixture(scope="session")

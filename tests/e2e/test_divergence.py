@@ -8,8 +8,8 @@ import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
 
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 
 @pytest.mark.parametrize("factor", [10.0, 1000.0])

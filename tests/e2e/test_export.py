@@ -17,13 +17,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
-from bitymi_ns.host import target
-from bitymi_ns.host.bundle_model import RENDERER
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.export import default_export
-from bitymi_ns.host.verify import check_run
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export import target
+from bitymi_ns.plugin.export.command import default_export
+from bitymi_ns.plugin.export.verify import check_run
+from bitymi_ns.plugin.run.bundle_model import RENDERER
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.scene.baked import FAST
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.bundle import check_files, read_bundle
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.verify import check_run
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export.verify import check_run
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 

@@ -14,10 +14,10 @@ from bitymi_ns.bake import TuneOptions
 from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
-from bitymi_ns.host import export as host_export
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.verify import check_run
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export import command as host_export
+from bitymi_ns.plugin.export.verify import check_run
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 

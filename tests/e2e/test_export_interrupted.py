@@ -10,8 +10,8 @@ import pytest
 from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bake import tune
 from bitymi_ns.bundle import check_files
-from bitymi_ns.host import export as host_export
-from bitymi_ns.host.config import BitymiTrainerConfig
+from bitymi_ns.plugin.export import command as host_export
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, run_export
 
 

@@ -13,11 +13,11 @@ import pytest
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.host import export as host_export
-from bitymi_ns.host import target
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.export import ExportAtlas
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export import command as host_export
+from bitymi_ns.plugin.export import target
+from bitymi_ns.plugin.export.command import ExportAtlas
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import run_export
 
 

@@ -22,15 +22,15 @@ from PIL import Image
 import bitymi_ns.capture
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.host import kept_poses
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.export import load_trained, world_of
-from bitymi_ns.host.run_folder import POSES
+from bitymi_ns.plugin.data import kept_poses
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export.command import load_trained, world_of
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.run_folder import POSES
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import a_run_of, checkpoint, different, rewrite
-from tests.host.captures import colmap_model, said
+from tests.plugin.data.captures import colmap_model, said
 
 STEPS = 4
 

@@ -20,9 +20,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from bitymi_ns.bundle import strict_json
-from bitymi_ns.host.commands import REFUSED
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.run.commands import REFUSED
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import evaluate
 
 

@@ -14,12 +14,12 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 from PIL import Image
 
-from bitymi_ns.host import callbacks
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.curve import FILE
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.export import ExportAtlas
-from tests.host.captures import mixed_project
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.export.command import ExportAtlas
+from bitymi_ns.plugin.run import callbacks
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.curve import FILE
+from tests.plugin.data.captures import mixed_project
 
 Start = Callable[..., BitymiTrainerConfig]
 

@@ -16,10 +16,10 @@ import torch
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.capture.frame import WorldFrame, write_frame
-from bitymi_ns.host import run_folder
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.errors import InputError
 from bitymi_ns.measure.report import build
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.run import run_folder
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.runs import Start, checkpoint
 
 
@@ -44,7 +44,7 @@ def test_a_full_disk_keeps_the_earlier_checkpoint(start: Start, monkeypatch: pyt
 HOLDS = """
 import sys
 from pathlib import Path
-from bitymi_ns.host import run_folder
+from bitymi_ns.plugin.run import run_folder
 
 run_folder.take(Path(sys.argv[1]))
 print("has it", flush=True)

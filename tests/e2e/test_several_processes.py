@@ -13,10 +13,10 @@ import torch.distributed as dist
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.host.config import BitymiTrainerConfig
-from bitymi_ns.host.curve import FILE
-from bitymi_ns.host.errors import InputError
-from bitymi_ns.host.trainer import BitymiTrainer
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.curve import FILE
+from bitymi_ns.plugin.run.trainer import BitymiTrainer
 from tests.e2e.conftest import STEPS, small_run
 from tests.e2e.runs import Start, checkpoint, different
 

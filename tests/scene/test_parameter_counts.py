@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.host.preset import load_preset
 from bitymi_ns.measure.report.paper import VIEW_COLORS as OF_THE_PAPER
 from bitymi_ns.ops import VIEW_COLORS
+from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene import Scene, SceneConfig
 
 GEOMETRY = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "beta_raw": ()}

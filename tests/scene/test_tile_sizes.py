@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake.texels import texel_centres, tile_points
+from bitymi_ns.bake.field.texels import texel_centres, tile_points
 from bitymi_ns.scene.tile_sizes import (
     coarsened,
     max_projected_extent,

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake.limits import BRIGHTEST
-from bitymi_ns.bake.packing import pack
-from bitymi_ns.bake.quantise import Range, encode
 from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.manifest import parse
 from bitymi_ns.bundle.ply import parse_ply, write_ply
+from bitymi_ns.codec.limits import BRIGHTEST
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import Range, encode
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera

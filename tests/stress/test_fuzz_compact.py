@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 import zstandard
 
-from bitymi_ns.bake.limits import beyond
-from bitymi_ns.bake.streams import StreamError
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, describe, parse
 from bitymi_ns.bundle.read import assemble
 from bitymi_ns.bundle.sizes import check_head
+from bitymi_ns.codec.limits import beyond
+from bitymi_ns.codec.streams import StreamError
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.damage import signed
 

@@ -11,9 +11,9 @@ from typing import get_args
 
 import pytest
 
-from bitymi_ns.bake.quantise import Format
 from bitymi_ns.bundle import World
 from bitymi_ns.bundle.manifest import describe, dump
+from bitymi_ns.codec.quantise import Format
 from bitymi_ns.measure.bench import Bundle, Matrix, Row, SceneSpec
 
 FAKE = """#!{python} -SE

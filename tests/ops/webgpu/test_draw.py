@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bitymi_ns.bake.quantise import bc7_encoder
+from bitymi_ns.codec.quantise import bc7_encoder
 from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
 from bitymi_ns.ops.bc7 import decode_bc7

@@ -1,0 +1,160 @@
+"""What a tile has to hold: how far it is seen, how much an error in it counts, and the finest grid of use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.field.footprint import closest_pixels
+from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bake.statistics import KeptTexels
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.tile_sizes import (
+    kernel_parameters,
+    nyquist_resolution,
+    visible_extent,
+    voxel_along_axes,
+)
+from bitymi_ns.train.rotations import tangents
+
+PAPER_EXTENT = 4.0  # e of the paper's rule
+
+
+class Field(Protocol):
+    """The part of the residual field that the bake uses.
+
+    A field that also has `geometry.mid`, the centre of its contraction, gets tiles that follow the direction in which
+    its voxels are stretched; without it the smaller voxel edge holds for both axes.
+    """
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """[M, 3] world positions to [M, 3] residual colours."""
+
+    def voxel_size(self, x: Tensor) -> Tensor:
+        """[M, 3] world positions to [M, 2] finest voxel edges (radial, tangential), world units."""
+
+
+@dataclass
+class Shown:
+    """How much of a tile can be seen, and how strongly.
+
+    Attributes:
+        opacity: [N] largest blending weight of the surfel's centre.
+        beta: [N] exponent of the kernel.
+        extent: [N] half side of the tile in scale units: beyond it every fragment stays below the weight bound; 0 where
+            all do.
+        weight_bound: fragments of smaller weight get no residual.
+        pixels: [N, 2] pixels of a scale unit in the closest view (`footprint.closest_pixels`); None = not known.
+    """
+
+    opacity: Tensor
+    beta: Tensor
+    extent: Tensor
+    weight_bound: float
+    pixels: Tensor | None = field(default=None, kw_only=True)
+
+
+@dataclass
+class Plan(Shown):
+    """What is known of every tile before the field is looked at.
+
+    Attributes:
+        means: [N, 3] world positions.
+        edges: [N, 3, 2] tangent directions times scales, world units.
+        probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
+        limit: [N, 2] int32, the finest tile of use, at most `probes`.
+        texels: how many texels the rules before the tolerance give.
+    """
+
+    means: Tensor
+    edges: Tensor
+    probes: Tensor
+    limit: Tensor
+    texels: KeptTexels
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def make_plan(
+    surfels: Mapping[str, Tensor],
+    field: Field,
+    options: BakeOptions,
+    cameras: Sequence[Camera] = (),
+    transmittance: Tensor | None = None,
+    near: float = 0.2,
+    weight_bound: float = 0.0,
+    whole: bool = False,
+) -> Plan:
+    """Extents and grids of all tiles.
+
+    Args:
+        surfels: per-surfel parameters, N rows, all finite and drawable.
+        field: the residual field, for its voxel size.
+        options: sizes.
+        cameras: training views, for the cap.
+        transmittance: [N] of `Visibility`, None = 1.
+        near: nearest drawn depth.
+        weight_bound: fragments of smaller weight get no residual.
+        whole: every tile has the extent of the options and is probed at the texels of the rule; else it covers what
+            reaches the weight bound and is probed at the Nyquist rate.
+    """
+    means, scales = surfels["means"], surfels["log_scales"].exp()
+    axes = tangents(surfels["quats"])
+    opacity, beta = kernel_parameters(surfels, transmittance)
+    extent = torch.full_like(opacity, options.extent)
+    if not whole:
+        extent = torch.minimum(extent, visible_extent(opacity, beta, weight_bound))
+    voxel = torch.cat([field.voxel_size(part) for part in means.split(options.chunk)])
+    delta = (
+        voxel_along_axes(voxel, axes, means, _center(field))
+        if options.local_voxel
+        else voxel.amin().expand(scales.shape)
+    )
+    closest = closest_pixels(surfels, cameras, options.extent, near) if cameras else None
+    pixels = None if closest is None or not options.cap_by_views else closest * (2.0 * options.extent)
+
+    def grids(share: Tensor, pixels: Tensor | None) -> Tensor:
+        capped = None if pixels is None else pixels * share
+        return nyquist_resolution(scales * share, delta, options.extent, options.r_min, options.r_max, capped)
+
+    share = extent[:, None] / options.extent
+    limit = grids(share, pixels)
+    probes = limit if whole else grids(share, None)
+    full = torch.ones_like(share)
+    counts = KeptTexels(
+        nyquist=_texels(grids(full, None)),
+        after_cap_by_views=_texels(grids(full, pixels)),
+        within_visible_part=_texels(limit),
+    )
+    edges = axes * scales[:, None, :]
+    return Plan(opacity, beta, extent, weight_bound, means, edges, probes, limit, counts, pixels=closest)
+
+
+def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:
+    """How many texels the paper's rule gives: one voxel size, the smallest, and tiles of extent 4.
+
+    Args:
+        surfels: means [N, 3], log_scales [N, 2] of all surfels that can be drawn.
+        field: the whole residual field.
+        options: smallest and largest tile.
+    """
+    scales = surfels["log_scales"].exp()
+    finest = torch.stack([field.voxel_size(part).amin() for part in surfels["means"].split(options.chunk)]).amin()
+    sides = nyquist_resolution(scales, finest.expand(scales.shape), PAPER_EXTENT, options.r_min, options.r_max)
+    return _texels(sides)
+
+
+def _texels(sizes: Tensor) -> int:
+    """Texels of all tiles of sizes [N, 2]."""
+    return int(sizes.long().prod(1).sum())
+
+
+def _center(field: Field) -> Tensor | None:
+    """[3] centre of the field's contraction, world frame, if it tells."""
+    geometry = getattr(field, "geometry", None)
+    return None if geometry is None else torch.tensor(geometry.mid, dtype=torch.float32)

@@ -1,0 +1,207 @@
+"""The polish: after the bake texels, geometry, opacities and view colours learn together, without the network."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, Looks, gain, look, set_aside
+from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.statistics import FineTuning
+from bitymi_ns.bake.texel_scene import TexelScene
+from bitymi_ns.bake.tune import TuneOptions
+from bitymi_ns.ops import TexelDescent
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.losses import numbers, photometric
+from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
+from bitymi_ns.train.schedules import Schedule, falling
+from bitymi_ns.train.views import View, background_changes, step_background, training_order
+
+
+@dataclass
+class PolishOptions(TuneOptions):
+    """How a baked scene is polished: `rate` and `prior` are of the texels."""
+
+    steps: int = 300
+    share: float = 0.4
+    """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
+    checks: int = 10
+    pixels_per_texel: float = 0.25
+    """A tile starts with at most a texel for so many pixels that its surfel makes up of the view that shows most of
+    it."""
+
+    def check(self) -> None:
+        """Refuses values that make no sense."""
+        super().check()
+        for name, least in (("steps", 1), ("held_in_every", 2)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} of the polish must be at least {least}, not {getattr(self, name)}")
+        for name in ("share", "pixels_per_texel"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} of the polish must be positive, not {getattr(self, name)}")
+
+
+class _Polish:
+    """One polish, step by step."""
+
+    def __init__(
+        self, baked: Baked, views: Sequence[View], background: Tensor, options: PolishOptions, train: TrainConfig
+    ) -> None:
+        self.texels = TexelScene(baked, background)
+        drawn = baked.scene
+        config = SceneConfig(
+            view_color=drawn.view_color,  # type: ignore[arg-type]
+            weight_bound=drawn.weight_bound,
+            prefilter=drawn.prefilter,  # type: ignore[arg-type]
+            texture_moves_surfels=True,
+        )
+        tiles = self.texels.tiles
+        self.field = TexelField(tiles.size, tiles.extent, self.texels.texels)
+        self.scene = Scene(config, drawn.surfels, self.field, near=drawn.near)
+        self.options, self.background = options, background.cpu()
+        centers = torch.stack([view.camera.center.cpu() for view in views])
+        extent = scene_extent(centers, drawn.surfels["means"])
+        self.schedule = Schedule(replace(train, lr=train.lr.times(options.share)), options.steps, extent)
+        self.optimizers = surfel_optimizers(self.scene)
+        self.train, self.factor = train, 1.0
+
+    def shown(self, view: View, background: Tensor | None) -> Tensor:
+        """[H, W, 3] the scene as a view's photograph shows it, over a colour [3]."""
+        output = self.scene.render(view.camera.to("cpu"), background)
+        return view.shown(output.rgb, output.alpha, background)
+
+    @torch.no_grad()
+    def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
+        """Mean dB over the views of which any pixel counts."""
+        pictures = (
+            (self.shown(view, self.background), view.target(self.background, "cpu"), _mask(view)) for view in views
+        )
+        return look(pictures, len(views), progress)
+
+    def step(self, number: int, view: View, share: Tensor) -> bool:
+        """A step on one view; False = it is not finite, and was not done."""
+        options = self.options
+        for name, optimizer in self.optimizers.items():
+            set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
+        forget_gradients(self.optimizers.values())
+        background = self.background
+        if background_changes(self.train, view):
+            background = step_background(self.train, view, number, "cpu")
+        mask, target = _mask(view), view.target(background, "cpu")
+        # the loss is a mean, the step wants a sum
+        rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
+        self.field.descent = TexelDescent(share, rate)
+        loss = photometric(self.shown(view, background), target, options.ssim_weight, mask)
+        if not math.isfinite(float(loss.detach())):
+            return False
+        if not loss.requires_grad:  # nothing of the scene is in the view
+            return True
+        loss.backward()
+        step(self.optimizers.values())
+        return True
+
+    def state(self) -> dict[str, Any]:
+        """A copy of what is learned."""
+        return {name: value.detach().clone() for name, value in self.scene.state_dict().items()}
+
+    def go_back(self, state: dict[str, Any]) -> None:
+        """To an earlier state, with slower steps from here on."""
+        self.scene.load_state_dict(state)
+        self.optimizers = surfel_optimizers(self.scene)
+        self.factor *= self.train.guard.rates
+
+
+def polish_scene(
+    baked: Baked,
+    views: Sequence[View],
+    background: Tensor,
+    options: PolishOptions | None = None,
+    train: TrainConfig | None = None,
+    progress: Progress = no_progress,
+    eval_views: Sequence[View] = (),
+) -> Baked:
+    """Lets texels and surfels of a bake learn together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
+
+    Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Surfels keep their tiles with their
+    extents and sizes: a fragment beyond its tile reads the edge, while it learns and when it is drawn. Nothing is
+    densified. The state kept is the one that shows the set-aside views best, the bake itself where none is better. A
+    step that is not finite takes the scene back to that state, with smaller rates.
+
+    It runs on the CPU, as `tune_atlas` does.
+
+    Args:
+        baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
+        views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
+        background: [3] colour behind the scene, but for steps on views behind which it changes (`train.background`).
+        options: see `PolishOptions`.
+        train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
+            a step is not finite.
+        progress: called after every step.
+        eval_views: views of which the gain is stated; they decide nothing.
+
+    Returns:
+        a new bake with `statistics.polish`, to be `reduced`; `baked` itself without change where there are fewer than 4
+        views.
+
+    Raises:
+        ValueError: there is no atlas, the view colours are reduced, or an option is out of range.
+    """
+    options = options or PolishOptions()
+    options.check()
+    if "view_terms" in baked.scene.surfels:
+        raise ValueError("the view colours are reduced already: polish a bake that was made with pixels_per_texel")
+    if len(views) < FEWEST_VIEWS:
+        return replace(baked, statistics=baked.statistics.but(polish=FineTuning(steps=0, views=len(views))))
+    started, cpu_started = time.perf_counter(), time.process_time()
+    held_in, learned = (
+        OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
+        for rows in set_aside(len(views), options.held_in_every)
+    )
+    run = _Polish(baked, views, background, options, train or TrainConfig())
+    before = run.psnr(eval_views) if eval_views else math.nan
+    looks = _learn(run, learned, held_in, progress)
+    run.scene.load_state_dict(looks.best)
+    spent = time.perf_counter() - started, time.process_time() - cpu_started
+    statistics = looks.statistics(len(learned), len(held_in), *spent).but(
+        error_before=baked.statistics.error,
+        psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None,
+    )
+    texels = run.field.texels.detach()
+    result = run.texels.baked(texels).with_surfels(dict(run.scene.surfels))
+    return replace(result, statistics=result.statistics.but(polish=statistics))
+
+
+def _mask(view: View) -> Tensor | None:
+    return None if view.mask is None else view.mask.cpu()
+
+
+def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progress: Progress) -> Looks[dict[str, Any]]:
+    """The state that shows the set-aside views best, and the looks at these."""
+    options = run.options
+    looks = Looks(options, run.psnr(held_in, progress), run.state())
+    seen = run.texels.coverage(views, progress)
+    share, attempts = (1.0 / (seen + options.prior)).squeeze(1), 0  # [T]
+    for number in range(options.steps):
+        view = views[training_order(len(views), options.seed, number)]
+        if not run.step(number, view, share):
+            attempts += 1
+            run.go_back(looks.best)
+        more = attempts < run.train.guard.rollbacks
+        if not more or looks.due(number + 1):
+            more = looks.note(number + 1, run.psnr(held_in), run.state) and more
+        progress("polishing", number + 1, options.steps if more else number + 1)
+        if not more:
+            break
+    return looks

@@ -1,0 +1,302 @@
+"""Quantisation of the atlas: one global range, and the three texel formats."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.packing import Packing
+from bitymi_ns.codec.pages import coverage
+from bitymi_ns.ops.bc7 import decode_bc7
+from bitymi_ns.progress import Progress, no_progress
+
+Format = Literal["bc7", "uint8", "fp16"]
+RangeRule = Literal["sigma6", "minmax", "auto"]
+Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
+
+BYTES_PER_TEXEL: dict[str, int] = {"bc7": 1, "uint8": 4, "fp16": 8}
+_STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
+_SMALLEST_SPAN = 1e-6
+
+
+@dataclass(frozen=True)
+class Range:
+    """The global quantisation range: value = offset + scale * unorm with unorm in [0, 1]."""
+
+    offset: float
+    scale: float
+    rule: str
+
+    def to_unorm8(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+        """Nearest 8-bit codes of `values`, clipped to the range."""
+        unorm = (values - np.float32(self.offset)) * np.float32(1.0 / self.scale)
+        return np.rint(np.clip(unorm, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+    def from_unorm8(self, codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        """Values of 8-bit codes."""
+        return codes.astype(np.float32) * np.float32(self.scale / 255.0) + np.float32(self.offset)
+
+
+@dataclass(frozen=True)
+class EncodedAtlas:
+    """An atlas in the format it is stored in.
+
+    Attributes:
+        payload: one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top.
+        format: one of bc7, uint8, fp16.
+        width, height: page size in texels.
+        range: quantisation range (offset 0 and scale 1 for fp16).
+        encoder: name of the encoder and its profile.
+        clipped_fraction: share of the tiles' colour values outside the range.
+        mse: mean squared error of the decoded tiles against the atlas, colour units squared.
+    """
+
+    payload: list[bytes]
+    format: Format
+    width: int
+    height: int
+    range: Range
+    encoder: str
+    clipped_fraction: float
+    mse: float
+
+    @property
+    def psnr(self) -> float | None:
+        """PSNR in dB of the decoded tiles against the atlas, for a peak of 1; None when they are equal."""
+        return None if self.mse == 0 else float(-10.0 * np.log10(self.mse))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the texels."""
+        return sum(len(page) for page in self.payload)
+
+    def decoded(self) -> npt.NDArray[np.float32]:
+        """Residual colours as a renderer reads them: [layers, height, width, 3]."""
+        return decode(self.payload, self.format, self.width, self.height, self.range.offset, self.range.scale)
+
+
+def sample_texels(
+    texels: npt.NDArray[np.float32], packing: Packing, count: int = 1 << 18, seed: int = 0
+) -> npt.NDArray[np.float32]:
+    """A bootstrap sample (with replacement, uniform over the texels of all tiles), [count, 3]; [0, 3] without tiles."""
+    area = packing.tiles[:, 3].astype(np.int64) * packing.tiles[:, 4]
+    ends = np.cumsum(area)
+    if len(ends) == 0 or ends[-1] == 0:
+        return np.zeros((0, 3), dtype=np.float32)
+    drawn = np.random.default_rng(seed).integers(0, ends[-1], count)
+    tile = np.searchsorted(ends, drawn, side="right")
+    x, y, layer, r_u, _ = packing.tiles[tile].astype(np.int64).T
+    inside = drawn - (ends[tile] - area[tile])
+    return texels[layer, y + inside // r_u, x + inside % r_u]
+
+
+def choose_range(
+    texels: npt.NDArray[np.float32],
+    packing: Packing,
+    rule: RangeRule = "sigma6",
+    samples: int = 1 << 18,
+    seed: int = 0,
+) -> Range:
+    """The quantisation range of an atlas, one (offset, scale) for all channels.
+
+    sigma6: mean +- 6 standard deviations of a bootstrap sample (paper, Quantization). minmax: smallest to largest
+    value, nothing clipped. auto: whichever of the two has the smaller mean squared 8-bit error on the sample.
+
+    Args:
+        texels: [layers, height, width, 3] float32.
+        packing: where the tiles lie; values outside tiles are not looked at.
+        rule: see above.
+        samples: size of the bootstrap sample.
+        seed: of the sample.
+    """
+    sample = sample_texels(texels, packing, samples, seed)
+    if len(sample) == 0:
+        return Range(0.0, 1.0, rule if rule != "auto" else "sigma6")
+    if rule == "auto":
+        candidates = [choose_range(texels, packing, each, samples, seed) for each in ("sigma6", "minmax")]
+        return min(candidates, key=lambda each: _mean_square(each.from_unorm8(each.to_unorm8(sample)) - sample))
+    if rule == "sigma6":
+        values = sample.astype(np.float64)
+        mean, spread = float(values.mean()), 6.0 * float(values.std())
+        low, high = mean - spread, mean + spread
+    elif rule == "minmax":
+        low, high = _extremes(texels, packing)
+    else:
+        raise ValueError(f"the range rule must be sigma6, minmax or auto, not {rule!r}")
+    low, high = (float(np.clip(end, -RESIDUAL_LIMIT, RESIDUAL_LIMIT)) for end in (low, high))
+    if high - low < _SMALLEST_SPAN:  # a constant atlas: its value is code 0
+        low, high = (low + high) / 2, (low + high) / 2 + _SMALLEST_SPAN
+    return Range(low, high - low, rule)
+
+
+def encode(
+    texels: npt.NDArray[np.float32],
+    packing: Packing,
+    format: Format = "bc7",
+    value_range: Range | None = None,
+    profile: Profile = "veryfast",
+    threads: int | None = None,
+    progress: Progress = no_progress,
+) -> EncodedAtlas:
+    """Quantises and encodes an atlas, and measures the error of what was written.
+
+    Args:
+        texels: [layers, height, width, 3] float32 residual colours.
+        packing: where the tiles lie: errors are measured there only.
+        format: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
+        value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
+        profile: effort of the BC7 encoder, from ultrafast to slow.
+        threads: encoder threads; not given: one per processor. The result does not depend on it.
+        progress: called with the number of rows done.
+    """
+    if format not in BYTES_PER_TEXEL:
+        raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
+    layers, height, width, _ = texels.shape
+    if format == "fp16":
+        value_range = Range(0.0, 1.0, "none")
+    elif value_range is None:
+        value_range = choose_range(texels, packing)
+    owned = coverage(packing.tiles, width, height, layers)
+    encoder = bc7_encoder(profile) if format == "bc7" else None
+
+    def strip(layer: int, top: int) -> tuple[bytes, int, float]:
+        values = texels[layer, top : top + _STRIP]  # [h, width, 3]
+        mask = owned[layer, top // 4 : (top + len(values)) // 4].repeat(4, axis=0).repeat(4, axis=1)
+        rgba = _quantised(values, format, value_range)
+        data = encoder(rgba) if encoder else rgba.tobytes()
+        decoded = decode([data], format, width, len(values), value_range.offset, value_range.scale)[0]
+        inside = values[mask]
+        if format == "fp16":
+            low, high = -RESIDUAL_LIMIT, RESIDUAL_LIMIT
+        else:
+            low, high = value_range.offset, value_range.offset + value_range.scale
+        slack = 1e-6 * (high - low)  # the extremes themselves, rounded to float32, are not clipped
+        clipped = int(((inside < low - slack) | (inside > high + slack)).sum())
+        return data, clipped, float(np.square(decoded[mask].astype(np.float64) - inside).sum())
+
+    places = [(layer, top) for layer in range(layers) for top in range(0, height, _STRIP)]
+    pages: list[list[bytes]] = [[] for _ in texels]
+    clipped, squares = 0, 0.0
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        results = pool.map(lambda place: strip(*place), places)
+        for done, ((layer, _), (data, clips, square)) in enumerate(zip(places, results, strict=True), start=1):
+            pages[layer].append(data)
+            clipped, squares = clipped + clips, squares + square
+            progress("encoding the atlas", done, len(places))
+    values = max(1, int(owned.sum()) * 16 * 3)
+    return EncodedAtlas(
+        payload=[b"".join(strips) for strips in pages],
+        format=format,
+        width=width,
+        height=height,
+        range=value_range,
+        encoder=f"ispc_texcomp {profile}" if format == "bc7" else f"{format} rounding",
+        clipped_fraction=clipped / values,
+        mse=squares / values,
+    )
+
+
+def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: int) -> np.ndarray:
+    """Stored texels of an encoded atlas: [layers, height, width, 4], uint8 for bc7 and uint8, float16 for fp16.
+
+    Raises:
+        ValueError: a page has the wrong number of bytes.
+    """
+    dtype = np.float16 if format == "fp16" else np.uint8
+    pages = np.empty((len(payload), height, width, 4), dtype=dtype)
+    for page, data in zip(pages, payload, strict=True):
+        expected = width * height * BYTES_PER_TEXEL[format]
+        if len(data) != expected:
+            raise ValueError(f"a {format} page of {width} x {height} texels has {expected} bytes, not {len(data)}")
+        if format == "bc7":
+            page[:] = decode_bc7(bytes(data), width, height)
+        else:
+            page[:] = np.frombuffer(data, dtype=np.dtype(dtype).newbyteorder("<")).reshape(height, width, 4)
+    return pages
+
+
+def decode(
+    payload: Sequence[bytes], format: Format, width: int, height: int, offset: float, scale: float
+) -> npt.NDArray[np.float32]:
+    """Residual colours of an encoded atlas: [layers, height, width, 3] float32, offset + scale * stored value."""
+    stored = decode_pages(payload, format, width, height)[..., :3]
+    if format == "fp16":
+        return stored.astype(np.float32)
+    return Range(offset, scale, "none").from_unorm8(stored)
+
+
+def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Range) -> np.ndarray:
+    """RGBA texels with full alpha: [h, w, 4] uint8, or little-endian float16."""
+    if format == "fp16":
+        rgba = np.ones((*values.shape[:2], 4), dtype="<f2")
+        rgba[..., :3] = np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT)
+        return rgba
+    rgba = np.full((*values.shape[:2], 4), 255, dtype=np.uint8)
+    rgba[..., :3] = value_range.to_unorm8(values)
+    return rgba
+
+
+def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
+    """A function from RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, rows of blocks from the top.
+
+    Raises:
+        RuntimeError: the encoder is not installed.
+        ValueError: there is no such profile.
+    """
+    try:
+        import ispc_texcomp
+    except ImportError as error:
+        raise RuntimeError(
+            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp`, or choose the format uint8 or fp16"
+        ) from error
+    if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
+        raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
+    settings = ispc_texcomp.BC7EncSettings.from_profile(profile)
+
+    def compress(rgba: npt.NDArray[np.uint8]) -> bytes:
+        height, width = rgba.shape[:2]
+        surface = ispc_texcomp.RGBASurface(rgba.tobytes(), width, height)
+        return bytes(ispc_texcomp.compress_blocks_bc7(surface, settings))
+
+    return compress
+
+
+def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, threads: int | None = None) -> npt.NDArray[np.uint8]:
+    """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
+
+    Args:
+        pages: RGBA texels.
+        profile: effort of the encoder.
+        threads: of the encoder; not given: one per processor. The result does not depend on it.
+
+    Raises:
+        RuntimeError: the encoder is not installed.
+    """
+    compress = bc7_encoder(profile)
+    layers, height, width, _ = pages.shape
+    strips = [page[top : top + _STRIP] for page in pages for top in range(0, height, _STRIP)]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        blocks = bytearray().join(pool.map(compress, strips))
+    return np.frombuffer(blocks, np.uint8).reshape(layers, height // 4, width // 4, 16)
+
+
+def _extremes(texels: npt.NDArray[np.float32], packing: Packing) -> tuple[float, float]:
+    layers, height, width, _ = texels.shape
+    low, high = np.inf, -np.inf
+    for page, owned in zip(texels, coverage(packing.tiles, width, height, layers), strict=True):
+        blocks = page.reshape(height // 4, 4, width // 4, 4, 3)
+        if owned.any():
+            low = min(low, float(blocks.min(axis=(1, 3, 4))[owned].min()))
+            high = max(high, float(blocks.max(axis=(1, 3, 4))[owned].max()))
+    return low, high
+
+
+def _mean_square(difference: npt.NDArray[np.float32]) -> float:
+    return float(np.square(difference.astype(np.float64)).mean())

@@ -1,0 +1,271 @@
+"""Surfels as integers: what a compact bundle keeps of each, and the numbers that it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bitymi_ns.codec import streams
+from bitymi_ns.codec.limits import EXTENTS, LIMITS, limit_of
+from bitymi_ns.ops.constants import ALPHA_MIN
+from bitymi_ns.ops.view_color import LEAN
+from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
+
+Codes = npt.NDArray[np.int64]
+
+PLACE_BITS = 17
+"""Bits per axis of a place: three times as many are exact in a float64."""
+SMALLEST_SHARE = 1.0 / 1024
+"""Opacities and betas keep this distance from their ends, where a logit would be infinite."""
+REFERENCE: dict[str, float] = {
+    "place": 1.0 / 512,
+    "rotation": 1.0 / 128,
+    "log_scales": 1.0 / 32,
+    "opacity": 1.0 / 64,
+    "beta": 1.0 / 32,
+    "extent": 1.0 / 16,
+    "view_base": 1.0 / 96,
+    "term_shape": 1.0 / 12,
+    "term_color": 1.0 / 64,
+}
+"""Columns whose precision is chosen, with steps of which the error is about proportional to the step: those of place in
+`Frame` units, of opacity and beta as shares of their ranges, of term_shape in units of asinh."""
+PARAMETERS = {"place": "means", "rotation": "quats", "opacity": "opacity_logits", "beta": "beta_raw"}
+"""Parameters of the surfels by column, where the names differ."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The grid of places: x = center + scale sinh(low + step k), per axis, with integers k from 0. It is about uniform
+    within `scale` of the centre, and beyond its cells grow with the distance.
+
+    Attributes:
+        center, low: one number per axis.
+        scale: world units.
+    """
+
+    center: tuple[float, float, float]
+    scale: float
+    low: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SurfelCodes:
+    """N surfels along a Morton curve, as integers.
+
+    Attributes:
+        kind: of the view colours, a name of `ops.VIEW_COLORS`.
+        frame: the grid of places.
+        steps: the distance of neighbouring values by column, as in `REFERENCE`.
+        codes: column to [rows, numbers] int64.
+            place [N, 1]: bit 3 i + a is bit i of the cell along axis a; ascending.
+            largest [N, 1], rotation [N, 3]: which of w, x, y, z has the largest size and is positive; the others.
+            log_scales [N, 2], opacity [N, 1], beta [N, 1].
+            size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
+            extent [tiles, 1]: half sides of the tiles that there are.
+            view_base [N, 3], view_count [N, 1]: base colours and numbers of terms.
+            term_shape, term_color [T, ...]: the terms, those numbers that are no colours and those that are.
+            Colours are green, red less green, blue less green.
+    """
+
+    kind: str
+    frame: Frame
+    steps: Mapping[str, float]
+    codes: Mapping[str, Codes]
+
+    def __len__(self) -> int:
+        return len(self.codes["place"])
+
+    @property
+    def columns(self) -> dict[str, Codes]:
+        """The columns of surfels.bin, of which residuals are another: name to [rows, numbers]."""
+        return {**self.codes, "place": np.diff(self.codes["place"], axis=0, prepend=0)}
+
+    def nbytes(self) -> int:
+        """Bytes of surfels.bin without residuals."""
+        return sum(len(streams.pack(column).data) for column in self.columns.values())
+
+    @property
+    def sizes(self) -> npt.NDArray[np.int64]:
+        """[N, 2] sides of the tiles, texels; (0, 0) where there is none."""
+        size = self.codes["size"][:, 0]
+        return np.where(size[:, None] > 0, 1 << np.stack([size >> 4, size & 15], axis=1), 0)
+
+    def extent(self, default: float) -> Tensor:
+        """[N] half sides of the tiles in scale units, `default` where there is none."""
+        tiled, extent = self.codes["size"][:, 0] > 0, np.full(len(self), default)
+        extent[tiled] = np.clip(self._linear("extent")[:, 0], *EXTENTS)
+        return torch.from_numpy(extent.astype(np.float32)).clamp(*EXTENTS)
+
+    def surfels(self) -> dict[str, Tensor]:
+        """The parameters that the integers stand for, float32; view colours are lean."""
+        entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
+        terms = np.zeros((len(self.codes["term_color"]), entry.lean_width))
+        count = self.codes["view_count"][:, 0]
+        terms[:, colors] = self.steps["term_color"] * _rgb(self.codes["term_color"])
+        terms[:, shapes] = _sinh(self._linear("term_shape"))
+        values = {
+            "means": self._means(),
+            "quats": self._rotations(),
+            "log_scales": self._linear("log_scales"),
+            "opacity_logits": _logit(self._linear("opacity")[:, 0], ALPHA_MIN),
+            "beta_raw": _logit(self._linear("beta")[:, 0], SMALLEST_SHARE),
+            "view_base": self.steps["view_base"] * _rgb(self.codes["view_base"]),
+            "view_terms": terms,
+        }
+        found = {name: _within(name, self.kind, value) for name, value in values.items()}
+        span = np.stack([np.cumsum(count) - count, count], axis=1).astype(np.int32)
+        return {**found, "view_span": torch.from_numpy(span)}
+
+    def _linear(self, name: str) -> npt.NDArray[np.float64]:
+        return self.steps[name] * self.codes[name]
+
+    def _means(self) -> npt.NDArray[np.float64]:
+        frame = self.frame
+        bent = np.array(frame.low) + self.steps["place"] * cells(self.codes["place"])
+        return np.array(frame.center) + frame.scale * _sinh(bent)
+
+    def _rotations(self) -> npt.NDArray[np.float64]:
+        rest, largest = self._linear("rotation"), self.codes["largest"][:, 0]
+        quats = np.empty((len(rest), 4))
+        at = np.arange(4)[None, :] != largest[:, None]
+        quats[at] = rest.reshape(-1)
+        quats[~at] = np.sqrt(np.clip(1.0 - (rest**2).sum(1), 0.0, None))
+        return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-9)
+
+
+def code_surfels(
+    surfels: Mapping[str, Tensor],
+    kind: str,
+    sizes: npt.ArrayLike,
+    extent: Tensor,
+    steps: Mapping[str, float],
+) -> tuple[SurfelCodes, Tensor]:
+    """Rounds surfels to the given steps and puts them into the order of a Morton curve.
+
+    Args:
+        surfels: parameters by name, on the CPU, with lean view colours.
+        kind: a name of `ops.VIEW_COLORS`.
+        sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
+        extent: [N] half sides of the tiles, scale units.
+        steps: by column, as in `REFERENCE`; that of place may have to be larger for its cells to fit.
+
+    Returns:
+        the codes, and [N] int64: the row that each of them was.
+    """
+    values = {name: value.detach().double().numpy() for name, value in surfels.items()}
+    frame, step, cell = _placed(values["means"], steps["place"])
+    steps = {**steps, "place": step}
+    place = keys(cell)
+    order = np.argsort(place, kind="stable")
+    quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
+    largest = np.abs(quats).argmax(axis=1)
+    quats = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
+    rest = quats[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+    sides = np.asarray(sizes, dtype=np.int64)
+    tiled = sides[:, 0] > 0
+    exponents = np.log2(np.maximum(sides, 1)).astype(np.int64)
+    per_surfel = {
+        "place": place[:, None],
+        "largest": largest[:, None],
+        "rotation": _codes(rest, steps["rotation"]),
+        "log_scales": _codes(values["log_scales"], steps["log_scales"]),
+        "opacity": _codes(_sigmoid(values["opacity_logits"])[:, None], steps["opacity"]),
+        "beta": _codes(_sigmoid(values["beta_raw"])[:, None], steps["beta"]),
+        "size": np.where(tiled, 16 * exponents[:, 0] + exponents[:, 1], 0)[:, None],
+        "view_base": _differences(_codes(values["view_base"], steps["view_base"])),
+        "view_count": values["view_span"][:, 1:].astype(np.int64),
+    }
+    codes = {name: np.ascontiguousarray(value[order]) for name, value in per_surfel.items()}
+    tiles = order[tiled[order]]
+    codes["extent"] = _codes(extent.double().numpy()[tiles, None], steps["extent"])
+    colors, shapes = term_numbers(kind)
+    terms = values["view_terms"][_term_rows(values["view_span"].astype(np.int64)[order])]
+    codes["term_shape"] = _codes(np.arcsinh(terms[:, shapes]), steps["term_shape"])
+    codes["term_color"] = _differences(_codes(terms[:, colors], steps["term_color"]))
+    return SurfelCodes(kind, frame, steps, codes), torch.from_numpy(order)
+
+
+def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]:
+    """Surfels with lean view colours in another order [N], their terms in the order of the surfels."""
+    span = surfels["view_span"].long()[order]
+    moved = {name: value[order].contiguous() for name, value in surfels.items() if name not in LEAN}
+    moved["view_base"] = surfels["view_base"][order].contiguous()
+    moved["view_terms"] = surfels["view_terms"][torch.from_numpy(_term_rows(span.numpy()))].contiguous()
+    moved["view_span"] = torch.stack([span[:, 1].cumsum(0) - span[:, 1], span[:, 1]], dim=1).int()
+    return moved
+
+
+def term_numbers(kind: str) -> tuple[list[int], list[int]]:
+    """Which numbers of a lean term are colours, in threes, and which are not."""
+    limit = limit_of("view_terms", kind)
+    every = limit * (VIEW_COLORS[kind].lean_width if len(limit) == 1 else 1)
+    colors = [i for i, each in enumerate(every) if each == COLOR_LIMIT]
+    return colors, [i for i in range(len(every)) if i not in colors]
+
+
+def keys(cell: Codes) -> Codes:
+    """[N] places on the Morton curve of cells [N, 3] of at most 2^17 per axis."""
+    return sum(((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(PLACE_BITS) for a in range(3))
+
+
+def cells(place: Codes) -> Codes:
+    """[N, 3] cells of places [N, 1]."""
+    axes = [sum(((place[:, 0] >> (3 * i + a)) & 1) << i for i in range(PLACE_BITS)) for a in range(3)]
+    return np.stack(axes, axis=1)
+
+
+def _placed(means: npt.NDArray[np.float64], step: float) -> tuple[Frame, float, Codes]:
+    center = np.median(means, axis=0)
+    scale = float(np.median(np.abs(means - center))) or 1.0
+    bent = np.arcsinh((means - center) / scale)
+    low = bent.min(axis=0)
+    step = max(step, float((bent.max(axis=0) - low).max()) / (2**PLACE_BITS - 1))
+    frame = Frame(tuple(map(float, center)), scale, tuple(map(float, low)))  # type: ignore[arg-type]
+    return frame, step, np.rint((bent - low) / step).astype(np.int64)
+
+
+def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Rows of the terms of surfels, surfel after surfel, of their spans [N, 2]."""
+    first, count = span[:, 0], span[:, 1]
+    start = np.cumsum(count) - count
+    return np.repeat(first - start, count) + np.arange(int(count.sum()))
+
+
+def _codes(values: npt.NDArray[np.float64], step: float) -> Codes:
+    return np.rint(values / step).astype(np.int64)
+
+
+def _differences(rgb: Codes) -> Codes:
+    """Colours of channels (..., 3 each): green, red less green, blue less green."""
+    r, g, b = (rgb[:, i::3] for i in range(3))
+    return np.stack([g, r - g, b - g], axis=2).reshape(rgb.shape)
+
+
+def _rgb(differences: Codes) -> Codes:
+    g, r, b = (differences[:, i::3] for i in range(3))
+    return np.stack([r + g, g, b + g], axis=2).reshape(differences.shape)
+
+
+def _sinh(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.sinh(np.clip(x, -50.0, 50.0))  # beyond all limits already, and finite
+
+
+def _sigmoid(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return 1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0)))
+
+
+def _logit(share: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float64]:
+    share = np.clip(share, least, 1.0 - SMALLEST_SHARE)
+    return np.log(share) - np.log1p(-share)
+
+
+def _within(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:
+    """float32 values within what a bundle may hold: rounding may have led beyond."""
+    limit = np.array(limit_of(name, kind) if name == "view_terms" else LIMITS.get(name, (np.inf,)))
+    return torch.from_numpy(np.clip(values, -limit, limit).astype(np.float32))

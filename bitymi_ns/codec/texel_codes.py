@@ -1,0 +1,285 @@
+"""Texels as integers: every tile's cosine transform, as coarse as the pictures allow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bitymi_ns.codec import streams
+from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.packing import Packing
+from bitymi_ns.codec.pages import paged_texels, size_classes
+
+BLOCK = 8
+"""Tiles are transformed in blocks of at most so many texels along a side."""
+GRADES = (-8, 24)
+"""A tile's step is the common one times 2^(grade / 2), with a grade from here."""
+RESIDUAL_STEP = 4.0 / 255
+"""Of the mean residuals of tiles, and of the residuals of surfels without a tile."""
+LEAST_WEIGHT = 1e-3
+"""Every texel counts as if it made up at least so much of a pixel, so that its values stay near those of the bake."""
+SPARSE_ROUNDS = 8
+"""Rounds in which coefficients that only texels nobody sees would need are shrunk."""
+SHRINK = 0.6
+"""By how much of its step a coefficient is shrunk in a round, where all texels of its block are seen alike."""
+_ATTEMPTS = 16
+_FAST = 9
+_LARGEST_STEP = 50.0
+# Brightness, and two differences: an orthonormal basis, so that errors are as large as those of the channels.
+_OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]])
+_OPPONENT = _OPPONENT / _OPPONENT.norm(dim=1, keepdim=True)
+
+
+@dataclass
+class TexelCodeOptions:
+    """How precisely texels are kept."""
+
+    step: float = 7.5
+    """Step of a coefficient, in 8-bit steps, of texels that make up one pixel of the views each: of those that make up
+    w pixels it is step / sqrt(w)."""
+    most_bytes: int | None = None
+    """Texels take no more than this: the step grows until they fit. None = it stays."""
+
+    def check(self) -> None:
+        """Refuses values that make no sense."""
+        if not 0.01 <= self.step <= 1000:
+            raise ValueError(f"the step of the texels must be from 0.01 to 1000, not {self.step}")
+        if self.most_bytes is not None and self.most_bytes < 1:
+            raise ValueError(f"no bytes are left for the texels ({self.most_bytes}): ask for more")
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """The blocks of one size of all tiles, by the rows of their surfels, then from the top, then from the left.
+
+    Attributes:
+        size: (b_u, b_v) texels.
+        tile: [B] int64, the number of the block's tile among the surfels that have one.
+        texels: [B, b_v, b_u] int64, rows of its texels in the list of `TexelTiles`.
+    """
+
+    size: tuple[int, int]
+    tile: Tensor
+    texels: Tensor
+
+    @property
+    def name(self) -> str:
+        """Of its column."""
+        return f"{self.size[0]}x{self.size[1]}"
+
+    @property
+    def order(self) -> list[tuple[int, int]]:
+        """(k_v, k_u) of the coefficients, in the order in which they are kept: from the lowest frequency."""
+        b_u, b_v = self.size
+        every = ((k_v, k_u) for k_v in range(b_v) for k_u in range(b_u))
+        return sorted(every, key=lambda k: (k[0] * b_u + k[1] * b_v, k))
+
+
+def blocks_of(sizes: Tensor) -> list[Blocks]:
+    """The blocks of tiles of the sizes [N, 2], by (b_u, b_v)."""
+    area = sizes.long().clamp(min=1).prod(dim=1)
+    first, number = area.cumsum(0) - area, (sizes[:, 0] > 0).long().cumsum(0) - 1
+    found: dict[tuple[int, int], list[tuple[Tensor, Tensor]]] = {}
+    for r_u, r_v, rows in size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1)):
+        b_u, b_v = min(r_u, BLOCK), min(r_v, BLOCK)
+        tile = torch.arange(r_u * r_v).view(r_v // b_v, b_v, r_u // b_u, b_u).transpose(1, 2).reshape(-1, b_v, b_u)
+        texels = first[rows, None, None, None] + tile
+        owner = number[rows].repeat_interleave(len(tile))
+        found.setdefault((b_u, b_v), []).append((owner, texels.reshape(-1, b_v, b_u)))
+    blocks = []
+    for size in sorted(found):
+        owner, texels = (torch.cat(parts) for parts in zip(*found[size], strict=True))
+        order = torch.argsort(owner, stable=True)
+        blocks.append(Blocks(size, owner[order], texels[order]))
+    return blocks
+
+
+@dataclass(frozen=True)
+class TexelCodes:
+    """The texels of N surfels as integers.
+
+    Attributes:
+        sizes: [N, 2] int64 sides of the tiles; (0, 0) = one constant.
+        step: of the coefficients of a tile of grade 0, colour units.
+        residual: [N, 3] int64, mean of every tile or the constant, in steps: green, red less green, blue less green.
+        residual_step: of these, colour units.
+        grades: [tiles] int64.
+        coefficients: of every entry of `blocks_of(sizes)`, int32 [coefficients, B, 3] in their order; the channels are
+            (r + g + b) / sqrt(3), (r - b) / sqrt(2), (r - 2 g + b) / sqrt(6).
+    """
+
+    sizes: Tensor
+    step: float
+    residual: npt.NDArray[np.int64]
+    residual_step: float
+    grades: Tensor
+    coefficients: Sequence[Tensor]
+
+    @property
+    def columns(self) -> dict[str, npt.NDArray[np.int64]]:
+        """The columns of texels.bin: name to [rows, numbers]."""
+        columns = {"grade": self.grades.numpy()[:, None]}
+        for blocks, values in zip(blocks_of(self.sizes), self.coefficients, strict=True):
+            columns[blocks.name] = values.reshape(-1, 3).numpy().astype(np.int64)
+        return columns
+
+    def nbytes(self, level: int = streams.LEVEL) -> int:
+        """Bytes of texels.bin."""
+        return sum(len(streams.pack(column, level).data) for column in self.columns.values())
+
+    @property
+    def constants(self) -> Tensor:
+        """[N, 3] mean residuals."""
+        return constants(self.residual, self.residual_step)
+
+    def texels(self) -> Tensor:
+        """[T, 3] residual colours, in the order of `TexelTiles`."""
+        every, tiled = self.constants, self.sizes[:, 0] > 0
+        texels = every.repeat_interleave(self.sizes.clamp(min=1).prod(dim=1), dim=0)
+        of_tile, steps = every[tiled], _steps(self.step, self.grades)
+        for blocks, coefficients in zip(blocks_of(self.sizes), self.coefficients, strict=True):
+            count, texels_of = coefficients.shape[1], len(blocks.order)
+            channels = coefficients.view(texels_of, -1).T.float() @ _waves(blocks)  # [B 3, texels]: one product
+            channels = channels.view(count, 3, -1).transpose(1, 2) * steps[blocks.tile, None, None]
+            rgb = channels @ _OPPONENT + of_tile[blocks.tile, None, :]
+            texels[blocks.texels.reshape(-1)] = rgb.reshape(-1, 3)
+        return texels
+
+
+def constants(residual: npt.NDArray[np.int64], step: float) -> Tensor:
+    """[N, 3] float32 residuals of integers: green, red less green, blue less green."""
+    g, r, b = np.ascontiguousarray(residual.T)
+    values = np.stack([r + g, g, b + g], axis=1) * step
+    return torch.from_numpy(np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT).astype(np.float32))
+
+
+def residual_codes(values: Tensor, step: float = RESIDUAL_STEP) -> npt.NDArray[np.int64]:
+    """[N, 3] integers of residuals."""
+    r, g, b = np.rint(values.double().numpy() / step).astype(np.int64).T
+    return np.stack([g, r - g, b - g], axis=1)
+
+
+class TexelCoder:
+    """Codes texels of given tiles, as the weights of the texels in the views decide."""
+
+    def __init__(self, sizes: Tensor, weights: Tensor, options: TexelCodeOptions) -> None:
+        """
+        Args:
+            sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
+            weights: [T] of the texels, in the order of `TexelTiles`: sum over views and fragments of the squared
+                blending weight times the bilinear weight. An error e of a texel adds weight times e^2 to the pictures.
+            options: see `TexelCodeOptions`.
+        """
+        options.check()
+        self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
+        self._step = options.step / 255
+        self._blocks = blocks_of(self._sizes)
+        tiled = self._sizes[:, 0] > 0
+        area = self._sizes.clamp(min=1).prod(dim=1)
+        self._owner = torch.repeat_interleave(torch.arange(len(area)), area)
+        mean = self._sums(self._weights[:, None])[:, 0] / area
+        low, high = GRADES
+        self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high)
+
+    def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
+        """Codes of texels [T, 3] of no more than so many bytes: makes this coder's step larger where that takes it.
+
+        Bytes fall about as 1 / step. They are estimated with a fast packing until they fit nearly, and then counted.
+        """
+        codes = self.code(texels, rounds)
+        for attempt in range(_ATTEMPTS):
+            found = codes.nbytes(_FAST if attempt == 0 else streams.LEVEL)
+            if found <= most_bytes:
+                break
+            self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.06, (found / most_bytes) ** 1.2)))
+            codes = self.code(texels, rounds)
+        return codes
+
+    def _sums(self, values: Tensor) -> Tensor:
+        """Sums over tiles of [T, ...]."""
+        return values.new_zeros(len(self._sizes), *values.shape[1:]).index_add_(0, self._owner, values)
+
+    @torch.no_grad()
+    def code(self, texels: Tensor, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
+        """Codes of texels [T, 3].
+
+        Coefficients c minimise sum over texels of weight (t - t(c))^2 plus a price on their sizes: by as many rounds of
+        a gradient step and a shrinkage. So texels that nobody sees take what their visible neighbours need.
+        """
+        weights = self._weights[:, None]
+        means = self._sums(texels * weights) / self._sums(weights)
+        residual = residual_codes(means)
+        codes = TexelCodes(self._sizes, self._step, residual, RESIDUAL_STEP, self.grades, [])
+        of_tile, steps = codes.constants[self._sizes[:, 0] > 0], _steps(self._step, self.grades)
+        coefficients = []
+        for blocks in self._blocks:
+            step = steps[blocks.tile, None, None, None]
+            target = texels[blocks.texels] - of_tile[blocks.tile, None, None, :]
+            values = self._sparse(blocks, target, step, rounds) / step
+            coefficients.append(_ordered(blocks, torch.sign(values) * torch.floor(values.abs() + 0.5)))
+        return replace(codes, coefficients=coefficients)
+
+    def _sparse(self, blocks: Blocks, target: Tensor, step: Tensor, rounds: int) -> Tensor:
+        values = _forward(target)
+        weight = self._weights[blocks.texels][..., None]
+        most = weight.amax(dim=(1, 2), keepdim=True)
+        price = SHRINK * step * weight.mean(dim=(1, 2), keepdim=True) / most
+        pull = weight / most
+        for _ in range(rounds):
+            values = values + _forward(pull * (target - _inverse(values)))
+            mean = values[:, 0, 0].clone()
+            values = torch.sign(values) * (values.abs() - price).clamp(min=0)
+            values[:, 0, 0] = mean
+        return values
+
+
+def pages(codes: TexelCodes, packing: Packing) -> Tensor:
+    """[layers, height, width, 3] float32 residual colours where the tiles lie; 0 elsewhere."""
+    return paged_texels(codes.texels(), packing)
+
+
+def _steps(step: float, grades: Tensor) -> Tensor:
+    return (step * torch.exp2(0.5 * grades.double())).float()
+
+
+@cache
+def _cosines(count: int) -> Tensor:
+    """[count, count] the orthonormal cosine transform: row k is frequency k."""
+    k, i = np.arange(count)[:, None], np.arange(count)[None]
+    rows = np.cos(math.pi * (i + 0.5) * k / count) * math.sqrt(2.0 / count)
+    rows[0] /= math.sqrt(2.0)
+    return torch.from_numpy(rows.astype(np.float32))
+
+
+def _forward(rgb: Tensor) -> Tensor:
+    """[B, k_v, k_u, channel] of [B, b_v, b_u, rgb]."""
+    v, u = _cosines(rgb.shape[1]), _cosines(rgb.shape[2])
+    across = torch.einsum("nvuc,lu->nvlc", rgb @ _OPPONENT.T, u)
+    return torch.einsum("kv,nvlc->nklc", v, across)
+
+
+def _inverse(values: Tensor) -> Tensor:
+    """[B, b_v, b_u, rgb] of [B, k_v, k_u, channel]."""
+    v, u = _cosines(values.shape[1]), _cosines(values.shape[2])
+    down = torch.einsum("kv,nklc->nvlc", v, values)
+    return torch.einsum("nvlc,lu->nvuc", down, u) @ _OPPONENT
+
+
+def _ordered(blocks: Blocks, values: Tensor) -> Tensor:
+    rows, columns = zip(*blocks.order, strict=True)
+    return values[:, list(rows), list(columns)].transpose(0, 1).to(torch.int32).contiguous()
+
+
+def _waves(blocks: Blocks) -> Tensor:
+    """[coefficients, texels] what each coefficient adds to a block's texels, in the order in which they are kept."""
+    b_u, b_v = blocks.size
+    v, u = _cosines(b_v), _cosines(b_u)
+    rows, columns = (list(each) for each in zip(*blocks.order, strict=True))
+    return (v[rows][:, :, None] * u[columns][:, None, :]).reshape(len(rows), b_v * b_u)

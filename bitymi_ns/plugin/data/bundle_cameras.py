@@ -1,0 +1,78 @@
+"""A bundle whose capture is gone: its cameras.json stands for the capture in all that needs no photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+
+from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.bundle.read import read_manifest
+from bitymi_ns.interchange.bundle_cameras import NamedCamera, named_cameras
+from bitymi_ns.plugin.data.lens import Pinhole
+from bitymi_ns.plugin.data.views import ALONE, Views, pinhole_cameras
+from bitymi_ns.plugin.errors import fail
+from bitymi_ns.trust import inside
+
+
+@dataclass
+class BundleCamerasConfig(DataParserConfig):
+    """The cameras that a bundle has of its capture."""
+
+    _target: type = field(default_factory=lambda: BundleCameras)
+    data: Path = Path()
+    """The bundle."""
+    capture: Path = Path()
+    """Where its capture was."""
+
+
+class BundleCameras(DataParser):
+    """Views of a capture as a bundle has them: cameras, without photographs."""
+
+    config: BundleCamerasConfig
+    downscale_factor = None  # nerfstudio sets it where photographs are not needed
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        folder = Path(self.config.data)
+        try:
+            info = read_manifest(folder)
+            rows = named_cameras(folder, info)
+            files = {row.name: inside(Path(self.config.capture), row.name) for row in rows}
+        except BundleError as error:
+            fail(str(error), error)
+        except ValueError as error:
+            fail(f"{folder}, {CAMERAS}: {error}.", error)
+        chosen = [row for row in rows if row.held_out == (split != "train")] or rows
+        world = info.world
+        return Views(
+            image_filenames=[files[row.name] for row in chosen],
+            cameras=_cameras(chosen),
+            dataparser_scale=float(world.scale),
+            dataparser_transform=torch.tensor(np.asarray(world.transform, np.float64)[:3]),
+            metadata={ALONE: True},
+        )
+
+
+def has_cameras(bundle: Path) -> bool:
+    """Whether a bundle states the cameras of its capture."""
+    try:
+        return bool(named_cameras(bundle, read_manifest(bundle)))
+    except BundleError as error:
+        fail(str(error), error)
+
+
+def _cameras(rows: Sequence[NamedCamera]) -> Any:
+    poses, pinholes = [], []
+    for _, _, camera in rows:
+        pose = torch.linalg.inv(camera.viewmat.double())
+        pose[:3, 1:3] *= -1.0  # OpenCV's axes to nerfstudio's
+        poses.append(pose.float())
+        K = camera.K.tolist()
+        pinholes.append(Pinhole(K[0][0], K[1][1], K[0][2], K[1][2], camera.width, camera.height))
+    return pinhole_cameras(pinholes, torch.stack(poses))

@@ -1,0 +1,149 @@
+"""Files by the names that a capture's files give them, also where these were written on another machine."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.plugin.errors import listed
+from bitymi_ns.trust import leads_inside
+
+Parts = tuple[str, ...]
+"""Of a name: its folders and the file, folded: of one case and one form of Unicode."""
+_DRIVE = re.compile(r"^[A-Za-z]:")
+
+
+def folded(name: str) -> Parts:
+    """A name without what differs between machines: separators, case, the form of Unicode, `.` and a drive."""
+    portable = _DRIVE.sub("", name).replace("\\", "/")
+    plain = unicodedata.normalize("NFC", os.path.normpath(portable)).casefold()
+    return tuple(part for part in plain.split("/") if part not in ("", "."))
+
+
+def without_ending(parts: Parts) -> Parts:
+    """A folded name without the ending of a picture."""
+    stem, ending = os.path.splitext(parts[-1])
+    return (*parts[:-1], stem if ending in PHOTOGRAPHS else parts[-1])
+
+
+class Files:
+    """The files below a folder, found by names that may differ in what machines and programs change.
+
+    In this order: the name itself; with other separators, case, Unicode or leading folders, as in absolute names of
+    another machine; also with another ending, or none. Only what is unambiguous is found.
+
+    Args:
+        folder: to which the names are relative.
+        outside: names may lead out of the folder; else only files in it are found.
+        endings: of the files, in lower case.
+    """
+
+    def __init__(self, folder: Path, outside: bool = False, endings: tuple[str, ...] = PHOTOGRAPHS) -> None:
+        self.folder = folder
+        self.outside = outside
+        self.endings = endings
+
+    def find(self, name: str) -> Path | None:
+        """The file of a name; None = there is none, or more than one."""
+        for exact in (name, name.replace("\\", "/")):
+            if self.may_be(exact) and (self.folder / exact).is_file():
+                return self.folder / exact
+        parts = folded(name)
+        if not parts:
+            return None
+        other = (parts, without_ending(parts))  # one more than it has, or another one
+        return self._like(parts) or next(filter(None, (self._like(each, endings=True) for each in other)), None)
+
+    def find_all(self, names: Sequence[str]) -> list[Path | None]:
+        """The files of several names. A file that would be that of two of them is that of the one it has the name of,
+        or of none."""
+        found = [self.find(name) for name in names]
+        users: dict[Path, list[int]] = defaultdict(list)
+        for i, path in enumerate(found):
+            if path is not None:
+                users[path].append(i)
+        for path, numbers in users.items():
+            if len(numbers) > 1:
+                exact = [i for i in numbers if self.folder / names[i] == path]
+                for i in numbers:
+                    if len(exact) != 1 or i != exact[0]:
+                        found[i] = None
+        return found
+
+    def may_be(self, name: str) -> bool:
+        """Whether a file may be looked for under this very name."""
+        return self.outside or leads_inside(name)
+
+    def missing(self, name: str) -> Path:
+        """Where a file that was not found is said to be missing."""
+        if self.may_be(name):
+            return self.folder / name
+        parts = PurePosixPath(name.replace("\\", "/").replace("\0", "_")).parts
+        return self.folder.joinpath(*("_" if part in ("/", "//", "..") else part for part in parts))
+
+    def ambiguous(self, name: str) -> list[str]:
+        """The files that a name without its ending may mean, where they are several."""
+        files = self._stems.get(without_ending(folded(name)), [])
+        return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
+
+    def nearest(self, name: str) -> str:
+        """Words on a file whose name is nearly this one, and what differs; empty where there is none."""
+        wanted = folded(name)[-1:]
+        last = {parts[-1]: files[0] for parts, files in self._whole.items()}
+        near = difflib.get_close_matches(wanted[0] if wanted else "", last, n=1, cutoff=0.8)
+        if not near:
+            return ""
+        there = last[near[0]].relative_to(self.folder).as_posix()
+        same = there.isascii() and name.isascii()
+        return f"but there is {there}" if same else f"but there is {there}, {ascii(there)}, instead of {ascii(name)}"
+
+    def _like(self, parts: Parts, endings: bool = False) -> Path | None:
+        table = self._stems if endings else self._whole
+        for start in range(len(parts)):  # the whole name first, then without its leading folders
+            files = table.get(parts[start:], [])
+            if files:
+                return files[0] if len(files) == 1 else None
+        deeper = [files for tail, files in table.items() if tail[-len(parts) :] == parts]
+        return deeper[0][0] if len(deeper) == 1 and len(deeper[0]) == 1 else None
+
+    @cached_property
+    def _whole(self) -> dict[Parts, list[Path]]:
+        table: dict[Parts, list[Path]] = defaultdict(list)
+        for path in sorted(self._walk()):
+            table[folded(path.relative_to(self.folder).as_posix())].append(path)
+        return dict(table)
+
+    @cached_property
+    def _stems(self) -> dict[Parts, list[Path]]:
+        table: dict[Parts, list[Path]] = defaultdict(list)
+        for parts, files in self._whole.items():
+            table[without_ending(parts)] += files
+        return dict(table)
+
+    def _walk(self) -> Iterator[Path]:
+        for folder, below, files in os.walk(self.folder):
+            below[:] = [name for name in below if not name.startswith(".")]
+            yield from (Path(folder, name) for name in files if name.lower().endswith(self.endings))
+
+
+def renamed(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
+    """A sentence on the files that were found under another name; empty where none was. Names without their ending are
+    usual, and so are either separators."""
+
+    def is_usual(name: str, file: Path) -> bool:
+        plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
+        return os.path.normpath(file) in (str(plain), f"{plain}{file.suffix}")
+
+    other = [
+        f"{file.relative_to(folder).as_posix()} for {name}"
+        for name, file in zip(names, files, strict=True)
+        if file.is_relative_to(folder) and not is_usual(name, file)
+    ]
+    return f"{len(other)} of {len(names)} photographs have other names than it says: {listed(other)}." if other else ""

@@ -1,0 +1,365 @@
+"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure what the bake cost.
+
+Also `python -m bitymi_ns.plugin.export.command`, should a future nerfstudio not take the command in.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+import yaml
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+
+from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn, rich_progress
+from bitymi_ns.bake.compact import Compact
+from bitymi_ns.bake.statistics import HeldOut
+from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
+from bitymi_ns.bundle.folder import CONFIG
+from bitymi_ns.bundle.manifest import MANIFEST, dump
+from bitymi_ns.bundle.read import download_bytes
+from bitymi_ns.bundle.write import World
+from bitymi_ns.capture.frame import UP, read_frame
+from bitymi_ns.files import reason, write_file
+from bitymi_ns.interchange import Frame, Kind, check_extras, described, place_of, write_extras
+from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.errors import fail, say, warn
+from bitymi_ns.plugin.export.cameras import camera_files
+from bitymi_ns.plugin.export.compact_options import BundleFormat, CompactOptions
+from bitymi_ns.plugin.export.summary import print_summary
+from bitymi_ns.plugin.export.target import bundle_place, bundle_version, check_room
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
+from bitymi_ns.plugin.run.memory import state_export
+from bitymi_ns.plugin.run.model import BitymiModel
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train.exposure import corrected
+from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.views import View, as_bytes
+
+INTERRUPTED = 130
+FEWEST_PASSES = 4
+"""Steps of polish or fine-tuning per photograph; with fewer than this a line says that more may gain."""
+STEPS_AFTER_LEARNING = 100
+"""Of the fine-tuning of texels that learned in training or in the polish: what is left to learn is what the reduction
+of tiles and view colours changed."""
+
+
+@dataclass(kw_only=True)
+class ExportAtlas(BakeOptions, CompactOptions):
+    """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
+
+    The bundle is written aside and renamed, opened again, and compared with the trained scene and with the photographs
+    on the held-out views.
+    """
+
+    load_config: Path
+    """config.yml of a trained scene."""
+    output_dir: Path
+    """Folder of the bundle."""
+    overwrite: bool = False
+    """Replace a bundle that is there already."""
+    format: BundleFormat | None = None  # type: ignore[assignment]  # of the bundle; that of the bake is `_options`
+    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a sixth to a
+    half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
+    and 8 bytes. Not given: compact, or bc7 where everything is kept (--exact, --tolerance 0)."""
+    exact: bool = False
+    """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
+    sites of the view colours, and texels as the field gives them, without fine-tuning."""
+    polish_steps: int | None = None
+    """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
+    without the network, before tiles and view colours are reduced; 0 = surfels stay as they were trained. Not given:
+    0 where texels learned in training already, and on a GPU, for which there are no kernels; else 300, or 4 for each
+    photograph where that is more."""
+    finetune_steps: int | None = None
+    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 where nothing but a field has learned
+    yet, 100 after a polish, both with 120 further ones that see what is stored of the texels; 100 that do so where
+    texels learned in training."""
+    finetune_memory: float = TuneOptions.cache_bytes / 1e9
+    """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
+    not."""
+    compare: bool = True
+    """Render the held-out views from the bundle and from the trained scene and state the difference."""
+
+    extras: tuple[Kind, ...] = ()
+    """Also write the scene for other programs, into a folder beside the bundle with its name and .extras: gaussians (a
+    preview as Gaussian splats), mesh (textured quads). `bitymi extras BUNDLE` does so later."""
+    extras_frame: Frame = "scene"
+    """Frame of these files: the scene's, or the capture's own."""
+    check_room: bool = True
+    """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
+    photographs: bool = False
+    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders; who is given the
+    bundle is given them."""
+
+    def main(self) -> None:
+        """Run the export."""
+        earlier = None
+        bake_options = self._options()
+        try:
+            with bundle_place(self.output_dir, self.overwrite):
+                earlier = bundle_version(self.output_dir)
+                if self.extras:
+                    check_extras(self.extras, place_of(self.output_dir), self.overwrite)
+                if self.check_room:
+                    check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
+                self._run(bake_options)
+        except KeyboardInterrupt:
+            there = bundle_version(self.output_dir)
+            state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
+            warn(f"The export was interrupted; the bundle {self.output_dir} {state}.")
+            raise SystemExit(INTERRUPTED) from None
+        except BundleError as error:
+            fail(str(error), error)
+
+    def _options(self) -> BakeOptions:
+        """Those of the bake; stops where any is out of its range, before anything is loaded."""
+        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions) if f.name != "format"})
+        if self.exact:
+            options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
+        form = self._form
+        # a compact bundle needs no encoder: its texels are decoded to 8 bits
+        options = replace(options, format="uint8" if form == "compact" else form)
+        if self.finetune_steps is not None and self.finetune_steps < 0:
+            fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
+        if self.polish_steps is not None and self.polish_steps < 0:
+            fail(f"--polish-steps must not be negative, it is {self.polish_steps}; 0 = no polish")
+        if not 0 <= self.finetune_memory <= 1e6:
+            fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
+        try:
+            options.check()
+        except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
+            fail(f"the scene cannot be baked: {error}", error)
+        self.check_compact(form, options.tolerance, options.bc7_profile)
+        return options
+
+    @property
+    def _form(self) -> BundleFormat:
+        return self.format or ("bc7" if self.exact or self.tolerance == 0 else "compact")
+
+    @property
+    def _is_compact(self) -> bool:
+        return self._form == "compact"
+
+    def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
+        """What learns from so many training photographs, and whether the bundle is compact."""
+        if self.exact:
+            return Learning()
+        has_learned, textured = isinstance(model.scene.field, TexelField), model.scene.field is not None
+        steps = self.polish_steps
+        if steps is None:
+            polishes = model.device.type == "cpu" and textured and not has_learned
+            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if polishes else 0
+        polish = PolishOptions(steps=steps) if steps and textured else None
+        steps = self.finetune_steps
+        if steps is None:
+            steps = TuneOptions.steps if polish is None and not has_learned else STEPS_AFTER_LEARNING
+        tune = None
+        if textured and steps:
+            options = TuneOptions.of_learned if has_learned else TuneOptions
+            tune = options(steps=steps, cache_bytes=int(self.finetune_memory * 1e9))
+        return Learning(polish, tune, model.train_config, compact)
+
+    def _run(self, options: BakeOptions) -> None:
+        config, pipeline = load_trained(self.load_config)
+        model, datamanager = pipeline.model, pipeline.datamanager
+        cameras = datamanager.undistorted_train_cameras()
+        views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
+        first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
+        shown = preview(model, first, "JPEG" if self._is_compact else "PNG")
+        cameras_of = camera_files(datamanager, views, self.photographs)
+        beside = len(shown) + sum(map(len, cameras_of.values()))
+        learning = self._learning(model, len(views), self.compact_of(beside) if self._is_compact else None)
+        polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
+        for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
+            if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
+                passes = options_of.steps / len(views)
+                say(
+                    f"The {name} has {options_of.steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
+                    f"for each: more may gain (--{name}-steps)."
+                )
+        if (tune or polish) and model.device.type != "cpu":
+            say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
+        if model.device.type == "cpu":
+            kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
+            state_export(model.scene, views, kept, learning_surfels, self._is_compact)
+        try:
+            with rich_progress() as progress:
+                held_out = datamanager.eval_views if self.compare else ()
+                background = model.background.cpu()
+                photographs = datamanager.train_views
+                if polish or tune or learning.compact:
+                    photographs = corrected(photographs, model.resume_state.get("exposure"))
+                baked = bake_and_learn(
+                    model.scene, views, photographs, background, options, learning, progress, held_out
+                )
+        except (ValueError, RuntimeError) as error:
+            fail(f"the scene cannot be baked: {error}", error)
+        background = tuple(model.background.tolist())
+        export(
+            baked,
+            self.output_dir,
+            background=background,
+            world=world_of(datamanager),
+            statistics={"options": asdict(options), "method": config.method_name},
+            extra_files={
+                "preview.jpg" if self._is_compact else "preview.png": shown,
+                **cameras_of,
+            },
+            loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
+            overwrite=self.overwrite,
+            interchange=self.interchange,
+            first=first,
+        )
+        bundle = read_bundle(self.output_dir)
+        if self.compare and len(datamanager.eval_dataset):
+            scene = bundle.scene
+            held_out = compare(model, datamanager, lambda c: scene.render(c, background=torch.tensor(background)).rgb)
+            bundle.info.statistics.held_out = held_out
+            replace_file(self.output_dir / MANIFEST, dump(bundle.info))
+        print_summary(self.output_dir, bundle.info)
+        self.state_size(download_bytes(self.output_dir, bundle.info))
+        if self.extras:
+            self._write_extras(bundle, views, datamanager.eval_views)
+
+    def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
+        """Beside the bundle, which is complete already; says what was written."""
+        folder = place_of(self.output_dir)
+        with rich_progress() as progress:
+            written = write_extras(
+                bundle,
+                folder,
+                self.extras,
+                frame=self.extras_frame,
+                cameras=[camera.to("cpu") for camera in cameras],
+                held_out=held_out if self.compare else (),
+                overwrite=self.overwrite,
+                progress=progress,
+            )
+        for each in written.values():
+            say(f"In {folder}: {described(each)}")
+
+
+def default_export() -> ExportAtlas:
+    """The options with their defaults; what has none is left open."""
+    return ExportAtlas(load_config=tyro.MISSING, output_dir=tyro.MISSING)
+
+
+def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
+    """Configuration and pipeline of a trained scene, at a step of which there is a checkpoint or at the last one."""
+
+    def choose(config: Any) -> Any:
+        config.load_step = step
+        return config
+
+    if (load_config.parent / MANIFEST).is_file():
+        fail(
+            f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
+            "it was made from."
+        )
+    if not load_config.is_file():
+        fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
+    try:
+        config, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=choose)
+    except (yaml.YAMLError, AttributeError, KeyError) as error:
+        fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
+    except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
+        detail = (str(error).strip().splitlines() or [""])[0]
+        if isinstance(error, AssertionError) and not detail:  # the host's word for another kind of file
+            fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
+        fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
+    if not isinstance(pipeline.model, BitymiModel):
+        fail(
+            f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
+            "give the config.yml of a bitymi training run"
+        )
+    return config, pipeline
+
+
+def world_of(datamanager: Any) -> World:
+    """Where the scene lies in the capture's own frame, and that in the real world where its poses were found here."""
+    outputs = datamanager.train_dataparser_outputs
+    report = getattr(datamanager.dataparser, "poses_report", None)
+    frame = None if report is None else read_frame(report)
+    transform, scale = np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)
+    return World(transform, scale) if frame is None else World(transform, scale, UP, frame.up, frame.metres_per_unit)
+
+
+@torch.no_grad()
+def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
+    """The trained scene as a camera sees it."""
+    rgb = model.render(camera, model.background, maps=False).rgb
+    buffer = io.BytesIO()
+    Image.fromarray(as_bytes(rgb).numpy()).save(buffer, format=format)
+    return buffer.getvalue()
+
+
+@torch.no_grad()
+def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
+    """PSNR in dB over the held-out views: means of bundle, trained scene and photographs against each other, also after
+    the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
+    rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
+    names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
+    names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")
+    means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
+    worst = round(min(row[0] for row in rows), 4)
+    return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
+
+
+@torch.no_grad()
+def held_out_psnr(
+    model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
+) -> list[list[float]]:
+    """Of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
+    bundle against photograph, and the last two after the affine fit of the colours."""
+    rows = []
+    background = model.background
+    for index in range(min(views, len(datamanager.eval_views))):
+        view = datamanager.eval_views[index]
+        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
+        baked = render_baked(view.camera.to("cpu")).clamp(0.0, 1.0)
+        photo = view.target(background.cpu(), "cpu")
+        mask = None if view.mask is None else view.mask.cpu()
+        of_photo = [measure(rgb, photo, mask) for measure in (psnr, cc_psnr) for rgb in (neural, baked)]
+        rows.append([psnr(baked, neural, mask), *of_photo])
+    return rows
+
+
+def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> bytes:
+    """The config.yml with which nerfstudio's tools open the bundle.
+
+    It is no part of what bundle.json vouches for: nothing of ours reads it, and its data path may have to be edited
+    when the photographs are moved.
+    """
+    config = copy.deepcopy(config)
+    config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=background)  # type: ignore[arg-type]
+    config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None
+    config.optimizers = {}
+    vars(config).pop("read_from", None)
+    return yaml.dump(config).encode("utf8")
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    try:
+        write_file(path, data)
+    except OSError as error:
+        fail(f"{path} could not be written: {reason(error, path)}.", error)
+
+
+def main() -> None:
+    """Command line of this module."""
+    tyro.cli(tyro.conf.FlagConversionOff[ExportAtlas], default=default_export()).main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""What an export says when it is done: what was written, what was left out, and what it cost."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from rich.table import Table
+
+from bitymi_ns.bake.statistics import FineTuning, Percentiles
+from bitymi_ns.bundle.manifest import Manifest
+from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
+from bitymi_ns.ops import VIEW_COLORS
+from bitymi_ns.plugin.errors import say
+from bitymi_ns.trust import printable
+
+
+def decibels(value: float | None) -> str:
+    """For the table; pictures that are equal have no finite PSNR, nor have those of which no pixel counts."""
+    return "no number" if value is None else f"{value:.2f} dB"
+
+
+def print_summary(folder: Path, info: Manifest) -> None:
+    """What was written, what was left out, and what it cost."""
+    statistics = info.statistics
+    surfels = statistics.surfels
+    table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
+    table.add_row("Surfels", f"{surfels.trained:,} -> {info.surfels.count:,}")
+    left_out = {name: count for name, count in surfels.left_out if count}
+    table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
+    if statistics.texels is not None:
+        print_savings(table, info)
+    levels = statistics.field
+    if levels is not None:
+        alone = ", ".join(f"{change:.2f}" for change in levels.change_of_each)
+        table.add_row("Levels of the field", f"{levels.levels} -> {levels.kept[1]}")
+        table.add_row("", f"(each alone changes a surfel by up to {alone} steps; tolerance {levels.tolerance:g})")
+    print_view_color(table, info)
+    atlas = statistics.atlas
+    if atlas is None:
+        why = "the scene has no texture" if statistics.texels is None else "no tile is needed"
+        table.add_row("Atlas", f"none ({why})")
+    else:
+        layers, height, width = atlas.pages
+        size = info.files[info.atlas.file].bytes
+        table.add_row("Atlas", f"{size / 1e6:.2f} MB {info.atlas.format}, {layers} x {width} x {height} texels")
+        table.add_row("Occupancy", f"{100 * atlas.occupancy:.1f} %")
+        if atlas.psnr is not None:
+            table.add_row("Quantisation", f"{atlas.psnr:.2f} dB over the texels")
+    for name, learned in (("Polish", statistics.polish), ("Fine-tuning", statistics.finetune)):
+        if learned is not None:
+            print_tuning(table, name, learned)
+    table.add_row("Files", f"{sum(entry.bytes for entry in info.files.values()) / 1e6:.2f} MB in total")
+    held_out = statistics.held_out
+    if held_out is not None:
+        table.add_row("Held-out views", f"{held_out.views}")
+        table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))
+        for name, form in (("Trained scene", "neural"), ("Bundle", "baked")):
+            plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "cc_psnr"))
+            table.add_row(
+                f"{name} against photographs", f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
+            )
+    CONSOLE.print(table)
+    say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
+
+
+def print_savings(table: Table, info: Manifest) -> None:
+    """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
+    statistics, options = info.statistics, info.statistics.options
+    texels = statistics.texels
+    learned = [part.error_before for part in (statistics.polish, statistics.finetune) if part is not None]
+    error = statistics.error or next((each for each in learned if each is not None), None)
+    kept, count = texels.kept, info.surfels.count
+    table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
+    if texels.paper is not None:
+        table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
+        voxel = "local voxel" if options.local_voxel else "smallest voxel"
+        table.add_row(f"... by the {voxel}, extent {options.extent:g}", f"{texels.nyquist:,}")
+    if texels.learned is not None:
+        table.add_row("Texels that learned", f"{texels.learned:,}")
+    else:
+        table.add_row("... no finer than a view sees", f"{texels.after_cap_by_views:,}")
+        table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
+    if texels.polished is not None:
+        table.add_row("... by the pixels that show them: polished", f"{texels.polished:,}")
+    first = texels.paper or texels.learned or texels.within_visible_part
+    table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, first):.1f} %)")
+    rule = first * BYTES_PER_TEXEL["bc7" if info.surfels.columns else options.format]
+    stored = info.files[info.atlas.file].bytes if info.atlas else 0
+    table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
+    certificate = statistics.certificate
+    if certificate is not None:
+        count, of = certificate.within + certificate.beyond, {"field": "the field", "texels": "what was learned"}
+        table.add_row("As stored and seen", f"{certificate.within:,} of {count:,} surfels within the tolerance")
+        worst = "no number" if certificate.worst is None else f"at most {certificate.worst:.2f} steps"
+        table.add_row("", f"({certificate.tolerance:g} steps from {of[certificate.against]}; {worst})")
+    if error is None:  # the tiles hold what was learned, not the field
+        return
+    tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
+    table.add_row("Error of a tile", percentiles_text(error.rms))
+    when = "before the texels learned" if statistics.error is None else "as stored"
+    table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
+
+
+def print_view_color(table: Table, info: Manifest) -> None:
+    """What the surfels keep of their view colours, and what that saves and costs."""
+    lean, stored = info.statistics.view_color, info.files[info.surfels.file].bytes
+    if lean is None:
+        table.add_row("View colour", "all of it is kept")
+        table.add_row("Surfel bytes", f"{stored:,}")
+        return
+    sites, count = lean.sites, info.surfels.count
+    share = 100 * sites.after / sites.before
+    table.add_row(VIEW_COLORS[lean.kind].kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
+    table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
+    if info.surfels.columns is None:
+        whole = stored + lean.bytes.before - lean.bytes.after
+        table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
+    else:
+        table.add_row("Surfel bytes", f"{stored:,} ({stored / max(1, count):.1f} per surfel)")
+    table.add_row("Error of a view colour", percentiles_text(lean.error))
+    table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
+
+
+def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
+    """What the polish or the fine-tuning gained, and why it ended."""
+    if not tuned.steps:
+        table.add_row(name, f"none: {tuned.views} training views are too few to set some aside")
+        return
+    table.add_row(name, f"{tuned.steps} steps, {tuned.seconds:.0f} s")
+    if tuned.steps < tuned.steps_asked:
+        table.add_row("", f"(stopped early at step {tuned.steps} of {tuned.steps_asked}: no gain on the")
+        table.add_row("", f"set-aside training views for {tuned.steps - tuned.best_step} steps)")
+    gains = {"... set-aside training views": tuned.psnr_held_in, "... held-out views": tuned.psnr_held_out}
+    for views, gain in gains.items():
+        if gain is not None:
+            table.add_row(views, f"{gain.before:.2f} -> {gain.after:.2f} dB")
+
+
+def percentiles_text(error: Percentiles) -> str:
+    """Of an error in 8-bit steps."""
+    return f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"

@@ -1,0 +1,82 @@
+"""Whether what a command makes will find its place: found out before the work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bundle.folder import check_target
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
+from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text
+from bitymi_ns.plugin.errors import fail, warn
+
+SURFEL_BYTES = 60 * 4
+"""Bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments."""
+TYPICAL_SIDE = 32
+"""Side of a texture tile in texels, estimated generously: within a tolerance most are far smaller."""
+
+
+def see_writable(path: Path) -> None:
+    """Stop where a file or folder cannot be written."""
+    try:
+        check_writable(path)
+    except OSError as error:
+        fail(f"{path} cannot be written: {reason(error, path)}.", error)
+
+
+@contextmanager
+def bundle_place(folder: Path, overwrite: bool) -> Iterator[None]:
+    """Hold the place of a bundle; stop where another process does, or where a bundle may not or cannot be written."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(reserved(folder, warn))
+            check_target(folder, overwrite)
+        except OSError as error:
+            fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
+        except BundleError as error:
+            fail(f"{error}.", error)
+        yield
+
+
+def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool, compact: bool = False) -> None:
+    """Stop where there may be too little room for a bundle."""
+    needed, free = space_needed(load_config, options, exact, compact), free_bytes(folder)
+    if free < needed:
+        beside = " beside the earlier one" if folder.exists() else ""
+        fail(
+            f"there may be too little room for {folder}: {size_text(free)} are free, and a bundle of this scene may "
+            f"take up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint). Free some "
+            "space, give an --output-dir on another disk, or try it all the same with --check-room False: if the disk "
+            "gets full, nothing is left behind."
+        )
+
+
+def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: bool = False) -> int:
+    """A generous estimate of the bytes of a run's bundle.
+
+    It assumes that the newest checkpoint holds nothing but surfels, each with a tile of 32 x 32 texels, or with the
+    largest tile where everything is kept.
+
+    Args:
+        load_config: config.yml of the run; without a checkpoint beside it the estimate is 0.
+        options: of the bake.
+        exact: whether everything is kept.
+        compact: whether the bundle is compact, of which a texel takes less than a byte.
+    """
+    newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
+    surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
+    side = options.r_max if exact else min(options.r_max, TYPICAL_SIDE)
+    texel = 1 if compact else BYTES_PER_TEXEL[options.format]
+    return surfels * (SURFEL_BYTES + side * side * texel)
+
+
+def bundle_version(folder: Path) -> tuple[int, int] | None:
+    """What tells a bundle from another one in its place; None where there is none."""
+    try:
+        found = (folder / MANIFEST).stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns

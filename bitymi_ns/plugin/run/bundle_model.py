@@ -1,0 +1,105 @@
+"""A bundle as a nerfstudio model: what ns-eval, ns-viewer and ns-render show of a baked scene."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.models.base_model import ModelConfig
+from torch import Tensor
+
+from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
+from bitymi_ns.bundle.read import download_bytes
+from bitymi_ns.ops import webgpu
+from bitymi_ns.plugin.errors import fail
+from bitymi_ns.plugin.run.device import kernel_device
+from bitymi_ns.plugin.run.surfel_model import SurfelModel
+from bitymi_ns.scene.baked import FAST, BakedOutput
+from bitymi_ns.scene.camera import Camera
+
+RENDERER = "BITYMI_RENDERER"
+"""Environment variable that goes before `BakedModelConfig.renderer`: ns-eval has no option for it."""
+
+
+@dataclass
+class BakedModelConfig(ModelConfig):
+    """A scene baked into a bundle."""
+
+    _target: type = field(default_factory=lambda: BakedModel)
+    enable_collider: bool = False
+    bundle: Path = Path()
+    """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour behind the scene."""
+    renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
+    """kernels: on CUDA or the CPU; fast: the same, and a pixel ends where less than half of an 8-bit step of light is
+    left; webgpu: on graphics of any maker, which needs the package wgpu."""
+
+
+class BakedModel(SurfelModel):
+    """Renders from the files of a bundle alone: no network, no checkpoint."""
+
+    config: BakedModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        folder, renderer = Path(self.config.bundle), self._renderer()
+        through_webgpu = renderer == "webgpu"
+        on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
+        try:
+            bundle = read_bundle(folder, decode=not on_card)
+        except BundleError as error:
+            fail(f"{error}. {REMEDY}", error)
+        atlas = bundle.info.atlas
+        self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
+        self._bundle_bytes = download_bytes(folder, bundle.info)
+        self._scene = bundle.scene
+        self._scene.through_webgpu = through_webgpu
+        if renderer == "fast":
+            self._scene.transmittance_min = FAST
+        self._count = len(bundle)
+
+    def _renderer(self) -> str:
+        """The renderer that is asked for; stops where there is none of that name, or no WebGPU."""
+        asked = os.environ.get(RENDERER) or self.config.renderer
+        if asked not in ("kernels", "fast", "webgpu"):
+            fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
+        if asked == "webgpu":
+            try:
+                webgpu.require()
+            except webgpu.WebGpuUnavailable as error:
+                fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
+        return asked
+
+    def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
+        try:
+            drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+        except webgpu.WebGpuUnavailable as error:
+            fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
+        if not self._scene.through_webgpu:
+            return drawn
+        return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
+
+    def surfel_count(self) -> int:
+        return self._count
+
+    @property
+    def background(self) -> Tensor:
+        return torch.tensor(self.config.background, device=self.device)
+
+    def size_metrics(self) -> dict[str, float]:
+        sizes = {"atlas_bytes": float(self._atlas_bytes), "bundle_bytes": float(self._bundle_bytes)}
+        return {**super().size_metrics(), **sizes}
+
+    def to(self, *args: Any, **kwargs: Any) -> BakedModel:
+        super().to(*args, **kwargs)
+        if self._scene.tiles.device != self.device and not self._scene.through_webgpu:
+            self._scene = self._scene.to(self.device)
+        return self
+
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Nothing to load: everything is in the bundle."""
+        return torch.nn.modules.module._IncompatibleKeys([], [])

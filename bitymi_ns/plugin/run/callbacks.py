@@ -1,0 +1,232 @@
+"""A training run inside nerfstudio's loop: what it calls before, in and after a step, and the curve of progress."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NoReturn
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+from torch.nn import Parameter
+
+from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.exif import stops_of
+from bitymi_ns.plugin.data.fingerprint import capture_print, warn_of_another
+from bitymi_ns.plugin.errors import fail, listed, say, warn
+from bitymi_ns.plugin.run.curve import FILE, TrainingCurve, points
+from bitymi_ns.plugin.run.memory import state_training
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train import bounds
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.coverage import views_without_surfels
+from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
+from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.step import Training
+from bitymi_ns.train.views import TrainingData, View, covered_share
+
+
+class TrainingRun:
+    """Ties `Training` to nerfstudio's loop. Order of a step there:
+
+    `before` -> the data manager's `next_train` -> `losses` -> backward -> `Training.combine` -> optimisers -> `after`.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        attributes: TrainingCallbackAttributes,
+        metadata: Mapping[str, Any],
+        background: Tensor,
+        resume_state: Mapping[str, Any],
+        curve_points: int,
+        curve_views: int,
+    ) -> None:
+        """
+        Args:
+            scene: what is learned.
+            config: training options.
+            attributes: nerfstudio's trainer, pipeline and optimisers.
+            metadata: what the data manager says about the capture.
+            background: [3] colour behind held-out views.
+            resume_state: `state` of the run that is continued; empty = a new run.
+            curve_points, curve_views: of the training curve.
+        """
+        trainer, pipeline = attributes.trainer, attributes.pipeline
+        if trainer is None or pipeline is None or attributes.optimizers is None:
+            raise ValueError("a training run needs nerfstudio's trainer, pipeline and optimisers")
+        self.scene, self.config, self.background = scene, config, background
+        self.datamanager = pipeline.datamanager
+        self.total: int = trainer.config.max_num_iterations
+        self.first_step: int = trainer._start_step
+        self._parameters = attributes.optimizers.parameters
+        self._curve_views = curve_views
+        data = TrainingData(
+            self.datamanager.train_views,
+            scene_extent(metadata["camera_centers"], scene.surfels["means"]),
+            metadata["train_pixels"],
+            metadata["first_surfels"],
+            covered_share(self.datamanager.train_views),
+            stops_of(self.datamanager.train_dataset.image_filenames),
+        )
+        optimizers = attributes.optimizers.optimizers
+        try:
+            processes = trainer.processes
+            self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
+        except ValueError as error:
+            fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
+        attributes.optimizers.before_step = self.training.combine
+        self.capture = capture_print(self.datamanager.train_dataset)
+        self._random_state: Tensor | None = None
+        if resume_state:
+            self.training.load_state_dict(resume_state)
+            self._random_state = resume_state["random"]
+            if "capture" in resume_state:  # checkpoints of earlier versions have none
+                warn_of_another(resume_state["capture"], self.capture)
+        self.curve_steps = points(self.total, curve_points)
+        resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
+        self.curve = TrainingCurve(
+            trainer.base_dir / FILE,
+            None if resumed_from is None else resumed_from.parent / FILE,
+            self.first_step,
+        )
+        self.names = {
+            "experiment_name": trainer.config.experiment_name,
+            "method_name": trainer.config.method_name,
+        }
+        self._held_back = False  # whether it was said that densification meets its bound
+        for sentence in bounds.short_run(
+            self.training.schedule,
+            len(self.datamanager.train_dataset),
+            scene.config.texture == "hash",
+            processes.views,
+        ):
+            say(sentence)
+        _ = self.datamanager.cached_train  # read the images now: loading is not training time
+        if self.curve_steps:
+            _ = self.datamanager.cached_eval
+        self.datamanager.check_pictures()
+        if self.first_step == 0:
+            self._check_start()
+        if background.device.type == "cpu":
+            train = self.datamanager.train_dataset.cameras
+            cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1]))
+            learns = scene.config.texture == "texels"
+            texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
+            state_training(scene, cameras, self.training.strategy.most, texels, to_come, processes.count)
+        self.datamanager.step_view = self.training.view
+
+    def _check_start(self) -> None:
+        """Stop, or warn, when views see nothing of what training starts from: no gradient would come from them."""
+        dataset = self.datamanager.train_dataset
+        cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
+        blind = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
+        if len(blind) == len(dataset):
+            fail(
+                f"none of the {len(self.scene):,} points that training starts from lies in any training view: "
+                "nothing could be learned. Either the point cloud is in another frame than the poses, or the cameras "
+                "look the other way (nerfstudio's axes are x right, y up, z back)."
+            )
+        if blind:
+            warn(
+                f"{listed(blind)} sees none of the points that training starts from: the pose may be wrong, or the "
+                "point cloud has no points there."
+            )
+
+    def callbacks(self) -> list[TrainingCallback]:
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.before),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self.after),
+        ]
+
+    def state(self) -> dict[str, Any]:
+        """Everything beside parameters and optimisers that decides how the run goes on."""
+        return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
+
+    # a step
+
+    def before(self, step: int) -> None:
+        """Set the learning rates of the step."""
+        if self._random_state is not None:
+            torch.set_rng_state(self._random_state)
+            self._random_state = None
+        undecided, field = not self.training.exposure.decided, self.scene.field
+        self.training.begin(step)
+        if self.scene.field is not field:
+            assert isinstance(self.scene.field, TexelField)
+            say(f"From step {step} on every surfel has its own texels, {len(self.scene.field.texels):,} in all.")
+        if undecided:
+            say(self.training.exposure.sentence)
+
+    def losses(self, view: View) -> dict[str, Tensor]:
+        """Render the step's view and compare it with its photograph."""
+        try:
+            return self.training.losses(view)[0]
+        except ValueError as error:
+            self._diverged(error)
+
+    def after(self, step: int) -> None:
+        """Densify and prune; then, with the clock stopped, note how far the run has come."""
+        try:
+            if step in self.curve_steps:
+                self.training.watch.finish(self.scene)
+            report = self.training.finish()
+        except ValueError as error:
+            self._diverged(error)
+        if report.get("held_back") and not self._held_back:
+            self._held_back = True
+            most = self.training.strategy.most
+            warn(bounds.held_back(int(report["held_back"]), most, self.config))
+        if report:
+            writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
+        if step in self.curve_steps:
+            self._add_point(step)
+
+    def _diverged(self, error: ValueError) -> NoReturn:
+        fail(
+            f"training cannot go on at step {self.training.step}: {error}. Earlier checkpoints are kept; lower "
+            "learning rates (--pipeline.model.train.lr.*) may help.",
+            error,
+        )
+
+    def _on_resize(self, name: str, parameter: Parameter) -> None:
+        self._parameters[name] = [parameter]  # used by gradient clipping
+
+    # the curve
+
+    def _add_point(self, step: int) -> None:
+        quality = self._held_out(all_views=step + 1 >= self.total)
+        point = {
+            "step": step + 1,
+            "seconds": round(self.training.clock.seconds, 4),
+            "cpu_seconds": round(self.training.clock.cpu_seconds, 4),
+            "surfels": len(self.scene),
+        }
+        shown = ""
+        if quality is not None:
+            point |= {name: round(value, 4) for name, value in quality._asdict().items()}
+            shown = f"{quality.psnr:6.2f} dB held out, "
+            writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
+        self.curve.add({**point, **self.names})
+        CONSOLE.print(
+            f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
+            f"{self.training.clock.seconds:.0f} s of training"
+        )
+
+    def _held_out(self, all_views: bool) -> Quality | None:
+        """Means over held-out views at full size; None where no pixel counts."""
+        views = self.datamanager.eval_views
+        rows = evenly_spaced(len(views), 0 if all_views else self._curve_views)
+        quality = held_out_quality(
+            lambda camera: self.scene.render(camera, background=self.background, field_mode="frozen"),
+            OnDemand(len(rows), lambda i: views[rows[i]]),
+            self.background,
+            self.background.device,
+        )
+        return None if math.isnan(quality.psnr) else quality

@@ -1,0 +1,303 @@
+"""nerfstudio configurations of the registered methods, made from the presets."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+import yaml
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import OptimizerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from bitymi_ns.files import reason, write_file
+from bitymi_ns.plugin.data import kept_poses
+from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
+from bitymi_ns.plugin.data.capture_checks import check_capture
+from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.errors import fail, say, warn
+from bitymi_ns.plugin.run import checkpoints, run_folder
+from bitymi_ns.plugin.run.bundle_config import find_bundle, stub_checkpoint_dir
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
+from bitymi_ns.plugin.run.commands import folder_being_evaluated, moved_capture, refuse_others
+from bitymi_ns.plugin.run.device import default_device_type, has_cuda_kernels, why_not_cuda
+from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
+from bitymi_ns.plugin.run.pipeline import BitymiPipelineConfig
+from bitymi_ns.plugin.run.preset import Preset, load_preset
+from bitymi_ns.plugin.run.trainer import BitymiTrainer
+from bitymi_ns.plugin.run.viewer import LOOPBACK, adopt_viewer
+from bitymi_ns.train.config import AdamConfig
+
+SEEDS = 1 << 32
+"""End of the range of seeds that numpy takes."""
+
+
+@dataclass
+class BitymiTrainerConfig(TrainerConfig):
+    """Configuration of a training run."""
+
+    _target: type = field(default_factory=lambda: BitymiTrainer)
+    read_from = None  # folder of the config.yml that was loaded for evaluation; no field: config.yml is not to state it
+    processes = 1  # of the run; no field: --machine.num-devices says it, which nerfstudio is not to see
+    vis: Literal[
+        "none",
+        "viewer",
+        "wandb",
+        "tensorboard",
+        "comet",
+        "viewer+wandb",
+        "viewer+tensorboard",
+        "viewer+comet",
+        "viewer_legacy",
+    ] = "viewer"
+    """Which visualizer to use; none = no viewer and no log but the training curve."""
+    max_num_iterations: int | None = None
+    """Length of the run in steps; schedules scale. Not given: --default-iterations; a resumed run: as before."""
+    default_iterations: int = 30_000
+    """Steps of a run on a GPU when --max-num-iterations is not given."""
+    default_iterations_cpu: int = 3_000
+    """Steps of a run without a supported GPU when --max-num-iterations is not given."""
+    steps_per_save: int | None = None
+    """Number of steps between checkpoints; not given: see --default-saves."""
+    default_saves: int = 5
+    """Checkpoints written over a run when --steps-per-save is not given."""
+    prompt: tyro.conf.Suppress[str | None] = None
+    """Of nerfstudio's text-to-scene methods."""
+    optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+    """By parameter group. Not in the help: the rates come from --pipeline.model.train.lr."""
+
+    def set_timestamp(self) -> None:
+        """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
+        super().set_timestamp()
+        if not 0 <= self.machine.seed < SEEDS:
+            fail(f"--machine.seed must be from 0 to {SEEDS - 1}, not {self.machine.seed}")
+        if self.machine.device_type != "cpu" and (why := why_not_cuda()):
+            warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
+            self.machine.device_type = "cpu"
+        self._check_machine()
+        self._make_paths_absolute()
+        self._take_poses_of_resumed()
+        if self.load_dir is None and self.load_checkpoint is None:
+            self.resolve_length()  # a resumed run learns its length from the checkpoint
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The trainer of a process; that of the first starts the others."""
+        return super().setup(**{**kwargs, "world_size": self.processes})
+
+    def _check_machine(self) -> None:
+        machine = self.machine
+        for name in ("mixed_precision", "use_grad_scaler"):
+            if getattr(self, name):
+                fail(
+                    f"--{name.replace('_', '-')} True is not supported: it scales the loss, and with it the gradients "
+                    "by which texels move and surfels are densified. The kernels compute in single precision anyway; "
+                    "leave the option out"
+                )
+        if machine.num_machines != 1:
+            fail(f"a run is of one machine, not {machine.num_machines} (--machine.num-machines)")
+        if machine.num_devices < 1:
+            fail(f"--machine.num-devices must be at least 1, not {machine.num_devices}")
+        if machine.device_type == "cuda" and machine.num_devices > (cards := torch.cuda.device_count()):
+            fail(f"there are {cards} of {machine.num_devices} GPUs that --machine.num-devices asks for")
+
+    def print_to_terminal(self) -> None:
+        """Nothing: nerfstudio would print every option here, before anything is checked. All of them are in config.yml,
+        and `save_config` says what matters."""
+
+    def save_config(self) -> None:
+        """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
+        folder that cannot be used shows here. What can be checked before anything is written is checked now."""
+        check_capture(self.pipeline.datamanager)
+        folder = self.get_base_dir()
+        if self.load_dir is None and self.load_checkpoint is None:
+            run_folder.check_unused(folder, self.get_checkpoint_dir())
+        run_folder.take(folder)
+        try:
+            write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
+        except OSError as error:
+            fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
+        # what follows in nerfstudio would start the processes its own way, see `several`
+        self.processes, self.machine = self.machine.num_devices, replace(self.machine, num_devices=1)
+        say(self.summary())
+
+    def summary(self) -> str:
+        """Method, capture, length, device and output folder of the run, a line each."""
+        resumed = self.load_dir or self.load_checkpoint
+        lines = {
+            "method": self.method_name,
+            "capture": self.pipeline.datamanager.data,
+            "length": self.length() if resumed is None else f"goes on from {resumed}",
+            "output": f"{self.get_base_dir()} (every option is in its config.yml)",
+        }
+        return "\n".join(f"{name:8} {value}" for name, value in lines.items())
+
+    def resolve_length(self, trained_for: int | None = None) -> None:
+        """Fill in the length of the run where it was not given.
+
+        Args:
+            trained_for: the length of the run that is resumed.
+        """
+        if self.max_num_iterations is None:
+            default = self.default_iterations_cpu if self.machine.device_type == "cpu" else self.default_iterations
+            self.max_num_iterations = trained_for or default
+        if self.max_num_iterations < 1:
+            fail(f"--max-num-iterations must be at least 1, not {self.max_num_iterations}")
+        self.pipeline.model.steps = self.max_num_iterations
+        if self.steps_per_save is None:
+            self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
+
+    def length(self) -> str:
+        """The number of steps and the device, with the reason where the run is shorter than on a GPU."""
+        text = f"{self.max_num_iterations:,} steps on {self.machine.device_type}"
+        if self.processes > 1:
+            text += f", each on {self.processes} views by as many processes"
+        short = self.max_num_iterations == self.default_iterations_cpu != self.default_iterations
+        if self.machine.device_type == "cpu" and short:
+            why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"
+            text += f", the short schedule ({why}); for the full one: --max-num-iterations {self.default_iterations}"
+        return text
+
+    def _make_paths_absolute(self) -> None:
+        """So that the capture is found from any folder, also by the commands that read config.yml later."""
+        datamanager = self.pipeline.datamanager
+        if datamanager.data is None:  # given to the dataparser; the experiment is named after this one
+            datamanager.data = getattr(datamanager.dataparser, "data", None)
+        for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
+            path = getattr(owner, "data", None)
+            if path is not None:
+                owner.data = Path(os.path.expanduser(path)).absolute()
+        if isinstance(datamanager.dataparser, BitymiDataParserConfig):
+            datamanager.dataparser.settle()
+
+    def _take_poses_of_resumed(self) -> None:
+        """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
+        checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
+        if checkpoints_of is not None:
+            self._take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
+            dataparser = self.pipeline.datamanager.dataparser
+            poses = getattr(dataparser, "poses", None)
+            if poses is not None and kept_poses.are_in(Path(poses)):
+                dataparser.sfm = kept_poses.settings_in(Path(poses), dataparser.sfm)
+        elif isinstance(self.pipeline.datamanager.dataparser, BitymiDataParserConfig):
+            self.pipeline.datamanager.dataparser.poses = None
+
+    def _take_poses_of(self, run: Path) -> None:
+        """Have the data read with the poses in this run's folder, where it keeps any."""
+        dataparser = self.pipeline.datamanager.dataparser
+        if isinstance(dataparser, BitymiDataParserConfig) and kept_poses.are_in(run / run_folder.POSES):
+            dataparser.poses = run / run_folder.POSES
+
+    def is_viewer_enabled(self) -> bool:
+        return self.vis != "none" and super().is_viewer_enabled()
+
+    def get_checkpoint_dir(self) -> Path:
+        """The folder of the checkpoints; for the configuration in a bundle, a stand-in that satisfies nerfstudio.
+
+        nerfstudio's tools ask here before they build the model. So this is also where a bundle or a run is found that
+        was moved, or that is used from another folder than it was trained in.
+        """
+        model, evaluated = self.pipeline.model, folder_being_evaluated()
+        if evaluated is not None:
+            refuse_others()
+            adopt_viewer(self)
+            moved_capture(self.pipeline.datamanager)
+        if isinstance(model, BakedModelConfig):
+            model.bundle = find_bundle(model.bundle)
+            self.read_from = evaluated
+            self._read_cameras_of(model.bundle)
+            return stub_checkpoint_dir(model.bundle)
+        folder = super().get_checkpoint_dir()
+        if evaluated is not None:
+            if (evaluated / self.relative_model_dir).is_dir():
+                folder, self.read_from = evaluated / self.relative_model_dir, evaluated
+            self._choose_checkpoint(folder)
+            self._take_poses_of(evaluated)
+        return folder
+
+    def get_base_dir(self) -> Path:
+        """The folder of the run; of one that is evaluated, that of its config.yml, from whatever folder that is done
+        and wherever the run was moved."""
+        return super().get_base_dir() if self.read_from is None else self.read_from
+
+    def _read_cameras_of(self, bundle: Path) -> None:
+        """Where the capture of a bundle is gone, have the bundle's own cameras read instead of it."""
+        datamanager = self.pipeline.datamanager
+        data = datamanager.data or getattr(datamanager.dataparser, "data", None)
+        if data is not None and not Path(data).exists() and has_cameras(bundle):
+            datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
+            datamanager.data = bundle
+
+    def _choose_checkpoint(self, folder: Path) -> None:
+        """Fix the checkpoint that nerfstudio's tools will load, and stop now if it cannot be used: they would report
+        that with a traceback."""
+        # in a resumed run the recorded step is that of the run it went on from
+        if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
+            self.load_step = checkpoints.newest_step(folder)
+        checkpoints.load(checkpoints.path_of(folder, self.load_step), self.pipeline.model.scene)
+
+
+@dataclass
+class BitymiAdamConfig(OptimizerConfig):
+    """Adam; the learning rate is set at every step from the preset's schedule."""
+
+    betas: tuple[float, float] = AdamConfig.betas
+    """Decay of the running averages."""
+    fused: bool = True
+    """Update all entries of a tensor in one pass."""
+
+
+def optimizers(options: AdamConfig) -> dict[str, Any]:
+    """nerfstudio's optimiser dictionary: one Adam per parameter group, no scheduler (the model sets the rates)."""
+
+    def adam(group: str) -> BitymiAdamConfig:
+        betas = options.field_betas if group.startswith("field") else options.betas
+        return BitymiAdamConfig(lr=1e-3, eps=options.eps, betas=betas)
+
+    return {group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS}
+
+
+def trainer_config(preset: Preset) -> BitymiTrainerConfig:
+    """The configuration of a training run by a preset."""
+    trainer, data = preset.trainer, preset.data
+    dataparser = BitymiDataParserConfig(eval_mode=data.eval_mode, eval_interval=data.eval_interval, points=data.points)
+    return BitymiTrainerConfig(
+        method_name=preset.name,
+        machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]
+        default_iterations=trainer.iterations,
+        default_iterations_cpu=trainer.iterations_cpu,
+        default_saves=trainer.saves,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
+        mixed_precision=False,
+        pipeline=BitymiPipelineConfig(
+            datamanager=BitymiDataManagerConfig(
+                dataparser=dataparser,
+                cache_images_type=data.cache_images_type,
+                cache_images="gpu" if has_cuda_kernels() else "cpu",
+            ),
+            model=BitymiModelConfig(
+                scene=preset.scene,
+                train=preset.train,
+                curve_points=trainer.curve_points,
+                curve_views=trainer.curve_views,
+            ),
+        ),
+        optimizers=optimizers(preset.optimizer),
+        # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
+        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=trainer.quit_on_train_completion),
+        vis=trainer.vis,  # type: ignore[arg-type]
+    )
+
+
+def method_config(name: str) -> MethodSpecification:
+    """The registry entry of the preset `name`."""
+    preset = load_preset(name)
+    return MethodSpecification(config=trainer_config(preset), description=preset.description)

@@ -1,0 +1,68 @@
+"""Which device the kernels can run on here."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from functools import cache
+from types import ModuleType
+
+import torch
+
+from bitymi_ns.plugin.errors import warn
+
+
+def has_cuda_kernels() -> bool:
+    """Whether there is a GPU and this installation has CUDA kernels; does not touch the GPU."""
+    return torch.cuda.is_available() and importlib.util.find_spec("bitymi_ns._cuda") is not None
+
+
+def why_not_cuda(index: int | None = None) -> str | None:
+    """Why the kernels cannot run on a GPU here and what can be done about it; None when they can.
+
+    Args:
+        index: of the GPU; None = the current one.
+    """
+    if not torch.cuda.is_available():
+        if torch.version.cuda is None:
+            return f"torch {torch.__version__} is a build without CUDA"
+        return "there is no NVIDIA GPU, or its driver is missing or too old for this torch"
+    if importlib.util.find_spec("bitymi_ns._cuda") is None:
+        return (
+            "this installation has no CUDA kernels, because no nvcc was found when it was built: install the CUDA "
+            "toolkit (12 or 13), put its bin folder on PATH and install bitymi-ns again"
+        )
+    try:
+        kernels = importlib.import_module("bitymi_ns._cuda")
+    except ImportError as error:
+        return f"the CUDA kernels cannot be loaded: {error}"
+    return _device_problem(kernels, torch.cuda.current_device() if index is None else index)
+
+
+@cache
+def _device_problem(kernels: ModuleType, index: int) -> str | None:
+    """The kernels' own trial on that GPU."""
+    return kernels.device_problem(index) or None
+
+
+def default_device_type() -> str:
+    """nerfstudio's name of the device that is used when none is asked for."""
+    return "cuda" if has_cuda_kernels() else "cpu"
+
+
+def kernel_device(device: torch.device | str) -> torch.device:
+    """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one)."""
+    device = torch.device(device)
+    if device.type != "cpu":
+        problem = (
+            why_not_cuda(device.index) if device.type == "cuda" else f"there are no kernels for the device '{device}'"
+        )
+        if problem is None:
+            return device
+        _say_once(f"The scene stays on the CPU: {problem}.")
+    return torch.device("cpu")
+
+
+@cache
+def _say_once(message: str) -> None:
+    warn(message)

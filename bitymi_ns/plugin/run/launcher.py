@@ -1,0 +1,168 @@
+"""A run of several processes on one machine: starts those beside the first one, and ends them.
+
+nerfstudio's own start of several processes needs CUDA, and wraps the model in torch's DistributedDataParallel, which
+knows no parameters that change their size. So the process that the user started is the first of the run: it reads and
+checks the capture, holds the run folder, prints, evaluates and saves as it would alone. The others are started when all
+that is done, and write into folders of their own that are thrown away.
+"""
+
+from __future__ import annotations
+
+import atexit
+import copy
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from contextlib import suppress
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import torch
+import torch.distributed as dist
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns import interpreter
+from bitymi_ns.plugin.errors import fail
+from bitymi_ns.train.processes import ProcessLost
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
+TIMEOUT = timedelta(minutes=30)
+"""How long a process waits for another that is there but does not answer. One that has ended is noticed at once."""
+PATIENCE = 10.0
+"""Seconds in which a process that is lost is expected to say why."""
+HOST = "127.0.0.1"
+LOST = 3
+"""Exit status of a process that ends because another one has."""
+
+
+class Others:
+    """The processes of a run beside this first one."""
+
+    def __init__(self, config: TrainerConfig, count: int) -> None:
+        """
+        Args:
+            config: of the run, with its length.
+            count: of all processes of the run.
+        """
+        self._cards = config.machine.device_type == "cuda"
+        self._scratch = tempfile.TemporaryDirectory()
+        self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)
+        self._inputs = [(self._of(config, rank), rank, count, self._store.port) for rank in range(1, count)]
+        self._processes: list[subprocess.Popen[bytes]] = []
+        atexit.register(self.end)
+
+    def start(self) -> None:
+        """Starts them and waits until they are there.
+
+        Raises:
+            InputError: one has ended already.
+        """
+        count = len(self._inputs) + 1
+        environment = {**os.environ, "PYTHONWARNINGS": "ignore"}  # those of nerfstudio's import were shown once
+        for inputs in self._inputs:
+            process = subprocess.Popen(interpreter.command(__name__, "work"), stdin=subprocess.PIPE, env=environment)
+            self._processes.append(process)
+            assert process.stdin is not None
+            with suppress(BrokenPipeError), process.stdin:  # one that has ended already is noticed below
+                process.stdin.write(pickle.dumps(inputs))
+        keys = [_here(rank) for rank in range(1, count)]
+        while not self._store.check(keys):
+            if any(process.poll() is not None for process in self._processes):
+                self.explain()
+            time.sleep(0.05)
+        _join(self._store, 0, count, self._cards)
+
+    def _of(self, config: TrainerConfig, rank: int) -> TrainerConfig:
+        """The configuration of another process: it writes nothing that stays, shows nothing and evaluates nothing."""
+        own = copy.deepcopy(config)
+        own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
+        return own
+
+    def explain(self) -> NoReturn:
+        """Ends the run with what the process said that was lost.
+
+        Raises:
+            InputError: always.
+        """
+        until, count = time.monotonic() + PATIENCE, len(self._processes) + 1
+        while True:
+            for rank, process in enumerate(self._processes, 1):
+                told = self._store.check([_why(rank)])
+                if told or process.poll() not in (None, LOST):
+                    why = self._store.get(_why(rank)).decode() if told else f"exit status {process.returncode}"
+                    fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
+            if time.monotonic() > until:
+                minutes = round(TIMEOUT.total_seconds() / 60)
+                fail(f"the {count} processes of this run do not hear each other any more, or not within {minutes} min")
+            time.sleep(0.05)
+
+    def end(self, orderly: bool = False) -> None:
+        """Ends the other processes; a second call changes nothing.
+
+        Args:
+            orderly: the run is over for all of them: let them end themselves.
+        """
+        atexit.unregister(self.end)
+        processes, self._processes = self._processes, []
+        for process in processes:
+            if orderly:
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(PATIENCE)
+            process.kill()
+            process.wait()
+        self._scratch.cleanup()
+        # a card may wait for one that is lost: then the end of this process is the remedy
+        if processes and dist.is_initialized() and (orderly or not self._cards):
+            dist.destroy_process_group()
+
+
+def _here(rank: int) -> str:
+    return f"here {rank}"
+
+
+def _why(rank: int) -> str:
+    return f"why {rank}"
+
+
+def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
+    """Enters torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
+    backend = "gloo"
+    if cards:
+        torch.cuda.set_device(rank)
+        backend = "cpu:gloo,cuda:nccl"
+    else:  # all of them have the same cores
+        torch.set_num_threads(max(1, torch.get_num_threads() // count))
+    dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=TIMEOUT)
+
+
+def work() -> None:
+    """What a process beside the first one does; its stdin says of which run, and which of its processes it is."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # before and after training the first process decides
+        signal.signal(number, signal.SIG_IGN)
+    config, rank, count, port = pickle.loads(sys.stdin.buffer.read())
+    from nerfstudio.scripts.train import train_loop
+
+    CONSOLE.quiet = True
+    store = dist.TCPStore(HOST, port, count, is_master=False, timeout=TIMEOUT)
+    try:
+        store.set(_here(rank), "1")
+        _join(store, rank, count, config.machine.device_type == "cuda")
+        train_loop(rank, count, config)  # with the seed of the first process
+        dist.destroy_process_group()
+    except ProcessLost:  # another one has ended, and the first one says why
+        if config.machine.device_type != "cuda":  # a card may wait for one that is lost
+            dist.destroy_process_group()
+        sys.exit(LOST)
+    except BaseException as error:
+        said = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
+        with suppress(RuntimeError):  # the first process has ended
+            store.set(_why(rank), said)
+        sys.exit(1)

@@ -1,0 +1,153 @@
+"""The memory that training or an export will take on the CPU, stated before it starts.
+
+What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
+a few views. The other numbers are measured; they belong to the default preset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import psutil
+import torch
+
+from bitymi_ns.bake.texel_scene import LEAST_KEPT
+from bitymi_ns.bake.view_color_rate import choice_bytes
+from bitymi_ns.ops import project
+from bitymi_ns.ops.trace_cpu import MOST, count
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.plugin.data.photographs import PHOTOGRAPH_BYTES
+from bitymi_ns.plugin.errors import say, warn
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import GEOMETRY, Scene
+from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.texels import SMALLEST, most_texels
+from bitymi_ns.train.views import REDUCED_BYTES, spread
+
+COUNTED_VIEWS = 3
+"""Views whose fragments are counted."""
+MARGIN = 1.1
+"""Factor by which another view may have more fragments than the counted ones."""
+PROGRAM = 800e6
+"""Bytes of Python, the libraries, and a capture's cameras and points."""
+PER_FRAGMENT = 36
+"""Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
+PER_SHADED_FRAGMENT = 32
+"""Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
+PER_PIXEL = 400
+"""Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
+PER_SURFEL = 3000
+"""Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
+
+PER_TEXEL = 28
+"""Bytes in training: the texel, how far it moves, and the two states in half precision that a run could go back to."""
+PER_BAKED_TEXEL = 96
+"""Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
+PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
+"""Bytes of a view that the fine-tuning keeps, by its fragments, of which 22 to 43 % were measured to show a texel."""
+VIEWS_OF_TEXELS = 12
+"""Beside the smallest tiles, all texels together are as many as those of so many views: 3.5 to 11 were measured."""
+
+
+@torch.no_grad()
+def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
+    """Fragments that are held at once when these views are drawn, by a count of a few of them.
+
+    Args:
+        scene: as it is.
+        cameras: of all views, on the CPU.
+        bound: views with more are drawn in bands; 0 = that of the CPU kernels.
+    """
+    p, most = scene.surfels, 0
+    for i in spread(len(cameras), COUNTED_VIEWS):
+        camera = cameras[i]
+        geometry = (p[name] for name in GEOMETRY)
+        most = max(most, count(project(*geometry, camera, scene.near, scene.config.through_pixel)))
+    return min(int(MARGIN * most), bound or MOST)
+
+
+def state_training(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    most_surfels: int,
+    texels: TexelConfig | None = None,
+    to_come: int = 0,
+    processes: int = 1,
+) -> None:
+    """Say what a training run will take.
+
+    Args:
+        scene: as the run finds it.
+        cameras: of the training views, on the CPU.
+        most_surfels: that densification may make; 0 = any number.
+        texels: of those that will learn; None = none will.
+        to_come: views that they learn from, each counted as often as it is looked at.
+        processes: of the run, each of which takes as much.
+    """
+    pixels, total = _pixels(cameras)
+    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
+    fragments = most_fragments(scene, cameras, scene.config.max_fragments)
+    needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    surfels = max(len(scene), most_surfels)
+    needed += PER_SURFEL * surfels
+    if texels is not None:
+        most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
+        needed += PER_TEXEL * (SMALLEST**2 * surfels + most)
+        needed += len(cameras) * surfels  # of `Visibility`, a byte for each that is looked through: at most all
+    advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
+    _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
+
+
+def state_export(
+    scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
+) -> None:
+    """Say what an export will take.
+
+    Args:
+        scene: a trained one.
+        cameras: of the training views, on the CPU.
+        finetune_bytes: that the fine-tuning may keep of the views; 0 = there is none.
+        learning: surfels that learn after the bake.
+        compact: the bundle's view colours have the terms that the pictures pay for.
+    """
+    pixels, total = _pixels(cameras)
+    kept = min(PHOTOGRAPH_BYTES, 3 * total)
+    fragments = most_fragments(scene, cameras)
+    if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
+        finetune_bytes = 0  # too few views would fit
+    needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    kind = scene.config.view_color
+    entry = VIEW_COLORS[kind]
+    terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
+    chosen = choice_bytes(kind, len(scene), len(cameras), terms) if compact else 0
+    seen = 2 * len(cameras) * len(scene)  # of `Visibility`, and of those of its surfels that are drawn
+    needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
+    if isinstance(scene.field, TexelField):
+        needed += PER_BAKED_TEXEL * len(scene.field.texels)
+    _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
+
+
+def _per_fragment(scene: Scene) -> float:
+    return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
+
+
+def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Those of the largest view, and of all together."""
+    sizes = [camera.width * camera.height for camera in cameras]
+    return max(sizes), sum(sizes)
+
+
+def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> None:
+    """One line, and a warning where the machine has less."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    width, height = max(sizes, key=lambda size: size[0] * size[1])
+    photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
+    say(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.")
+    # what this process has taken already is a part of what it needs
+    available = psutil.virtual_memory().available + psutil.Process().memory_info().rss
+    if needed > available:
+        warn(
+            f"That is more than the {available / 1e9:.1f} GB that this machine has available. Close other programs, or "
+            f"{advice}."
+        )

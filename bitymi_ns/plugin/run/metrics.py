@@ -1,0 +1,97 @@
+"""Image quality and honest render times."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.plugin.errors import warn
+from bitymi_ns.plugin.run import lpips
+from bitymi_ns.train.losses import cc_psnr, psnr
+
+LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
+"""Names of LPIPS in the results, by the backbone: the conventions of nerfstudio and gsplat, and of 3DGS."""
+_lpips_missing: list[bool] = []
+_flip_missing: list[bool] = []
+
+
+def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
+    """psnr, cc_psnr (after an affine fit of the colours), ssim, flip (where its package is installed), and lpips and
+    lpips_vgg (where their weights can be had).
+
+    Args:
+        image, reference: [H, W, 3] in [0, 1].
+        mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of psnr
+            and cc_psnr.
+    """
+    image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
+    if mask is not None:
+        mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
+        image, reference = image * mask, reference * mask
+    result = {"psnr": psnr(image, reference, mask), "cc_psnr": cc_psnr(image, reference, mask)}
+    result["ssim"] = ssim(image, reference)
+    found = flip(image, reference)
+    if found is not None:
+        result["flip"] = found
+    return result | lpips_metrics(image, reference)
+
+
+def ssim(image: Tensor, reference: Tensor) -> float:
+    """Structural similarity, by torchmetrics (11 x 11 Gaussian window, sigma 1.5, data range 1)."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
+    return float(structural_similarity_index_measure(*pair, data_range=1.0))
+
+
+def flip(image: Tensor, reference: Tensor) -> float | None:
+    """NVIDIA's FLIP (LDR), mean over the image; None when its package is not installed."""
+    if _flip_missing:
+        return None
+    try:
+        from flip_evaluator import nbflip
+    except ImportError:
+        _flip_missing.append(True)
+        warn("FLIP is left out: its package is not installed (pip install flip-evaluator).")
+        return None
+    # LDR, sRGB input, no colour map, with mean error, default viewing conditions
+    pair = (reference.cpu().contiguous().numpy(), image.cpu().contiguous().numpy())
+    _, mean, _ = nbflip.evaluate(*pair, False, True, False, True, {})
+    return float(mean)
+
+
+def lpips_metrics(image: Tensor, reference: Tensor) -> dict[str, float]:
+    """`LPIPS` of two images; empty when the weights cannot be had (one warning per process says why), and for images
+    of fewer than 32 pixels along a side."""
+    if _lpips_missing or min(image.shape[:2]) < lpips.LEAST_SIDE:
+        return {}
+    try:
+        return {name: lpips.lpips(image, reference, backbone) for name, backbone in LPIPS.items()}
+    except lpips.LpipsUnavailable as error:
+        _lpips_missing.append(True)
+        warn(f"LPIPS is left out: {error}.")
+        return {}
+
+
+def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats: int = 3) -> float:
+    """Median time of rendering alone, after one run to warm up, waiting for the device each time."""
+
+    def timed() -> float:
+        _synchronize(device)
+        start = time.perf_counter()
+        render()
+        _synchronize(device)
+        return 1000.0 * (time.perf_counter() - start)
+
+    with torch.no_grad():
+        timed()
+        return sorted(timed() for _ in range(repeats))[repeats // 2]
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

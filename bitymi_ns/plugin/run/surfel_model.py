@@ -1,0 +1,165 @@
+"""What a trained and a baked scene have in common as nerfstudio models: outputs, metrics and images."""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import tyro
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor
+from torch.nn import Parameter
+
+from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
+from bitymi_ns.plugin.errors import InputError, warn
+from bitymi_ns.plugin.run.device import kernel_device
+from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import as_float, over_background, reduce_image, reduce_mask
+
+OVERDRAW_SCALE = 64.0
+"""Blended surfels at a pixel at which colour maps of overdraw end: the same in every picture, so that runs compare."""
+
+
+@dataclass
+class SurfelModelConfig(ModelConfig):
+    """Options of nerfstudio's models of rays, which mean nothing here, are left out of the help."""
+
+    enable_collider: tyro.conf.Suppress[bool] = False
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: tyro.conf.Suppress[int] = 4096
+    prompt: tyro.conf.Suppress[str | None] = None
+
+
+class SurfelModel(Model):
+    """Renders whole images from surfels."""
+
+    measure_time = True
+    """Whether image metrics include the time of rendering; off while training."""
+
+    @abstractmethod
+    def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
+        """A RenderOutput: rgb, alpha, beta, overdraw, and with maps also depth and normal."""
+
+    @abstractmethod
+    def surfel_count(self) -> int:
+        """Number of primitives."""
+
+    @property
+    @abstractmethod
+    def background(self) -> Tensor:
+        """[3] colour behind the scene in evaluation."""
+
+    def size_metrics(self) -> dict[str, float]:
+        """Sizes that are reported with the image metrics."""
+        return {"surfels": float(self.surfel_count())}
+
+    def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
+        """Moves the model, except to a device that this installation has no kernels for: there it stays on the CPU.
+
+        nerfstudio's tools use a GPU whenever they see one.
+        """
+        device, dtype, _, _ = torch._C._nn._parse_to(*args, **kwargs)
+        if dtype is not None:
+            raise ValueError("the scene is float32")
+        return self if device is None else super().to(kernel_device(device))
+
+    def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
+        """Outputs that the viewer and ns-render offer, each [H, W, C] float32:
+
+        rgb, accumulation; depth = expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0
+        where nothing is seen), beta = blended kernel exponent / 4, overdraw = surfels blended at the pixel /
+        OVERDRAW_SCALE (the tools' colour maps span 0 to 1).
+        """
+        if not isinstance(ray_bundle, Cameras):
+            raise TypeError("this model renders cameras, not bundles of rays")
+        camera = to_camera(ray_bundle, self.device)
+        output = self.render(camera, self.background, maps=True)
+        outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
+        if output.depth is not None:
+            outputs["depth"] = ray_distance(output.depth, output.alpha, camera)
+        if output.normal is not None:
+            outputs["normal"] = normal_image(output.normal, camera)
+        if getattr(output, "beta", None) is not None:
+            outputs["beta"] = output.beta / 4.0
+        outputs["overdraw"] = output.overdraw.float() / OVERDRAW_SCALE
+        return outputs
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Render a camera; a crop box is not supported, which is said.
+
+        In a thread, which is one of the viewer's, a camera that cannot be rendered gives an empty picture: a refusal
+        would end the thread, and the viewer would show nothing any more.
+        """
+        if obb_box is not None:
+            self._say_once("Crop boxes are not supported: the whole scene is rendered.")
+        try:
+            self._last_camera = to_camera(camera, self.device)
+            outputs = self.get_outputs(camera)
+        except InputError as error:
+            if threading.current_thread() is threading.main_thread():
+                raise
+            self._say_once(str(error))
+            return self._empty(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]))
+        return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
+
+    def _say_once(self, message: str) -> None:
+        said: set[str] = self.__dict__.setdefault("_said", set())
+        if message not in said:
+            said.add(message)
+            warn(message)
+
+    def _empty(self, height: int, width: int) -> dict[str, Tensor]:
+        """The outputs of `get_outputs` where nothing is seen."""
+        black = torch.zeros(height, width, 3, device=self.device)
+        one = dict.fromkeys(("accumulation", "depth", "beta", "overdraw"), black[..., :1])
+        return {"rgb": black + self.background.to(black), "normal": black, **one}
+
+    def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
+        """[H, W, 3] the batch's photograph over the background, and [H, W, 1] its mask, at the size of a render."""
+        height, width = rgb.shape[:2]
+        target = reduce_image(as_float(batch["image"].to(rgb.device)), width, height)
+        mask = batch.get("mask")
+        mask = None if mask is None else reduce_mask(mask.to(rgb.device), width, height)
+        return over_background(target, self.background), mask
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Quality of a held-out view, what it cost to draw, and photograph and render side by side."""
+        rgb = outputs["rgb"]
+        height, width = rgb.shape[:2]
+        target, mask = self.photograph(batch, rgb)
+        metrics = image_metrics(rgb, target, mask)
+        metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
+        metrics.update(self.size_metrics())
+        camera = getattr(self, "_last_camera", None)
+        if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
+            metrics["render_ms"] = render_milliseconds(
+                lambda: self.render(camera, self.background, maps=False), self.device
+            )
+        return metrics, {"img": torch.cat([target, rgb], dim=1)}
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """[H, W, 4] with straight alpha, for `ns-render --rendered-output-names rgba`."""
+        alpha = outputs["accumulation"]
+        rgb = (outputs[output_name] - (1.0 - alpha) * self.background.to(alpha)) / alpha.clamp(min=1e-6)
+        return torch.cat([torch.where(alpha > 0, rgb, 0.0).clamp(0.0, 1.0), alpha], dim=-1)
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        return {"surfels": torch.tensor(float(self.surfel_count()))}
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
+        raise NotImplementedError("this scene is not trained any further")
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        return {}

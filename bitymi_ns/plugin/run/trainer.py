@@ -1,0 +1,215 @@
+"""nerfstudio's trainer with exact resumption, crash-safe checkpoints and an orderly end on Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns import files
+from bitymi_ns.plugin.console import quiet_host, quiet_warnings, step_bar
+from bitymi_ns.plugin.errors import fail, say, warn
+from bitymi_ns.plugin.run import checkpoints, run_folder
+from bitymi_ns.plugin.run.launcher import Others
+from bitymi_ns.train import optimizers
+from bitymi_ns.train.processes import Processes, ProcessesApart, ProcessLost
+
+if TYPE_CHECKING:
+    from torch.cuda.amp.grad_scaler import GradScaler
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, by the convention of shells."""
+
+
+class _StopAfterStep(Exception):
+    """Raised at the end of a training step after which the run is to stop."""
+
+
+class TogetherOptimizers(Optimizers):
+    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time.
+
+    Attributes:
+        before_step: called before each step, with all gradients there.
+    """
+
+    before_step: Callable[[], None] | None = None
+
+    def zero_grad_some(self, param_groups: list[str]) -> None:
+        optimizers.forget_gradients(self.optimizers[group] for group in param_groups)
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        if self.before_step is not None:
+            self.before_step()
+        clipped = any(self.config[group]["optimizer"].max_norm is not None for group in param_groups)
+        if clipped or grad_scaler.is_enabled():
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+        else:
+            optimizers.step([self.optimizers[group] for group in param_groups])
+
+
+class BitymiTrainer(Trainer):
+    """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one.
+
+    In a run of several processes each has one, in step with the others; that of the first is as it would be alone.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        with quiet_host():
+            super().__init__(*args, **kwargs)
+        self.processes = Processes(self.local_rank, self.world_size)
+        self._others: Others | None = None
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        self._stop_requested = False
+        try:
+            with quiet_host():
+                super().setup(test_mode)
+        except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
+            CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
+            raise SystemExit(INTERRUPTED) from None
+        parser = self.pipeline.datamanager.dataparser
+        run_folder.keep_poses_report(
+            self.base_dir, getattr(parser, "poses_report", None), getattr(parser, "found", None)
+        )
+        for line in getattr(self.viewer_state, "viewer_info", []):
+            CONSOLE.print(line, soft_wrap=True)
+        # after all other callbacks of a step: the state is then complete and can be saved
+        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
+
+    def setup_optimizers(self) -> Optimizers:
+        return TogetherOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+
+    def _end_of_step(self, step: int) -> None:
+        self._show_step(step)
+        if self.processes.any(self._stop_requested):
+            raise _StopAfterStep
+
+    def _load_checkpoint(self) -> None:
+        config = self.config
+        if config.load_dir is not None or config.load_checkpoint is not None:
+            if config.load_dir is not None:
+                step = config.load_step if config.load_step is not None else checkpoints.newest_step(config.load_dir)
+                path = checkpoints.path_of(config.load_dir, step)
+            else:
+                path = Path(config.load_checkpoint)
+            if self.processes.first:
+                files.remove_unfinished(path.parent.parent)  # of the run that was killed
+            self._restore(checkpoints.load(path, config.pipeline.model.scene), path)
+            say(f"Resuming after step {self._start_step - 1} from {path}")
+        config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
+
+    def _restore(self, state: dict[str, Any], path: Path) -> None:
+        self._start_step = state["step"] + 1
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        try:
+            self.optimizers.load_optimizers(state["optimizers"])
+            if "schedulers" in state and self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        except (RuntimeError, LookupError, ValueError, TypeError) as error:
+            fail(f"{path} cannot be resumed: the state of its optimisers does not fit ({error}). Train again.", error)
+
+    def train(self) -> None:
+        """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
+        orderly = False
+        try:
+            self._train_to_the_end()
+            orderly = True
+        except ProcessLost:
+            if self._others is None:
+                raise
+            self._others.explain()
+        except ProcessesApart as error:
+            fail(f"training cannot go on at step {self.step}: {error}.", error)
+        finally:
+            if self._others is not None:
+                self._others.end(orderly)
+            run_folder.leave(self.base_dir)
+
+    def _train_to_the_end(self) -> None:
+        total = self.config.max_num_iterations
+        if self._start_step >= total:
+            warn(
+                f"Nothing to do: the checkpoint has {self._start_step:,} of {total:,} steps. For a longer run give a "
+                "larger --max-num-iterations."
+            )
+            return
+        if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
+            learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]
+            run_folder.check_space(self.base_dir, 3 * sum(learned))
+        if self._start_step > 0:
+            say(f"{self.config.length()}, {total - self._start_step:,} of them left")
+        restore_handler = self._catch_interrupt()
+        try:
+            if self.processes.count > 1 and self.processes.first:
+                self._others = Others(self.config, self.processes.count)
+                self._others.start()
+            self.config.max_num_iterations = total - self._start_step
+            with quiet_warnings(), step_bar(self._start_step, total) as self._show_step:
+                super().train()
+        except _StopAfterStep:
+            self.save_checkpoint(self.step)
+            self._report_interruption()
+        except KeyboardInterrupt:
+            if self.training_state != "completed":  # else only the viewer was left to quit
+                self._report_interruption()
+        finally:
+            self.config.max_num_iterations = total
+            restore_handler()
+
+    def _catch_interrupt(self) -> Callable[[], None]:
+        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; returns what
+        undoes that."""
+        if threading.current_thread() is not threading.main_thread():
+            return lambda: None
+        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def on_interrupt(number: int, frame: Any) -> None:
+            if self._stop_requested or self.training_state == "completed":
+                raise KeyboardInterrupt
+            self._stop_requested = True
+            CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
+
+        for number in previous:
+            signal.signal(number, on_interrupt)
+
+        def restore() -> None:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+        return restore
+
+    def _report_interruption(self) -> None:
+        saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
+        if saved:
+            hint = f"The newest checkpoint is {saved[-1]}; resume with\n  --load-dir {self.checkpoint_dir}"
+        else:
+            hint = "No checkpoint had been written yet."
+        warn(f"Training was interrupted. {hint}")
+        raise SystemExit(INTERRUPTED)
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Write the checkpoint of a finished step; older ones are removed only after that."""
+        path = checkpoints.path_of(self.checkpoint_dir, step)
+        pipeline = getattr(self.pipeline, "module", self.pipeline)
+        state = {
+            "step": step,
+            "pipeline": pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        checkpoints.save(state, path, scratch=self.base_dir)
+        if self.config.save_only_latest_checkpoint:
+            for other in self.checkpoint_dir.glob("step-*.ckpt"):
+                if other.name < path.name:  # later ones are of a run that this one branched off from
+                    other.unlink(missing_ok=True)

@@ -1,0 +1,209 @@
+"""The polish: photographs come from a baked scene that is known, the bake starts from one that was moved and faded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake import (
+    Baked,
+    BakeOptions,
+    Learning,
+    PolishOptions,
+    TuneOptions,
+    bake,
+    bake_and_learn,
+    polish_scene,
+    reduced,
+    tune_atlas,
+)
+from bitymi_ns.bake.field import polish as polish_module
+from bitymi_ns.train.config import GuardConfig
+from bitymi_ns.train.views import View
+from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving
+
+OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, held_in_every=4)
+
+
+@pytest.fixture(scope="module")
+def truth(scene) -> Baked:
+    """The scene of the photographs, with all of its view colours."""
+    return waving(scene(60), pixels_per_texel=0.5)
+
+
+@pytest.fixture(scope="module")
+def views(truth: Baked) -> list[View]:
+    """Photographs of it."""
+    return photographs(truth)
+
+
+@pytest.fixture(scope="module")
+def wrong(truth: Baked) -> Baked:
+    """The same scene with one residual everywhere, its surfels moved and fainter."""
+    g = torch.Generator().manual_seed(0)
+    surfels = {name: value.clone() for name, value in truth.scene.surfels.items()}
+    surfels["means"] += 0.03 * torch.randn(surfels["means"].shape, generator=g)
+    surfels["opacity_logits"] -= 0.4
+    grey = truth.with_mean_residual(torch.full_like(truth.mean_residual, 0.1))
+    return grey.with_texels(torch.full_like(truth.texels, 0.1)).with_surfels(surfels)
+
+
+def db(baked: Baked, views: list[View]) -> float:
+    """Mean PSNR of the pictures before quantisation."""
+    errors = [(render(baked, v.camera).clamp(0, 1) - v.image).square().mean() for v in views]
+    return float(torch.stack(errors).log10().mean() * -10)
+
+
+def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: list[View]) -> None:
+    polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
+    tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, held_in_every=4, coded_steps=0))
+    told = polished.statistics.polish
+    assert (told.views, told.held_in_views, told.steps) == (7, 3, 40)
+    assert told.psnr_held_in.after > told.psnr_held_in.before + 3 and told.error_before == wrong.statistics.error
+    assert db(polished, views[10:]) > db(tuned, views[10:]) + 0.5
+    assert db(wrong, views[10:]) == pytest.approx(told.psnr_held_out.before, abs=0.01)
+    assert db(polished, views[10:]) == pytest.approx(told.psnr_held_out.after, abs=0.05)  # half floats
+    for name, before in wrong.scene.surfels.items():
+        after = polished.scene.surfels[name]
+        assert not torch.equal(after, before) and torch.equal(after[59], before[59]), name  # nobody sees the last one
+    assert polished.statistics.error is None and polished.atlas is None
+    assert torch.equal(polished.extent, wrong.extent) and (polished.packing.tiles == wrong.packing.tiles).all()
+    assert (wrong.texels == 0.1).all() and wrong.statistics.polish is None  # the bake itself is as it was
+
+
+def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Baked, views: list[View]) -> None:
+    polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS)
+    polished.scene.surfels["opacity_logits"][5] = -9.0  # can be drawn no more
+    lean = reduced(polished, [v.camera for v in views[:10]])
+    assert "view_terms" in lean.scene.surfels and lean.statistics.view_color.error.p100 <= 0.76
+    left = lean.statistics.surfels
+    assert (left.kept, left.left_out.transparent, left.left_out.unseen) == (58, 1, 1)
+    assert lean.rows.tolist() == [i for i in range(60) if i not in (5, 59)] and lean.atlas is None
+    assert db(lean, views[10:]) == pytest.approx(db(polished, views[10:]), abs=0.1)
+    again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0))
+    assert again.statistics.polish == polished.statistics.polish and again.statistics.finetune.steps == 8
+    with pytest.raises(ValueError, match="reduced already"):
+        polish_scene(lean, views, BACKGROUND, OPTIONS)
+
+
+def test_a_bake_whose_surfels_did_not_change_is_nearly_that_of_one_go(scene, views: list[View]) -> None:
+    made, seen, options = scene(60), [v.camera for v in views], BakeOptions(format="fp16")
+    once, later = (bake(made, seen, options, pixels_per_texel=each) for each in (None, 1e-3))
+    assert later.atlas is None and later.statistics.error is None
+    assert (later.packing.tiles[:, 3:] >= once.packing.tiles[:, 3:]).all()
+    later = reduced(later, seen)
+    assert all(torch.equal(later.scene.surfels[name], value) for name, value in once.scene.surfels.items())
+    assert later.statistics.view_color == once.statistics.view_color
+    assert later.packing.texels < 1.2 * once.packing.texels  # what the tolerance asks for, of the fitted field
+    for camera in seen[:4]:
+        torch.testing.assert_close(
+            render(later, camera), render(once, camera), atol=3 * options.tolerance / 255, rtol=0
+        )
+
+
+def test_a_scene_without_a_field_stays_without_texels(scene, views: list[View]) -> None:
+    made, seen = scene(60), [v.camera for v in views]
+    made.field = None
+    options = Learning(PolishOptions(steps=2))
+    assert bake_and_learn(made, seen, views, BACKGROUND, BakeOptions(), options).texels is None
+
+
+def test_tiles_are_as_fine_as_the_views_see(scene, views: list[View]) -> None:
+    made, seen = scene(60), [v.camera for v in views]
+    sizes = [bake(made, seen, pixels_per_texel=each).packing.tiles[:, 3:].prod(1) for each in (0.05, 2.0, 1e6)]
+    assert (sizes[0] >= sizes[1]).all() and sizes[0].sum() > 2 * sizes[1].sum() and (sizes[2] <= 16).all()
+
+
+def test_some_of_the_surfels_keep_their_texels(truth: Baked) -> None:
+    kept = torch.arange(60) % 3 > 0
+    some = truth.only(kept)
+    gone = dict(truth.scene.surfels)
+    gone["opacity_logits"] = torch.where(kept, gone["opacity_logits"], -20.0)
+    for camera in cameras()[:3]:
+        want = render(truth.with_surfels(gone), camera)
+        torch.testing.assert_close(render(some, camera), want, rtol=1e-5, atol=1e-5)
+    assert truth.only(torch.ones(60, dtype=torch.bool)) is truth
+
+
+def test_the_best_state_is_kept(truth: Baked, wrong: Baked, views: list[View]) -> None:
+    wild = replace(OPTIONS, rate=30.0, share=40.0, patience=2)
+    perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
+    kept = polish_scene(wrong, perfect, BACKGROUND, wild)
+    told = kept.statistics.polish
+    assert told.best_step == 0 and told.steps < 40
+    torch.testing.assert_close(kept.texels, wrong.texels, rtol=0, atol=0)
+    assert all(torch.equal(kept.scene.surfels[name], value) for name, value in wrong.scene.surfels.items())
+
+
+def test_it_is_the_same_every_time(wrong: Baked, views: list[View]) -> None:
+    few = replace(OPTIONS, steps=6)
+    first, second = (polish_scene(wrong, views, BACKGROUND, few) for _ in range(2))
+    assert torch.equal(first.texels, second.texels) and first.encoded().atlas.payload == second.encoded().atlas.payload
+
+
+def test_steps_that_are_not_finite_are_survived(
+    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = polish_module.photometric, []
+
+    def sometimes(*arguments: Any) -> Tensor:
+        calls.append(1)
+        return real(*arguments) * (math.nan if len(calls) in (5, 6) else 1.0)
+
+    monkeypatch.setattr(polish_module, "photometric", sometimes)
+    told = polish_scene(wrong, views, BACKGROUND, OPTIONS)
+    assert told.statistics.polish.steps == 40 and told.texels.isfinite().all()
+    assert told.statistics.polish.psnr_held_in.after > told.statistics.polish.psnr_held_in.before + 1
+    monkeypatch.setattr(polish_module, "photometric", lambda *a: real(*a) * math.nan)
+    given_up = polish_scene(wrong, views, BACKGROUND, OPTIONS)
+    assert given_up.statistics.polish.steps == GuardConfig().rollbacks and given_up.statistics.polish.best_step == 0
+    torch.testing.assert_close(given_up.texels, wrong.texels, rtol=0, atol=0)
+
+
+def test_masks_and_exposures(truth: Baked, wrong: Baked, views: list[View]) -> None:
+    mask = torch.ones(40, 48, 1, dtype=torch.bool)
+    mask[:, :24] = False
+    spoilt = [View(v.camera, torch.where(mask, v.image, float("nan")), mask) for v in views]
+    polished = polish_scene(wrong, spoilt, BACKGROUND, replace(OPTIONS, steps=12))
+    assert polished.texels.isfinite().all() and not torch.equal(polished.texels, wrong.texels)
+    assert polished.statistics.polish.psnr_held_in.after > polished.statistics.polish.psnr_held_in.before
+    logs = torch.linspace(-0.4, 0.4, len(views))
+    exposed = []
+    for view, log in zip(views, logs, strict=True):
+        alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
+        bare = view._replace(correction=log.exp().expand(3))
+        exposed.append(bare._replace(image=bare.shown(view.image, alpha, BACKGROUND)))
+    blind = [view._replace(correction=None) for view in exposed]
+    known, unknown = (db(polish_scene(wrong, each, BACKGROUND, OPTIONS), views) for each in (exposed, blind))
+    assert known > unknown + 1.0
+
+
+def test_its_progress_ends_with_it(wrong: Baked, views: list[View]) -> None:
+    told: list[tuple[int, int]] = []
+    wild = replace(OPTIONS, rate=50.0, share=40.0, patience=2)
+
+    def progress(name: str, done: int, total: int) -> None:
+        if name == "polishing":
+            told.append((done, total))
+
+    statistics = polish_scene(wrong, views, BACKGROUND, wild, progress=progress).statistics.polish
+    assert told[0] == (1, 40) and told[-1] == (statistics.steps, statistics.steps)
+
+
+def test_too_few_views_leave_the_bake_alone(wrong: Baked, views: list[View]) -> None:
+    same = polish_scene(wrong, views[:3], BACKGROUND)
+    assert same.texels is wrong.texels and same.statistics.polish.model_dump() == {"steps": 0, "views": 3}
+
+
+@pytest.mark.parametrize(
+    "bad", [{"steps": 0}, {"held_in_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
+)
+def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        partial(polish_scene, wrong, views, BACKGROUND)(replace(PolishOptions(), **bad))

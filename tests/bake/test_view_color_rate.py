@@ -1,0 +1,112 @@
+"""View colours keep the terms that the pictures pay for: stated errors are those of pictures, prices decide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bitymi_ns.bake.view_color_rate import choice_bytes, color_choices, shown_weights
+from bitymi_ns.ops.view_color import check_lean
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.scene.baked import BakedScene
+from tests.bake.test_tune import BACKGROUND, photographs, waving
+from tests.ops.test_view_color import lean_parameters
+
+COUNT = 60
+
+
+@pytest.fixture(scope="module")
+def cameras(scene) -> list:
+    return [view.camera for view in photographs(waving(scene(COUNT)))]
+
+
+@pytest.fixture
+def colored(scene):
+    """The scene with view colours of a kind, as they are stored."""
+
+    def make(kind: str) -> BakedScene:
+        plain = waving(scene(COUNT)).unquantised()
+        names = {name for entry in VIEW_COLORS.values() for name in entry.names}
+        kept = {name: value for name, value in plain.surfels.items() if name not in names}
+        kept = {name: value for name, value in kept.items() if not name.startswith("view_")}
+        return replace(plain, surfels=kept | lean_parameters(kind, COUNT, torch.float32), view_color=kind)
+
+    return make
+
+
+def with_colors(scene: BakedScene, colors: dict[str, torch.Tensor]) -> BakedScene:
+    return replace(scene, surfels={**scene.surfels, **colors})
+
+
+@pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
+def test_the_price_decides_from_all_terms_to_none(colored, cameras, kind: str) -> None:
+    scene = colored(kind)
+    choices = color_choices(scene, cameras)
+    counts = []
+    for price in (0.0, 1e-4, 1e-2, 1e6):
+        colors = choices.at(price)
+        check_lean(kind, colors, COUNT)
+        counts.append(len(colors["view_terms"]))
+        assert with_colors(scene, colors).render(cameras[0], BACKGROUND).rgb.isfinite().all()
+    assert counts == sorted(counts, reverse=True) and counts[-1] == 0
+    assert counts[0] <= len(scene.surfels["view_terms"])
+
+
+@pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
+def test_the_bytes_that_are_stated_are_those_that_are_held(colored, cameras, kind: str) -> None:
+    scene = colored(kind)
+    most = int(scene.surfels["view_span"][:, 1].max())
+    choices = color_choices(scene, cameras)
+    held = [choices.error, choices.base, *choices.terms.values()]
+    if VIEW_COLORS[kind].sites is None:  # which keeps as many numbers as surfels have
+        held = [choices.error, choices.base, choices.terms[0], choices.terms[most]]
+    assert choice_bytes(kind, COUNT, 0, most) == sum(values.nbytes for values in held)
+    weights = shown_weights(scene, cameras)
+    of_views = choice_bytes(kind, COUNT, len(cameras), most) - choice_bytes(kind, COUNT, 0, most)
+    assert of_views == weights.nbytes + 2 * (weights > 0).nbytes
+
+
+def test_weights_are_those_of_the_fragments(colored, cameras) -> None:
+    """A surfel whose colour is changed by e changes the pictures by about its weights times e^2."""
+    scene = colored("sv")
+    weights = shown_weights(scene, cameras)
+    assert weights.shape == (len(cameras), COUNT)
+    row = int(weights.sum(0).argmax())
+    span = torch.zeros_like(scene.surfels["view_span"])
+    flat = {"view_base": scene.surfels["view_base"].abs() + 0.1, "view_span": span, "view_terms": torch.zeros(0, 6)}
+    other = {**flat, "view_base": flat["view_base"].clone()}
+    other["view_base"][row] += 0.1
+    a, b = with_colors(scene, flat), with_colors(scene, other)
+    for view, camera in enumerate(cameras):
+        change = (b.render(camera, BACKGROUND).rgb - a.render(camera, BACKGROUND).rgb).square().sum()
+        assert float(change) == pytest.approx(3 * 0.01 * float(weights[view, row]), rel=0.05, abs=1e-4)
+
+
+def test_what_costs_nothing_is_left_out_and_what_shows_is_kept(colored, cameras) -> None:
+    scene = colored("sv")
+    choices = color_choices(scene, cameras)
+    seen = shown_weights(scene, cameras).sum(0) > 1.0
+    counts = choices.at(1e-9)["view_span"][:, 1]
+    assert int(counts[~seen].sum()) <= int(scene.surfels["view_span"][~seen, 1].sum())
+    assert bool((choices.error[seen][:, 0] >= 0).all())
+    assert bool((counts <= scene.surfels["view_span"][:, 1]).all())
+
+
+def test_views_that_pass_close_by_count_though_they_look_elsewhere(colored, cameras) -> None:
+    """Such a view shows nothing, and so adds what the colour may be wrong by from there."""
+    scene = colored("sv")
+    weights = shown_weights(scene, cameras)
+    row = int(weights.sum(0).argmax())
+    turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # the other way round
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = turned @ cameras[0].viewmat[:3, :3]
+    center = scene.surfels["means"][row] + 0.05 * torch.nn.functional.normalize(
+        cameras[0].center - scene.surfels["means"][row], dim=0
+    ).roll(1)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    blind = replace(cameras[0], viewmat=viewmat)
+    assert float(shown_weights(scene, [blind])[0, row]) == 0.0
+    before, after = (color_choices(scene, views).error[:, 0] for views in (cameras, [*cameras, blind]))
+    assert float(after[row]) > 1.5 * float(before[row])

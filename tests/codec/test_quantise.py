@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.quantise import Range, choose_range, decode, decode_pages, encode, sample_texels
+
+
+def paint(packing, value):
+    """An atlas with value(tile index, [r_v, r_u] rows and columns) in every tile and zeros elsewhere."""
+    texels = np.zeros((packing.layers, packing.height, packing.width, 3), dtype=np.float32)
+    for i, (x, y, layer, r_u, r_v) in enumerate(packing.tiles):
+        texels[layer, y : y + r_v, x : x + r_u] = value(i, r_v, r_u)
+    return texels
+
+
+@pytest.fixture
+def atlas():
+    """Smooth tiles of many sizes around 0.5, on more than one page."""
+    packing = pack(2 ** np.random.default_rng(0).integers(2, 6, (300, 2)), page_width=256, max_rows=256)
+
+    def smooth(i, r_v, r_u):
+        v, u = np.mgrid[0:r_v, 0:r_u] / 16.0
+        return np.stack([0.5 + 0.1 * np.sin(u + i), 0.5 + 0.1 * np.cos(v - i), 0.5 + 0.05 * np.sin(u + v)], axis=-1)
+
+    assert packing.layers > 1
+    return packing, paint(packing, smooth)
+
+
+def test_the_sample_takes_texels_of_tiles_only_and_depends_on_the_seed(atlas):
+    packing, texels = atlas
+    sample = sample_texels(texels, packing, 5000)
+    assert sample.shape == (5000, 3) and sample.min() > 0.3  # zeros would come from between the tiles
+    np.testing.assert_array_equal(sample, sample_texels(texels, packing, 5000))
+    assert (sample != sample_texels(texels, packing, 5000, seed=1)).any()
+
+
+def test_the_sample_is_uniform_over_texels_not_tiles():
+    packing = pack([[64, 64], [4, 4]])
+    texels = paint(packing, lambda i, r_v, r_u: float(i))
+    assert sample_texels(texels, packing, 100_000).mean() == pytest.approx(16 / (64 * 64 + 16), rel=0.2)
+
+
+def test_sigma6_is_six_standard_deviations_about_the_mean(atlas):
+    packing, texels = atlas
+    inside = np.concatenate([texels[la, y : y + h, x : x + w].reshape(-1) for x, y, la, w, h in packing.tiles])
+    found = choose_range(texels, packing, "sigma6")
+    assert found.offset == pytest.approx(inside.mean() - 6 * inside.std(), abs=5e-3)
+    assert found.scale == pytest.approx(12 * inside.std(), rel=0.01)
+    assert found == choose_range(texels, packing, "sigma6")
+    exact = choose_range(texels, packing, "minmax")
+    assert (exact.offset, exact.offset + exact.scale) == pytest.approx((inside.min(), inside.max()))
+
+
+def test_auto_takes_the_rule_with_the_smaller_error(atlas):
+    packing, texels = atlas
+    assert choose_range(texels, packing, "auto").rule == "minmax"  # bounded values: six deviations waste codes
+    heavy = texels.copy()
+    x, y, layer, _, _ = packing.tiles[0]
+    heavy[layer, y, x] = 500.0
+    assert choose_range(heavy, packing, "auto", samples=4096).rule == "sigma6"
+
+
+def test_a_constant_atlas_survives_every_rule():
+    packing = pack([[8, 8], [4, 4]])
+    texels = paint(packing, lambda *_: 0.3)
+    for rule in ("sigma6", "minmax", "auto"):
+        encoded = encode(texels, packing, "uint8", choose_range(texels, packing, rule))
+        assert encoded.mse < 1e-10 and encoded.clipped_fraction == 0
+
+
+def test_uint8_is_exact_to_half_a_code(atlas):
+    packing, texels = atlas
+    chosen = choose_range(texels, packing, "minmax")
+    encoded = encode(texels, packing, "uint8", chosen)
+    decoded = decode(encoded.payload, "uint8", encoded.width, encoded.height, chosen.offset, chosen.scale)
+    mask = texels.any(axis=-1)
+    assert np.abs(decoded - texels)[mask].max() <= chosen.scale / 255 * 0.501
+    assert encoded.clipped_fraction == 0
+    assert encoded.mse == pytest.approx(np.square(decoded - texels)[mask].mean(), rel=1e-3)
+    assert (decode_pages(encoded.payload, "uint8", encoded.width, encoded.height)[..., 3] == 255).all()
+
+
+def test_fp16_stores_the_values_themselves(atlas):
+    packing, texels = atlas
+    encoded = encode(texels, packing, "fp16")
+    assert (encoded.range.offset, encoded.range.scale) == (0.0, 1.0)
+    decoded = decode(encoded.payload, "fp16", encoded.width, encoded.height, 0.0, 1.0)
+    np.testing.assert_array_equal(decoded, texels.astype(np.float16).astype(np.float32))
+    assert encoded.nbytes == 8 * texels[..., 0].size
+
+
+@pytest.mark.parametrize("profile", ["ultrafast", "veryfast", "fast", "basic", "slow"])
+def test_bc7_keeps_a_smooth_atlas_close(profile):
+    packing = pack([[32, 32]] * 4)
+
+    def plane_of_colours(i, r_v, r_u):  # steep and two-dimensional: hard for a format of lines through colour space
+        v, u = np.mgrid[0:1:32j, 0:1:32j]
+        return np.stack([v, u, np.full_like(u, 0.5)], axis=-1)
+
+    texels = paint(packing, plane_of_colours)
+    encoded = encode(texels, packing, "bc7", choose_range(texels, packing, "minmax"), profile)
+    assert encoded.psnr > (33 if profile == "ultrafast" else 40)  # one line through colour space a block, or more
+    assert encoded.nbytes == texels[..., 0].size
+    assert profile in encoded.encoder
+
+
+def test_bc7_does_not_depend_on_threads_and_beats_noise(atlas):
+    packing, texels = atlas
+    one = encode(texels, packing, "bc7", threads=1)
+    assert one.payload == encode(texels, packing, "bc7", threads=3).payload
+    assert len(one.payload) == packing.layers
+    assert one.psnr > 38
+    assert one.nbytes * 4 == encode(texels, packing, "uint8").nbytes
+
+
+def test_the_smallest_page_is_one_block():
+    packing = pack([[4, 4]])
+    texels = paint(packing, lambda *_: np.linspace(0, 1, 48).reshape(4, 4, 3))
+    assert len(encode(texels, packing, "bc7").payload[0]) == 16
+
+
+def test_clipped_values_are_counted(atlas):
+    packing, texels = atlas
+    encoded = encode(texels, packing, "uint8", Range(0.5, 10.0, "test"))
+    inside = texels[texels.any(axis=-1)]
+    assert encoded.clipped_fraction == pytest.approx((inside < 0.5 - 1e-5).mean(), abs=1e-3)
+
+
+def test_errors_say_what_to_choose(atlas):
+    packing, texels = atlas
+    with pytest.raises(ValueError, match="sigma6, minmax or auto"):
+        choose_range(texels, packing, "sigma3")
+    with pytest.raises(ValueError, match="bc7, uint8 or fp16"):
+        encode(texels, packing, "png")
+    with pytest.raises(ValueError, match="profile"):
+        encode(texels, packing, "bc7", profile="best")
+    with pytest.raises(ValueError, match="has 64 bytes, not 3"):
+        decode_pages([b"abc"], "uint8", 4, 4)

@@ -1,0 +1,62 @@
+"""Small captures in nerfstudio's format."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+import bitymi_ns.capture
+from bitymi_ns.sample import generate
+from tests.plugin.data.captures import colmap_model
+
+
+@pytest.fixture(autouse=True)
+def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Captures without points start from random ones: COLMAP would take seconds in each test that has such a one."""
+
+    def triangulate(*given: Any) -> Path:
+        raise bitymi_ns.capture.CaptureError("not in this test")
+
+    monkeypatch.setattr(bitymi_ns.capture, "triangulate", triangulate, raising=False)
+
+
+@pytest.fixture(scope="session")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ray-traced room: 12 views of 48 x 36 pixels with 200 points. Not to be changed."""
+    folder = tmp_path_factory.mktemp("captures") / "room"
+    generate(folder, views=12, width=48, height=36, seed=0, points=200)
+    return folder
+
+
+@pytest.fixture
+def capture(original: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return Path(shutil.copytree(original, tmp_path / "room"))
+
+
+@pytest.fixture
+def project(capture: Path) -> Path:
+    """The room as a COLMAP project, a model in text in sparse/0."""
+    colmap_model(capture, capture / "sparse/0")
+    for name in ("transforms.json", "sparse_pc.ply"):
+        (capture / name).unlink()
+    return capture
+
+
+def edit_transforms(capture: Path, change: Any) -> None:
+    """Apply `change` to the parsed transforms.json."""
+    path = capture / "transforms.json"
+    meta = json.loads(path.read_text("utf8"))
+    change(meta)
+    path.write_text(json.dumps(meta), "utf8")
+
+
+@pytest.fixture
+def edit() -> Any:
+    return edit_transforms

@@ -1,0 +1,86 @@
+"""How tests read a capture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.errors import InputError
+
+
+def load(data: Path, **dataparser: Any) -> BitymiDataManager:
+    """The data manager of a capture in nerfstudio's format, every eighth view held out."""
+    options = {"eval_mode": "interval", "eval_interval": 8, "load_3D_points": True, **dataparser}
+    return load_with(data, NerfstudioDataParserConfig(**options))
+
+
+def load_with(data: Path, dataparser: Any) -> BitymiDataManager:
+    """The data manager of a capture in another format."""
+    return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device="cpu", test_mode="val")
+
+
+def load_any(data: Path, **options: Any) -> BitymiDataManager:
+    """The data manager of whatever the path holds, as the presets read it."""
+    return load_with(data, BitymiDataParserConfig(**options))
+
+
+def images_of(capture: Path) -> list[Path]:
+    """Its photographs in order; the first and the ninth are held out."""
+    return sorted(p for p in (capture / "images").iterdir() if p.is_file())
+
+
+def expect(message: str) -> Any:
+    return pytest.raises(InputError, match=message)
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, on one line."""
+    return " ".join(capsys.readouterr().out.split())
+
+
+def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
+    """The capture's views as a COLMAP model in text; the quaternion of the fourth is `scale` long."""
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 48 36 40 40 24 18\n")
+    lines = []
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    for i, frame in enumerate(frames):
+        w2c = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
+        quaternion = Rotation.from_matrix(w2c[:3, :3]).as_quat()[[3, 0, 1, 2]] * (scale if i == 3 else 1.0)
+        numbers = " ".join(map(str, [i + 1, *quaternion, *w2c[:3, 3], 1]))
+        lines.append(f"{numbers} {Path(frame['file_path']).name}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5 1 0 2 0\n2 0.1 0 0.5 200 10 10 0.5 1 0 2 0\n")
+
+
+def mixed_project(folder: Path) -> Path:
+    """A COLMAP project of nine photographs by three cameras: landscape through a lens, portrait, and a fisheye."""
+    sizes = {1: (48, 36), 2: (30, 40), 3: (40, 40)}
+    cameras = {
+        1: "SIMPLE_RADIAL 48 36 40 24 18 0.08",
+        2: "PINHOLE 30 40 40 41 15 20",
+        3: "OPENCV_FISHEYE 40 40 16 16 20 20 0.01 0 0 0",
+    }
+    model = folder / "sparse/0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text("".join(f"{number} {line}\n" for number, line in cameras.items()))
+    (model / "points3D.txt").write_text("".join(f"{i} 0.{i} 0.{i % 3} 0.2 200 10 10 0.5\n" for i in range(1, 100)))
+    lines = []
+    for i, number in enumerate([1, 2, 3] * 3):
+        name, half = f"cam{number}/IMG {i} \u00fc.jpg", np.pi * i / 9
+        lines.append(f"{i + 1} {np.cos(half)} 0 {np.sin(half)} 0 0 0 3 {number} {name}\n\n")
+        path = folder / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        noise = np.random.default_rng(i).integers(0, 255, (*sizes[number][::-1], 3), np.uint8)
+        Image.fromarray(noise).save(path)
+    (model / "images.txt").write_text("".join(lines), "utf8")
+    return folder

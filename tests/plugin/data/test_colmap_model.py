@@ -1,0 +1,100 @@
+"""Models as other programs and editors write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bitymi_ns.plugin.data.colmap_model import read_model
+from tests.plugin.data.captures import expect, images_of, load_any, said
+from tests.plugin.data.test_colmap import as_binary
+
+
+def points(project: Path, *rows: str) -> Path:
+    (project / "sparse/0/points3D.txt").write_text("".join(f"{i} {row}\n" for i, row in enumerate(rows, 1)))
+    return project / "sparse/0"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_byte_order_marks(project: Path, encoding: str) -> None:
+    for path in (project / "sparse/0").iterdir():
+        path.write_text(f"# a comment\n{path.read_text()}", encoding)
+    names = [path.name for path in images_of(project)]
+    (project / "test_list.txt").write_text("\n".join(names[:2]), encoding)
+    manager = load_any(project)
+    assert [path.name for path in manager.eval_dataset.image_filenames] == names[:2]
+    assert len(manager.train_dataset) == 10
+
+
+@pytest.mark.parametrize("name", ["{}", "my {}", "my photo {}"])
+def test_images_without_their_second_line(project: Path, name: str) -> None:
+    path = project / "sparse/0/images.txt"
+    lines = [line.split() for line in path.read_text().splitlines() if line]
+    path.write_text("".join(f"{' '.join(words[:9])} {name.format(words[9])}\n" for words in lines))
+    assert [image.name for image in read_model(path.parent).images] == [name.format(words[9]) for words in lines]
+
+
+def test_second_lines_with_points(project: Path) -> None:
+    path = project / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("\n\n", "\n1.5 2.5 -1 3 4 5 6.5 7 8 9 10 11\n"))
+    assert len(read_model(path.parent).images) == 12
+
+
+@pytest.mark.parametrize(
+    ("colours", "expected"),
+    [
+        (("200 10 0", "1 0 1"), [[200, 10, 0], [1, 0, 1]]),
+        (("0.8 0.04 0", "1 0 1"), [[204, 10, 0], [255, 0, 255]]),
+        (("65535 2570 0", "257 0 257"), [[255, 10, 0], [1, 0, 1]]),
+        (("200.0 10.4 0.0", "1 0 1"), [[200, 10, 0], [1, 0, 1]]),
+    ],
+)
+def test_colours_by_which_white_they_fit(project: Path, colours: tuple[str, str], expected: list[list[int]]) -> None:
+    model = read_model(points(project, f"0 0 0.5 {colours[0]} 0.5", f"0.1 0 0.5 {colours[1]} 0.5"))
+    assert model.rgb.tolist() == expected and not model.without_colours
+
+
+@pytest.mark.parametrize(
+    ("colours", "why"),
+    [("", "its points have none"), (" 0 0 0", "its own are all black"), (" 70000 0 -1", "between -1 and 70000")],
+)
+def test_points_without_colours_get_them_of_the_photographs(
+    project: Path, colours: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = points(project, f"0 0 0.5{colours}", f"0.1 0 0.4{colours}")
+    metadata = load_any(project).train_dataset.metadata
+    assert np.allclose(read_model(folder).xyz, [[0, 0, 0.5], [0.1, 0, 0.4]])
+    assert metadata["points3D_rgb"].shape == (2, 3) and metadata["points3D_rgb"].any()
+    assert f"The points of {folder} get the colours of the photographs" in (text := said(capsys)) and why in text
+
+
+def test_points_of_two_kinds(project: Path) -> None:
+    folder = points(project, "0 0 0.5 200 10 10", "0.1 0 0.5")
+    with expect("points3D.txt has a line that cannot be read .*three coordinates and three colours"):
+        read_model(folder)
+
+
+def test_two_forms_that_differ(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = project / "sparse/0"
+    texts = {path.name: path.read_text() for path in folder.iterdir()}
+    as_binary(folder)
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    read_model(folder)
+    assert "two models" not in said(capsys)
+    (folder / "images.txt").write_text("\n".join(texts["images.txt"].split("\n")[:8]))
+    (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
+    assert len(read_model(folder).images) == 4
+    assert (
+        f"{folder} holds two models: 4 images in text and 12 in binary form and other cameras in text than in binary "
+        "form. The text is read. To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
+    ) in said(capsys)
+
+
+def test_a_single_file_in_text_is_of_another_model(project: Path) -> None:
+    folder = project / "sparse/0"
+    as_binary(folder)
+    (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
+    assert read_model(folder).cameras[1].params[0] == 40.0

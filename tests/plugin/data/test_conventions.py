@@ -1,0 +1,100 @@
+"""Poses in another convention than that of their file, told by the capture's points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bitymi_ns.plugin.data.ply import read_points
+from tests.plugin.data.captures import colmap_model, load_any, said
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+Pose = np.ndarray
+WRONG = "As they are, the scene will be wrong."
+
+
+@pytest.fixture
+def model(capture: Path) -> Path:
+    """The room as a COLMAP model with its 200 points; images.txt."""
+    folder = capture / "sparse/0"
+    colmap_model(capture, folder)
+    points = read_points(capture / "sparse_pc.ply")[0]
+    rows = [" ".join(map(str, [i, *xyz, *rgb, 0.5])) for i, (xyz, rgb) in enumerate(zip(*points, strict=True), 1)]
+    (folder / "points3D.txt").write_text("\n".join(rows))
+    for name in ("transforms.json", "sparse_pc.ply"):
+        (capture / name).unlink()
+    return folder / "images.txt"
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        (lambda pose: pose @ FLIP, "the cameras have OpenCV's axes"),
+        (np.linalg.inv, "they are world to camera: invert them."),
+        (lambda pose: np.linalg.inv(pose @ FLIP), "they are world to camera with OpenCV's axes"),
+        (lambda pose: pose @ np.diag([1.0, 1.0, -1.0, 1.0]), "they are left-handed, as Unity's"),
+    ],
+)
+def test_of_a_transforms_json(
+    capture: Path, edit: Any, written: Callable[[Pose], Pose], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def change(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            frame["transform_matrix"] = written(np.array(frame["transform_matrix"])).tolist()
+
+    edit(capture, change)
+    load_any(capture)
+    text = said(capsys)
+    assert f"another convention: {message}" in text and WRONG in text
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        (lambda w2c: FLIP @ w2c, "the cameras have OpenGL's axes"),
+        (np.linalg.inv, "they are camera to world: invert them."),
+        (lambda w2c: np.linalg.inv(FLIP @ w2c), "they are camera to world with OpenGL's axes"),
+        (None, "the quaternions are in the order x, y, z, w"),
+    ],
+)
+def test_of_a_colmap_model(
+    model: Path, written: Callable[[Pose], Pose] | None, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = []
+    for line in filter(None, model.read_text().splitlines()):
+        number, *pose, camera, name = line.split()
+        pose = list(map(float, pose))
+        if written is None:
+            pose[:4] = [*pose[1:4], pose[0]]
+        else:
+            w2c = np.eye(4)
+            w2c[:3, :3], w2c[:3, 3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:]
+            other = written(w2c)
+            x, y, z, w = Rotation.from_matrix(other[:3, :3]).as_quat()
+            pose = [w, x, y, z, *other[:3, 3]]
+        lines.append(f"{' '.join(map(str, [number, *pose, camera, name]))}\n\n")
+    model.write_text("".join(lines))
+    load_any(model.parents[2])
+    text = said(capsys)
+    assert f"another convention: {message}" in text and WRONG in text
+
+
+@pytest.mark.parametrize("colours", [True, False])
+def test_right_ones_are_nothing_to_speak_of(capture: Path, colours: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    if not colours:
+        xyz = read_points(capture / "sparse_pc.ply")[0].xyz
+        header = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n"
+        header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        (capture / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z}\n" for x, y, z in xyz))
+    load_any(capture)
+    assert "convention" not in said(capsys)
+
+
+def test_right_ones_of_a_colmap_model(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    load_any(model.parents[2])
+    assert "convention" not in said(capsys)

@@ -1,0 +1,414 @@
+"""The presets' parser: what it makes of captures with a transforms.json, of Blender's and of instant-ngp's."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import tyro
+import yaml
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+
+from bitymi_ns.plugin import methods
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.data.dataparser import USED_BY, BitymiDataParserConfig
+from tests.plugin.data.captures import colmap_model, expect, images_of, load, load_any, load_with, said
+
+
+def equal(one: BitymiDataManager, other: BitymiDataManager) -> None:
+    """Two data managers have the same views, points and place in the world, but for float32's rounding."""
+    for name in ("train_dataset", "eval_dataset"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert a.image_filenames == b.image_filenames
+        for column in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "camera_type"):
+            same(getattr(a.cameras, column), getattr(b.cameras, column))
+    a, b = one.train_dataparser_outputs, other.train_dataparser_outputs
+    same(a.dataparser_transform[:3], b.dataparser_transform[:3])
+    assert a.dataparser_scale == pytest.approx(b.dataparser_scale, rel=1e-5)
+    assert torch.equal(a.scene_box.aabb, b.scene_box.aabb)
+    assert ("points3D_xyz" in a.metadata) == ("points3D_xyz" in b.metadata)
+    if "points3D_xyz" in a.metadata:
+        same(a.metadata["points3D_xyz"], b.metadata["points3D_xyz"])
+        assert torch.equal(a.metadata["points3D_rgb"], b.metadata["points3D_rgb"])
+
+
+def same(one: torch.Tensor, other: torch.Tensor) -> None:
+    assert one.shape == other.shape
+    assert torch.allclose(one.double(), other.double(), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_a_transforms_json_is_what_nerfstudios_parser_makes_of_it(
+    capture: Path, as_file: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = capture / "transforms.json" if as_file else capture
+    one = load_any(given)
+    text = said(capsys)
+    assert f"Reading {capture / 'transforms.json'} (nerfstudio, 12 photographs)." in text
+    assert "Held out for evaluation: 2 of 12 photographs, every 8th by name (frame_00001.png, frame_00009.png)." in text
+    equal(one, load(given))
+
+
+def test_options_and_entries_mean_what_they_mean_to_nerfstudio(capture: Path, edit: Any) -> None:
+    def change(meta: dict[str, Any]) -> None:
+        meta.update(applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0.5]], applied_scale=2.0)
+        meta["frames"].reverse()
+
+    edit(capture, change)
+    options: dict[str, Any] = {"orientation_method": "pca", "center_method": "focus", "scale_factor": 0.5}
+    equal(load_any(capture, **options), load(capture, **options))
+    equal(load_any(capture, eval_interval=3), load(capture, eval_interval=3))
+    equal(load_any(capture, eval_mode="all"), load(capture, eval_mode="all"))
+    equal(load_any(capture, eval_mode="fraction"), load(capture, eval_mode="fraction", train_split_fraction=0.9))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_every_camera_is_turned_with_its_capture(
+    capture: Path, edit: Any, monkeypatch: pytest.MonkeyPatch, turned: bool
+) -> None:
+    given, eigh = {}, torch.linalg.eigh
+
+    def one_sign(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Processors differ in the signs of eigenvectors, and with them in which capture is upside down."""
+        values, vectors = eigh(matrix)
+        return values, vectors * vectors.gather(0, vectors.abs().argmax(0, keepdim=True)).sign()
+
+    monkeypatch.setattr(torch.linalg, "eigh", one_sign)
+
+    def change(meta: dict[str, Any]) -> None:
+        turn = np.diag([1.0, -1.0, -1.0, 1.0]) if not turned else np.eye(4)
+        for frame in meta["frames"]:
+            pose = turn @ np.array(frame["transform_matrix"])
+            frame["transform_matrix"] = pose.tolist()
+            given[Path(frame["file_path"]).name] = pose[:3, :3]
+
+    edit(capture, change)
+    manager = load_any(capture, eval_mode="all", orientation_method="pca")
+    cameras = manager.train_dataset.cameras.camera_to_worlds
+    stock = NerfstudioDataParserConfig(data=capture, eval_mode="all", orientation_method="pca").setup()
+    nerfstudios = stock.get_dataparser_outputs("train")  # not by way of our data manager
+    transform = manager.train_dataparser_outputs.dataparser_transform
+    same(transform, nerfstudios.dataparser_transform)
+    for path, found in zip(manager.train_dataset.image_filenames, cameras[:, :, :3].numpy(), strict=True):
+        np.testing.assert_allclose(found, transform[:3, :3].numpy() @ given[path.name], atol=1e-5)
+    works = bool((torch.linalg.det(nerfstudios.cameras.camera_to_worlds[:, :, :3]) > 0).all())
+    assert torch.allclose(cameras, nerfstudios.cameras.camera_to_worlds, atol=1e-5) is works
+    assert works is turned  # else one of the two captures shows nothing
+
+
+def test_the_captures_own_lists_decide_what_is_held_out(capture: Path, edit: Any) -> None:
+    names = [f"images/{path.name}" for path in images_of(capture)]
+    edit(capture, lambda meta: meta.update(train_filenames=names[3:], val_filenames=names[1:3]))
+    one = load_any(capture)
+    equal(one, load(capture))
+    assert [path.name for path in one.eval_dataset.image_filenames] == ["frame_00002.png", "frame_00003.png"]
+    other = load_any(capture, eval_names=("frame_00012.png",))  # what is asked for goes before the file
+    assert [path.name for path in other.eval_dataset.image_filenames] == ["frame_00012.png"]
+    assert len(other.train_dataset) == 11
+
+
+def test_reduced_photographs_of_nerfstudio(capture: Path, edit: Any) -> None:
+    (capture / "images_2").mkdir()
+    for path in images_of(capture):
+        Image.open(path).resize((24, 18)).save(capture / "images_2" / path.name)
+    one = load_any(capture, downscale_factor=2)
+    equal(one, load(capture, downscale_factor=2))
+    assert one.cached_train[0]["image"].shape == (18, 24, 3)
+    names = [f"images/{path.name}" for path in images_of(capture)]
+    edit(capture, lambda meta: meta.update(train_filenames=names[:-1], val_filenames=names[-1:]))
+    assert len(load_any(capture, downscale_factor=2).eval_dataset) == 1
+
+
+def test_photographs_of_one_name_in_two_folders(capture: Path, edit: Any) -> None:
+    for folder in ("images/left", "images_2"):
+        (capture / folder).mkdir()
+    Image.new("RGB", (48, 36), "red").save(capture / "images/left/frame_00001.png")
+    for path in images_of(capture):
+        Image.open(path).resize((24, 18)).save(capture / "images_2" / path.name)
+    edit(capture, lambda meta: meta["frames"][1].update(file_path="images/left/frame_00001.png"))
+    manager = load_any(capture, eval_names=("left/frame_00001.png",))
+    assert manager.eval_dataset.image_filenames == [capture / "images/left/frame_00001.png"]
+    with expect("images/frame_00001.png, images/left/frame_00001.png have the same names in different folders"):
+        load_any(capture, downscale_factor=2)
+
+
+def test_names_that_are_held_out(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = load_any(capture, eval_names=("images/frame_00003.png", "frame_00005.png"))
+    assert [path.name for path in one.eval_dataset.image_filenames] == ["frame_00003.png", "frame_00005.png"]
+    assert "2 of 12 photographs, by --eval-names (frame_00003.png, frame_00005.png)" in said(capsys)
+    with expect("--eval-names: 1 of 2 names are of no photograph of the capture: frame_3.png"):
+        load_any(capture, eval_names=("frame_00003.png", "frame_3.png"))
+    with expect("no image is left for training .* all 12 are held out"):
+        load_any(capture, eval_names=tuple(path.name for path in images_of(capture)))
+
+
+def test_fisheyes_of_nerfstudio_become_pinholes(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(capture, lambda meta: meta.update(camera_model="OPENCV_FISHEYE", fl_x=14.0, fl_y=14.0, k1=0.01))
+    manager = load_any(capture)
+    assert "is OPENCV_FISHEYE: its photographs are used as pinhole pictures of 10" in said(capsys)
+    image, camera = manager.cached_train[0]["image"], manager.train_dataset.cameras[0]
+    assert image.shape[:2] == (int(camera.height), int(camera.width))
+    assert manager.train_view(0)[0].distortion_params is None
+    edit(capture, lambda meta: meta.update(camera_model="EQUIRECTANGULAR"))
+    with expect("but EQUIRECTANGULAR. 360-degree pictures cannot be trained on as they are. Cut them"):
+        load_any(capture)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, m: (c / "images/frame_00004.png").unlink(), "1 of 12 photographs of .* are missing"),
+        (
+            lambda c, m: m["frames"][3]["transform_matrix"][0].__setitem__(3, math.nan),
+            "frame_00004.png is not a matrix",
+        ),
+        (lambda c, m: m["frames"][3]["transform_matrix"][0].__setitem__(0, 9.0), "frame_00004.png is no rotation"),
+        (lambda c, m: m["frames"].clear(), "lists no frames"),
+        (lambda c, m: m.pop("fl_x"), "gives no fl_x"),
+        (lambda c, m: m.update(ply_file_path="gone.ply"), "point cloud .*gone.ply does not exist"),
+    ],
+)
+def test_checks_of_a_transforms_json_go_on_working(capture: Path, change: Any, message: str) -> None:
+    path = capture / "transforms.json"
+    meta = json.loads(path.read_text())
+    change(capture, meta)
+    path.write_text(json.dumps(meta))
+    with expect(message):
+        load_any(capture)
+
+
+def test_a_damaged_photograph_among_good_ones_is_named(capture: Path) -> None:
+    path = images_of(capture)[4]
+    Image.open(path).save(path.with_suffix(".jpg"))
+    broken = path.with_suffix(".jpg").read_bytes()[:200]
+    path.write_bytes(broken)
+    with expect(f"{path.name} cannot be read"):
+        _ = load_any(capture).cached_train
+
+
+def test_an_empty_folder_and_one_that_is_not_there(tmp_path: Path) -> None:
+    with expect("is empty. Give a folder of photographs, a video, or a capture with poses"):
+        load_any(tmp_path)
+    with expect("nowhere does not exist"):
+        load_any(tmp_path / "nowhere")
+
+
+def test_two_things_in_one_folder(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    colmap_model(capture, capture / "sparse/0")
+    load_any(capture)
+    text = said(capsys)
+    assert "transforms.json (nerfstudio, 12 photographs). Not read: sparse/0 (`bitymi-data --format colmap`)." in text
+    load_any(capture, format="colmap")
+    text = said(capsys)
+    assert f"Reading COLMAP model {capture}/sparse/0" in text
+    assert "Not read: transforms.json (`bitymi-data --format nerfstudio`)" in text
+
+
+@pytest.mark.parametrize("name", ["images_path", "masks_path", "ply_path", "alpha_color"])
+def test_options_that_are_for_something_else_are_refused(capture: Path, name: str) -> None:
+    with expect(f"--{name.replace('_', '-')} is not for"):
+        load_any(capture, **{name: None if name == "alpha_color" else Path("x")})
+
+
+def test_options_that_are_for_something_else_exist() -> None:
+    assert USED_BY.keys() <= BitymiDataParserConfig.__dataclass_fields__.keys()
+
+
+def test_points_of_the_model_that_a_capture_was_made_of(capture: Path, edit: Any) -> None:
+    """nerfstudio's parser would ask whether to convert them."""
+    applied = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    colmap_model(capture, capture / "colmap/sparse/0")
+    edit(capture, lambda meta: meta.pop("ply_file_path"))
+    outputs = load_any(capture).train_dataparser_outputs
+    edit(capture, lambda meta: meta.update(applied_transform=applied))  # what nerfstudio takes where there is none
+    stock = load(capture, load_3D_points=False).train_dataparser_outputs
+    same(outputs.dataparser_transform, stock.dataparser_transform)
+    moved = torch.tensor([[0, 0, 0.5], [0.1, 0, 0.5]]) @ stock.dataparser_transform[:, :3].T
+    expected = (moved + stock.dataparser_transform[:, 3]) * stock.dataparser_scale
+    assert torch.allclose(outputs.metadata["points3D_xyz"], expected, atol=1e-6)
+    assert outputs.metadata["points3D_rgb"].tolist() == [[200, 10, 10], [200, 10, 10]]
+
+
+# Blender
+
+
+@pytest.fixture
+def blender(tmp_path: Path) -> Path:
+    """Six views of 8 x 8 pixels with alpha for training, two for each of the other files."""
+    for split, count in (("train", 6), ("val", 2), ("test", 2)):
+        (tmp_path / split).mkdir()
+        frames = []
+        for i in range(count):
+            pixels = np.random.default_rng(i).integers(0, 255, (8, 8, 4), np.uint8)
+            Image.fromarray(pixels).save(tmp_path / split / f"r_{i}.png")
+            turn = np.array([[math.cos(i), 0, math.sin(i)], [0, 1, 0], [-math.sin(i), 0, math.cos(i)]])
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turn, turn @ [0, 0, 3.0]
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+        meta = {"camera_angle_x": 0.7, "frames": frames}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(meta))
+    return tmp_path
+
+
+def test_a_blender_data_set_has_its_own_split_and_alpha(blender: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = load_any(blender)
+    equal(one, load_with(blender, BlenderDataParserConfig()))
+    text = said(capsys)
+    assert f"Reading {blender}/transforms_train.json (blender, 6 photographs)." in text
+    assert "Held out for evaluation: 2 of transforms_val.json and 2 of transforms_test.json." in text
+    assert one.train_dataset.metadata["has_alpha"] and one.cached_train[0]["image"].shape == (8, 8, 4)
+    assert torch.equal(one.train_dataset.metadata["alpha_color"], torch.ones(3))
+    assert load_any(blender, alpha_color=None).train_dataset.metadata["alpha_color"] is None
+    with expect("--eval-names is not for .* read as blender"):
+        load_any(blender, eval_names=("r_0.png",))
+
+
+def test_one_file_of_held_out_views_is_enough(blender: Path) -> None:
+    (blender / "transforms_val.json").unlink()
+    assert [path.parent.name for path in load_any(blender).eval_dataset.image_filenames] == ["test", "test"]
+    (blender / "transforms_test.json").unlink()
+    manager = load_any(blender)  # held out of those for training, by the common rule
+    assert [path.name for path in manager.eval_dataset.image_filenames] == ["r_0.png"]
+    assert len(manager.train_dataset) == 5
+
+
+def test_names_with_their_ending(blender: Path) -> None:
+    path = blender / "transforms_train.json"
+    path.write_text(path.read_text().replace('"./train/r_0"', '"./train/r_0.png"'))
+    assert load_any(blender).train_dataset.image_filenames[0] == blender / "train/r_0.png"
+
+
+# instant-ngp
+
+
+@pytest.fixture
+def ngp(capture: Path, edit: Any) -> Path:
+    """The capture as instant-ngp's tools write it, its frames out of order and without endings."""
+
+    def change(meta: dict[str, Any]) -> None:
+        for key in [key for key in meta if key not in ("frames", "w", "h")]:
+            del meta[key]
+        meta.update(camera_angle_x=1.1, aabb_scale=2)
+        meta["frames"].reverse()
+        for frame in meta["frames"]:
+            frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+
+    edit(capture, change)
+    return capture
+
+
+def test_instant_ngps_transforms(ngp: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = load_any(ngp)
+    text = said(capsys)
+    assert "transforms.json (instant-ngp, 12 photographs)" in text
+    assert "If nerfstudio wrote it: `bitymi-data --format nerfstudio`." in text
+    assert [path.name for path in one.eval_dataset.image_filenames] == ["frame_00001.png", "frame_00009.png"]
+    assert one.train_dataset.metadata["declares_box"] is True
+    assert one.train_dataset.scene_box.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
+    stock = load_with(ngp, InstantNGPDataParserConfig(eval_mode="all"))
+    places = {path.name: c[:, 3] for path, c in zip(
+        stock.train_dataset.image_filenames, stock.train_dataset.cameras.camera_to_worlds, strict=True
+    )}  # fmt: skip
+    for path, pose in zip(one.train_dataset.image_filenames, one.train_dataset.cameras.camera_to_worlds, strict=True):
+        same(places[path.name], pose[:, 3])
+
+
+def test_photographs_of_any_ending(ngp: Path) -> None:
+    for path in images_of(ngp):
+        Image.open(path).save(path.with_suffix(".jpg"))
+        path.unlink()
+    assert load_any(ngp).train_dataset.image_filenames[0].name == "frame_00002.jpg"
+    Image.new("RGB", (48, 36)).save(ngp / "images/frame_00003.webp")
+    with expect("frame 9 is of ./images/frame_00003, but there are images/frame_00003.jpg, images/frame_00003.webp"):
+        load_any(ngp)
+
+
+def test_photographs_of_instant_ngp_that_are_missing(ngp: Path) -> None:
+    images_of(ngp)[2].unlink()
+    with expect(r"(?s)1 of 12 photographs of .*transforms.json are missing:\s+\S*images/frame_00003\s+Copy them there"):
+        load_any(ngp)
+
+
+def test_both_focal_lengths_are_used(ngp: Path, edit: Any) -> None:
+    edit(ngp, lambda meta: meta.update(fl_x=40.0, fl_y=50.0))
+    cameras = load_any(ngp).train_dataset.cameras
+    assert (float(cameras.fx[0]), float(cameras.fy[0])) == (40.0, 50.0)
+    edit(ngp, lambda meta: (meta.pop("fl_x"), meta.pop("fl_y"), meta.update(camera_angle_y=0.9)))
+    fy = float(load_any(ngp).train_dataset.cameras.fy[0])
+    assert fy == pytest.approx(18 / math.tan(0.45))
+
+
+def test_panoramas_of_instant_ngp(ngp: Path, edit: Any) -> None:
+    edit(ngp, lambda meta: meta.update(equirectangular=True))
+    with expect("equirectangular is set. 360-degree pictures cannot be trained on"):
+        load_any(ngp)
+
+
+# on the command line, and in config.yml
+
+
+def parsed(*args: str) -> Any:
+    default = methods.bitymi.config
+    return tyro.cli(type(default), default=default, args=list(args)).pipeline.datamanager.dataparser
+
+
+def test_it_is_what_the_presets_read_with() -> None:
+    assert isinstance(parsed(), BitymiDataParserConfig)
+    given = parsed("bitymi-data", "--data", "x", "--eval-names", "a b.jpg", "\u00e4.jpg", "--downscale-factor", "4")
+    assert given == BitymiDataParserConfig(data=Path("x"), eval_names=("a b.jpg", "\u00e4.jpg"), downscale_factor=4)
+
+
+def test_nerfstudios_own_parsers_can_still_be_named() -> None:
+    own = parsed("nerfstudio-data", "--data", "x")
+    assert own == NerfstudioDataParserConfig(data=Path("x"), eval_mode="interval", load_3D_points=True)
+    assert isinstance(parsed("colmap", "--data", "x"), ColmapDataParserConfig)
+    assert isinstance(parsed("blender-data", "--data", "x"), BlenderDataParserConfig)
+    assert isinstance(parsed("instant-ngp-data", "--data", "x"), InstantNGPDataParserConfig)
+
+
+def test_a_list_of_names_is_kept_in_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "names.txt"
+    path.write_text("a.jpg\nb.jpg\n")
+    run = methods._specification("bitymi").config
+    run.pipeline.datamanager.dataparser.eval_names = (str(path),)
+    run.set_timestamp()
+    again = yaml.load(yaml.dump(run), Loader=yaml.Loader)
+    assert again.pipeline.datamanager.dataparser.eval_names == ("a.jpg", "b.jpg")
+
+
+def test_configurations_of_earlier_runs_are_read(capture: Path) -> None:
+    run = methods._specification("bitymi").config
+    run.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(eval_mode="interval", load_3D_points=True)
+    run.pipeline.datamanager.data = capture
+    again = yaml.load(yaml.dump(run), Loader=yaml.Loader).pipeline.datamanager
+    equal(again.setup(device="cpu", test_mode="test"), load(capture))
+
+
+def test_what_needs_no_photographs_opens_none(capture: Path) -> None:
+    for path in images_of(capture):
+        path.unlink()
+    config = methods._specification("bitymi").config.pipeline.datamanager
+    config.data = capture
+    assert len(config.setup(device="cpu", test_mode="inference").train_dataset) == 10
+
+
+@pytest.mark.parametrize("change", [str.upper, lambda name: Path(name).stem, lambda name: f"C:\\room\\{name}"])
+def test_lists_of_names_that_differ_as_those_of_the_photographs_do(capture: Path, edit: Any, change: Any) -> None:
+    def spoil(meta: dict[str, Any]) -> None:
+        names = [change(frame["file_path"]) for frame in meta["frames"]]
+        for frame, name in zip(meta["frames"], names, strict=True):
+            frame["file_path"] = name
+        meta.update(train_filenames=names[2:], val_filenames=names[:2])
+
+    edit(capture, spoil)
+    manager = load_any(capture)
+    assert list(manager.eval_dataset.image_filenames) == images_of(capture)[:2]

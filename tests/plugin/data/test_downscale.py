@@ -1,0 +1,129 @@
+"""Large photographs are reduced as they are read: cameras, pictures, masks and messages go with it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+pytest.importorskip("nerfstudio")
+
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.downscale import reduced_size
+from bitymi_ns.plugin.data.images import read_image
+from bitymi_ns.plugin.data.lens import lens
+from tests.plugin.conftest import edit_transforms
+from tests.plugin.data.captures import expect
+
+
+def load(capture: Path, longest_side: int) -> BitymiDataManager:
+    parser = BitymiDataParserConfig()
+    config = BitymiDataManagerConfig(data=capture, dataparser=parser, longest_side=longest_side)
+    return config.setup(device="cpu", test_mode="val")
+
+
+@pytest.mark.parametrize(
+    ("size", "longest", "expected"),
+    [((4032, 3024), 1600, (1600, 1200)), ((3024, 4032), 1600, (1200, 1600)), ((1600, 9), 1600, (1600, 9)),
+     ((1000, 1), 10, (10, 1))],
+)  # fmt: skip
+def test_the_longer_side_decides(size: tuple[int, int], longest: int, expected: tuple[int, int]) -> None:
+    assert reduced_size(size, longest) == expected
+
+
+def test_cameras_and_pictures_are_reduced_together(capture: Path, capsys: pytest.CaptureFixture) -> None:
+    """Half the size: a pixel is the mean of four, and shows the same rays."""
+    whole, half = load(capture, 0), load(capture, 24)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "10 of 10 training photographs have more than 24 pixels along a side (up to 48 x 36)" in said
+    for index in range(len(whole.train_dataset)):
+        large, small = whole.train_views[index], half.train_views[index]
+        assert small.image.shape == (18, 24, 3)
+        assert torch.allclose(small.camera.K[:2], 0.5 * large.camera.K[:2])
+        assert torch.equal(small.camera.viewmat, large.camera.viewmat)
+        mean = large.image.float().view(18, 2, 24, 2, 3).mean((1, 3))
+        assert (small.image.float() - mean).abs().max() <= 1.0  # PIL rounds after each direction
+    assert half.eval_views[0].image.shape == (18, 24, 3)
+    assert half.train_dataset.metadata["train_pixels"] == len(half.train_dataset) * 18 * 24
+
+
+def test_odd_sizes_keep_the_rays_of_the_corners(capture: Path) -> None:
+    whole, small = load(capture, 0), load(capture, 31)  # 31 x 23.25
+    a, b = whole.train_views[0].camera, small.train_views[0].camera
+    assert (b.width, b.height) == (31, 23)
+    for pixel in ((0.0, 0.0), (1.0, 1.0)):
+        x, y = pixel
+        rays = [
+            [float((x * c.width - c.K[0, 2]) / c.K[0, 0]), float((y * c.height - c.K[1, 2]) / c.K[1, 1])]
+            for c in (a, b)
+        ]
+        assert rays[0] == pytest.approx(rays[1], abs=1e-5)
+
+
+def test_masks_go_with_their_photographs(capture: Path) -> None:
+    (capture / "masks").mkdir()
+    mask = np.zeros((36, 48), np.uint8)
+    mask[:, 24:] = 255
+
+    def add(meta: dict) -> None:
+        for frame in meta["frames"]:
+            name = f"masks/{Path(frame['file_path']).stem}.png"
+            Image.fromarray(mask).save(capture / name)
+            frame["mask_path"] = name
+
+    edit_transforms(capture, add)
+    view = load(capture, 24).train_views[0]
+    assert view.mask is not None and view.mask.shape == (18, 24, 1)
+    assert not view.mask[:, :12].any() and view.mask[:, 12:].all()
+
+
+def test_a_photograph_of_another_size_is_named_by_its_size_in_the_file(capture: Path) -> None:
+    frame = json.loads((capture / "transforms.json").read_text())["frames"][3]["file_path"]
+    Image.new("RGB", (40, 30), (9, 99, 199)).save(capture / frame)
+    with expect(f"{Path(frame).name} has 40 x 30 pixels, but its camera is for 48 x 36"):
+        _ = load(capture, 24).cached_train, load(capture, 24).cached_eval
+
+
+def test_transparent_photographs_keep_their_colours(tmp_path: Path, capture: Path) -> None:
+    """Colours under transparent pixels do not bleed into the others."""
+    pixels = np.zeros((36, 48, 4), np.uint8)
+    pixels[:, ::2] = (200, 100, 50, 255)  # every other column; the rest is transparent black
+    for path in (capture / "images").iterdir():
+        Image.fromarray(pixels).save(path)
+    image = load(capture, 24).train_views[0].image
+    assert (image[..., 3].int() - 128).abs().max() <= 1
+    assert (image[..., :3].int() - torch.tensor([200, 100, 50])).abs().max() <= 2
+
+
+def test_a_negative_side_is_refused(capture: Path) -> None:
+    with expect("longest-side is -1: give a number of pixels"):
+        load(capture, -1)
+
+
+def test_a_lens_is_reduced_with_its_photographs() -> None:
+    whole, _ = lens("SIMPLE_RADIAL", (800.0, 480.0, 360.0, 0.1), 960, 720, (960, 720), "camera 1")
+    half = whole.reduced(0.5)
+    assert half.size == (480, 360) and half.stored == (960, 720)
+    assert half.pinhole.view == pytest.approx(whole.pinhole.view, abs=0.2)
+    grey = Image.fromarray(np.tile(np.linspace(0, 255, 960).astype(np.uint8), (720, 1))).convert("RGB")
+    a, b = (np.asarray(each.picture(grey)).astype(float) for each in (whole, half))
+    a = a[: 2 * (len(a) // 2), : 2 * (a.shape[1] // 2)]
+    a = a.reshape(len(a) // 2, 2, a.shape[1] // 2, 2, 3).mean((1, 3))
+    h, w = min(len(a), len(b)), min(a.shape[1], b.shape[1])
+    assert np.abs(a[:h, :w] - b[:h, :w]).mean() < 1.0
+
+
+def test_jpegs_are_decoded_no_larger_than_needed(tmp_path: Path) -> None:
+    rows, columns = np.mgrid[0:1200, 0:1600]
+    pixels = np.stack([rows / 5, columns / 7, 127 + 100 * np.sin(columns / 40)], -1).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=95)
+    whole = read_image(tmp_path / "a.jpg", (1600, 1200))
+    small = read_image(tmp_path / "a.jpg", (1600, 1200), (300, 225))
+    assert whole.size == (1600, 1200) and small.size == (400, 300)
+    a, b = (np.asarray(each.resize((200, 150), Image.Resampling.BOX)).astype(float) for each in (whole, small))
+    assert np.abs(a - b).mean() < 1.0

@@ -1,0 +1,268 @@
+"""Photographs and masks of all kinds, and which of them there is anything to learn from."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bitymi_ns.plugin.data import duplicates
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.data.images import Note, note, read_image, read_mask
+from tests.plugin.data.captures import expect, images_of, load, said
+from tests.profiles import DISPLAY_P3
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    """[36, 48, 3] uint8 with black and white in it."""
+    picture = np.random.default_rng(0).integers(0, 256, (36, 48, 3), dtype=np.uint8)
+    picture[0, 0], picture[0, 1] = 0, 255
+    return picture
+
+
+def grey_of(picture: np.ndarray) -> np.ndarray:
+    return np.asarray(Image.fromarray(picture).convert("L"))
+
+
+def as_rgb(grey: np.ndarray) -> np.ndarray:
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "factor"),
+    [
+        ("a.png", np.uint16, 257),
+        ("a.tiff", np.uint16, 257),
+        ("a.tiff", np.int32, 257),
+        ("a.tiff", np.int32, 1),
+        ("a.tiff", np.float32, 1 / 255),
+        ("a.tiff", np.float32, 1),
+    ],
+)
+def test_deep_grey_pictures_are_scaled(
+    picture: np.ndarray, tmp_path: Path, name: str, dtype: Any, factor: float
+) -> None:
+    grey = grey_of(picture)
+    grey = np.where(grey == grey.max(), 255, grey).astype(np.uint8)
+    Image.fromarray((grey * np.float64(factor)).astype(dtype)).save(tmp_path / name)
+    assert np.array_equal(np.asarray(read_image(tmp_path / name)), as_rgb(grey))
+
+
+def test_deep_colour_is_scaled(picture: np.ndarray, tmp_path: Path) -> None:
+    for name in ("a.png", "a.tiff"):
+        cv2.imwrite(str(tmp_path / name), picture[..., ::-1].astype(np.uint16) * 257)
+        assert np.array_equal(np.asarray(read_image(tmp_path / name)), picture)
+
+
+def test_floats_beyond_white_are_refused(tmp_path: Path) -> None:
+    for values, message in (([[0.0, 900.0]], "lie between 0 and 900"), ([[0.0, np.nan]], "lie between nan and nan")):
+        Image.fromarray(np.float32(values)).save(tmp_path / "a.tiff")
+        with expect(f"a.tiff cannot be read: its values {message}.*save it with 8 or 16 bits"):
+            read_image(tmp_path / "a.tiff")
+
+
+def test_other_modes_come_out_right(picture: np.ndarray, tmp_path: Path) -> None:
+    def saved(image: Image.Image, name: str = "a.png", **options: Any) -> np.ndarray:
+        image.save(tmp_path / name, **options)
+        return np.asarray(read_image(tmp_path / name))
+
+    grey, whole = grey_of(picture), Image.fromarray(picture)
+    few = whole.quantize(8)
+    assert np.array_equal(saved(few), np.asarray(few.convert("RGB")))
+    assert saved(few, transparency=0).shape[-1] == 4
+    assert np.array_equal(saved(Image.fromarray(grey)), as_rgb(grey))
+    assert np.array_equal(saved(Image.fromarray(grey > 99)), as_rgb(np.uint8(255) * (grey > 99)))
+    both = Image.merge("LA", [Image.fromarray(grey), Image.fromarray(grey.T.reshape(36, 48).copy())])
+    assert np.array_equal(saved(both), np.asarray(both.convert("RGBA")))
+    assert np.array_equal(saved(whole.convert("CMYK"), "a.tiff"), picture)
+    smooth = Image.fromarray(np.uint8(np.linspace(10, 240, 48 * 36).reshape(36, 48, 1).repeat(3, 2)))
+    jpeg = saved(smooth.convert("CMYK"), "a.jpg", quality=95)
+    assert np.abs(jpeg.astype(int) - np.asarray(smooth)).max() < 12
+
+
+def test_masks_of_any_mode_say_the_same(tmp_path: Path) -> None:
+    counts = np.tile([[False, True]], (6, 4))
+    grey = Image.fromarray(np.uint8(counts * 255))
+    swapped = Image.fromarray(np.uint8(~counts), "P")  # index 0 is white
+    swapped.putpalette([255, 255, 255, 0, 0, 0])
+    cut_out = Image.new("RGBA", grey.size, (200, 0, 0, 255))
+    cut_out.putalpha(grey)
+    for i, mask in enumerate(
+        (
+            grey,
+            swapped,
+            cut_out,
+            grey.convert("1"),
+            grey.convert("RGB"),
+            Image.merge("LA", [grey, Image.new("L", grey.size, 255)]),
+            Image.fromarray(np.uint16(counts * 256)),
+        )
+    ):
+        mask.save(tmp_path / f"{i}.png")
+        assert np.array_equal(np.asarray(read_mask(tmp_path / f"{i}.png")), counts), mask.mode
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    with expect("the mask .*bad.png cannot be read"):
+        read_mask(tmp_path / "bad.png")
+
+
+def add_masks(capture: Path, edit: Any, shown: Any) -> None:
+    """Masks of all frames; `shown(i)` says whether that of frame i lets its pixels count."""
+    (capture / "masks").mkdir()
+
+    def add(meta: dict[str, Any]) -> None:
+        for i, frame in enumerate(meta["frames"]):
+            frame["mask_path"] = "masks/" + Path(frame["file_path"]).stem + ".png"
+            Image.new("L", (48, 36), 255 if shown(i) else 0).save(capture / frame["mask_path"])
+
+    edit(capture, add)
+
+
+def test_masks_without_a_pixel(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    add_masks(capture, edit, lambda i: i not in (0, 4))
+    manager = load(capture)
+    assert (len(manager.train_dataset), len(manager.eval_dataset)) == (9, 1)
+    assert "frame_00005" not in "".join(map(str, manager.train_dataset.image_filenames))
+    assert len(manager.cached_train) == 9 and manager.cached_eval[0]["mask"].all()
+    message = said(capsys)
+    assert "The masks of 1 of 10 training photographs exclude every pixel" in message
+    assert "The masks of 1 of 2 held-out photographs exclude every pixel" in message and "frame_00005.png" in message
+
+
+def test_masks_that_leave_nothing(capture: Path, edit: Any) -> None:
+    add_masks(capture, edit, lambda i: False)
+    with expect("the masks of all 10 training photographs exclude every pixel.*if the masks are inverted"):
+        load(capture)
+
+
+def test_a_mask_for_some_frames_only(capture: Path, edit: Any) -> None:
+    add_masks(capture, edit, lambda i: True)
+    edit(capture, lambda meta: meta["frames"][5].pop("mask_path"))
+    with expect("images/frame_00006.png has no mask_path, but other frames have one"):
+        load(capture)
+
+
+def test_the_colour_for_what_masks_exclude(capture: Path, edit: Any) -> None:
+    add_masks(capture, edit, lambda i: True)
+    Image.fromarray(np.uint8(np.arange(48) % 2 * 255)[None].repeat(36, 0)).save(capture / "masks/frame_00002.png")
+    image = load(capture, mask_color=(1.0, 0.0, 0.5)).cached_train[0]["image"]
+    assert image.dtype == torch.uint8 and image[0, 0].tolist() == [255, 0, 128]
+    original = np.asarray(Image.open(images_of(capture)[1]))
+    assert np.array_equal(image[:, 1::2].numpy(), original[:, 1::2])
+
+
+def checked(capture: Path) -> BitymiDataManager:
+    manager = load(capture)
+    _ = manager.cached_train, manager.cached_eval
+    manager.check_pictures()
+    return manager
+
+
+def test_photographs_that_show_nothing(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = images_of(capture)
+    Image.new("RGB", (48, 36), (7, 7, 7)).save(paths[2])
+    clear = Image.open(paths[3]).convert("RGBA")
+    clear.putalpha(0)
+    clear.save(paths[3])
+    checked(capture)
+    message = said(capsys)
+    assert "1 show nothing, of one colour throughout" in message and paths[2].name in message
+    assert "1 show nothing, transparent everywhere" in message and paths[3].name in message
+    for path in paths:
+        clear.save(path)
+    with expect("nothing to learn from the 10 training photographs: transparent everywhere: .* and 7 more"):
+        checked(capture)
+
+
+def test_what_is_remembered_of_a_photograph(picture: np.ndarray) -> None:
+    large = np.zeros((500, 400, 3), np.uint8)
+    assert note(large).empty == "of one colour throughout"
+    large[1, 1] = 1  # between the pixels that are looked at first
+    assert note(large).empty == ""
+    assert note(picture) == Note("", note(picture.copy()).fingerprint)
+    assert note(picture).fingerprint != note(255 - picture).fingerprint
+
+
+def test_the_same_photograph_on_both_sides(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = images_of(capture)
+    shutil.copy(paths[0], paths[3])
+    load(capture)
+    message = said(capsys)
+    assert "1 of 2 held-out photographs are training photographs, too" in message
+    assert f"{paths[0]} = {paths[3]}" in message and "remove the duplicates" in message
+    Image.open(paths[8]).save(paths[5], compress_level=0)  # other bytes, the same pixels
+    checked(capture)
+    message = said(capsys)
+    assert f"{paths[8]} = {paths[5]}" in message and message.count(f"{paths[0]} = {paths[3]}") == 1
+
+
+def test_a_frame_that_is_listed_twice(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(capture, lambda meta: meta["frames"].insert(1, dict(meta["frames"][0])))
+    load(capture)
+    first = images_of(capture)[0]
+    assert f"{first} = {first}" in said(capsys)
+    load(capture, eval_mode="all")
+    assert "held-out photographs are" not in said(capsys)
+
+
+def test_only_files_of_equal_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [tmp_path / name for name in "abcd"]
+    for path, data in zip(paths, (b"one", b"other", b"two", b"one"), strict=True):
+        path.write_bytes(data)
+    read: list[str] = []
+    digest = duplicates._digest
+    monkeypatch.setattr(duplicates, "_digest", lambda path: read.append(path.name) or digest(path))
+    assert duplicates.same_files(paths[:2], paths[2:]) == [(0, 1)]
+    assert sorted(read) == ["a", "c", "d"]
+
+
+def with_orientation(path: Path, image: Image.Image, value: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = value
+    image.save(path, exif=exif)
+
+
+def test_turned_photographs(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = images_of(capture)
+    with_orientation(paths[3], Image.open(paths[3]), 3)
+    load(capture)
+    message = said(capsys)
+    assert f"{paths[3]} has an EXIF tag that asks viewers to turn" in message and "mogrify -auto-orient" in message
+    with_orientation(paths[3], Image.open(paths[3]).rotate(90, expand=True), 6)
+    with expect(f"{paths[3].name} is stored turned by a quarter: it has 36 x 48 .* camera is for 48 x 36.*EXIF tag"):
+        _ = load(capture).cached_train
+
+
+def declared(path: Path, width: int, height: int) -> None:
+    """A PNG file that says it has this size; there are no pixels in it."""
+    ihdr = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = [ihdr, b"IDAT" + zlib.compress(b""), b"IEND"]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    )
+
+
+@pytest.mark.parametrize("index", [0, 4])
+def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
+    path = images_of(capture)[index]
+    declared(path, 16320, 12240)  # of a phone's sensor of 200 million pixels
+    manager = load(capture)
+    assert len(manager.train_dataset) == 10
+    declared(path, 60000, 60000)
+    with expect(f"{path.name} has more than 1,000,000,000 pixels. Make it smaller"):
+        load(capture)
+
+
+def test_colours_are_those_of_screens(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8), (200, 100, 80)).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
+    red, green, _ = read_image(tmp_path / "a.png").getpixel((2, 2))
+    assert red > 205 and green < 100

@@ -1,0 +1,157 @@
+"""What training starts from: the points of a capture, triangulated ones, or random ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import bitymi_ns.capture
+from bitymi_ns.capture import known
+from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.ply import read_header, read_rows
+from bitymi_ns.sample.capture import camera_path, render
+from bitymi_ns.sample.room import Room
+from tests.plugin.data.captures import load_any, said
+from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
+
+SIZE = (200, 150)
+
+
+@pytest.fixture(scope="module")
+def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six photographs along an arc, with poses and without points."""
+    folder = tmp_path_factory.mktemp("arc")
+    (folder / "images").mkdir()
+    frames = []
+    for i, view in enumerate(camera_path(60, *SIZE, seed=0)[:6]):
+        Image.fromarray(render(Room(0), view, supersample=2)).save(folder / f"images/{i}.png")
+        pose = np.vstack([view.camera_to_world[:3], [0, 0, 0, 1]]).tolist()
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose})
+    camera = {"w": SIZE[0], "h": SIZE[1], "fl_x": view.focal, "fl_y": view.focal, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "camera_model": "OPENCV", "frames": frames}))
+    return folder
+
+
+@pytest.fixture
+def triangulating(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bitymi_ns.capture, "triangulate", known.triangulate, raising=False)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_points_are_triangulated_once(
+    arc: Path, tmp_path: Path, triangulating: None, mirrored: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = Path(shutil.copytree(arc, tmp_path / "arc"))
+    if mirrored:
+        meta = json.loads((capture / "transforms.json").read_text())
+        for frame in meta["frames"]:
+            frame["transform_matrix"] = (np.diag([1, -1, 1, 1]) @ np.array(frame["transform_matrix"])).tolist()
+        (capture / "transforms.json").write_text(json.dumps(meta))
+    outputs = load_any(capture, eval_interval=6).train_dataparser_outputs
+    points = outputs.metadata["points3D_xyz"].double()
+    transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
+    there = ((points / scale - transform[:, 3]) @ transform[:, :3]).numpy() * [1, -1 if mirrored else 1, 1]
+    assert len(there) > 30 and ((there > [-3.1, -2.6, -0.1]) & (there < [3.1, 2.6, 2.7])).all(1).mean() > 0.8
+    assert outputs.metadata["points3D_rgb"].float().std() > 10
+    text = said(capsys)
+    assert "has no points: they are triangulated from the photographs, once" in text and "splatfacto" not in text
+    assert list((capture / ".bitymi").glob("points-*/points"))
+
+
+def test_masked_pixels_give_no_points(arc: Path, tmp_path: Path, triangulating: None) -> None:
+    capture = Path(shutil.copytree(arc, tmp_path / "arc"))
+    meta = json.loads((capture / "transforms.json").read_text())
+    (capture / "masks").mkdir()
+    mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    mask[: SIZE[1] // 2] = 255
+    for i, frame in enumerate(meta["frames"]):
+        Image.fromarray(mask).save(capture / f"masks/{i}.png")
+        frame["mask_path"] = f"masks/{i}.png"
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    outputs = load_any(capture, eval_interval=6).train_dataparser_outputs
+    camera = outputs.cameras[0]
+    pose = camera.camera_to_worlds.double()
+    local = (outputs.metadata["points3D_xyz"].double() - pose[:, 3]) @ pose[:, :3]
+    rows = float(camera.cy) - float(camera.fy) * local[:, 1] / -local[:, 2]
+    assert len(local) > 10 and float((rows < 0.55 * SIZE[1]).double().mean()) > 0.9
+
+
+def test_what_cannot_be_triangulated(
+    arc: Path, tmp_path: Path, triangulating: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = Path(shutil.copytree(arc, tmp_path / "arc"))
+    for i in range(6):
+        Image.new("RGB", SIZE, (40 * i, 0, 0)).save(capture / f"images/{i}.png")
+    assert "points3D_xyz" not in load_any(capture).train_dataparser_outputs.metadata
+    assert "only 0 points can be triangulated from the given poses" in (text := said(capsys))
+    assert "Training starts from random points." in text
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known.KnownView]]:
+    """Triangulation gives a model of two points; what it was asked for."""
+    calls: list[list[known.KnownView]] = []
+
+    def triangulate(home: Path, views: list[known.KnownView], *told: Any) -> Path:
+        calls.append(views)
+        model = home / "triangulated"
+        model.mkdir(exist_ok=True)
+        (model / "cameras.txt").write_text("1 PINHOLE 48 36 40 40 24 18\n")
+        (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+        (model / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5\n2 0.1 0 0.5 200 10 10 0.5\n")
+        return model
+
+    monkeypatch.setattr(bitymi_ns.capture, "triangulate", triangulate, raising=False)
+    return calls
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_every_format_without_points(capture: Path, form: Any, asked: list[Any]) -> None:
+    place = form(capture)
+    if form is colmap:
+        (place / "points3D.txt").unlink()
+    elif form is not blender:
+        meta = json.loads(place.read_text())
+        meta.pop("ply_file_path", None)
+        place.write_text(json.dumps(meta))
+    assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
+    (views,) = asked
+    assert len(views) == 12 and views[3].model == "PINHOLE" and (views[3].width, views[3].height) == (48, 36)
+    assert "points3D_xyz" not in load_any(capture, points="random").train_dataparser_outputs.metadata
+    config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())
+    for mode in ("test", "inference"):  # the scene is there already
+        assert "points3D_xyz" not in config.setup(device="cpu", test_mode=mode).train_dataparser_outputs.metadata
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form: Any, asked: list[Any]) -> None:
+    place = form(capture)
+    move(place, np.zeros(3))
+    load_any(capture)
+    before = len(asked)
+    load_any(capture, points="triangulate")
+    assert len(asked) == before + 1
+
+
+def test_points_without_colours_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    header = read_header(capture / "sparse_pc.ply")
+    rows = read_rows(capture / "sparse_pc.ply", header, "vertex")
+    with_colours = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
+    lines = "\n".join(f"{row['x']} {row['y']} {row['z']}" for row in rows)
+    properties = "".join(f"property float {c}\n" for c in "xyz")
+    (capture / "sparse_pc.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}end_header\n{lines}\n"
+    )
+    found = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
+    assert (found - with_colours).abs().mean() < 0.5 * (128.0 - with_colours).abs().mean()
+    assert "get the colours of the photographs that see them: its points have none." in said(capsys)
+    config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())
+    assert len(config.setup(device="cpu", test_mode="test").train_dataparser_outputs.metadata["points3D_rgb"]) == 0

@@ -1,0 +1,149 @@
+"""Up and metres of a capture whose poses were found here, from its reader to the bundle."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import bitymi_ns.capture
+from bitymi_ns.bundle import check_files, check_place
+from bitymi_ns.bundle.manifest import Manifest
+from bitymi_ns.capture.frame import WorldFrame, write_frame
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.export.command import world_of
+from bitymi_ns.plugin.run.run_folder import POSES, keep_poses_report
+from tests.bake.conftest import surfels
+from tests.bake.scenes import write
+from tests.plugin.data.captures import colmap_model, images_of, load_any
+
+__all__ = ["surfels"]
+
+UNIT = 2.5
+"""Metres per unit of the room's world, in which z is up."""
+
+
+def frame(up: str = "gps", metres: float | None = UNIT) -> WorldFrame:
+    return WorldFrame(up, metres, None, None, 0, np.eye(4)[:3].tolist())
+
+
+def known_places(capture: Path) -> np.ndarray:
+    """[n, 3] where the training photographs were taken from, in metres, z up."""
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    places = {Path(f["file_path"]).name: np.array(f["transform_matrix"])[:3, 3] for f in frames}
+    return UNIT * np.array([places[path.name] for path in images_of(capture)])
+
+
+def photographs(capture: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The capture's photographs alone, of which the finding of poses gives the capture's own."""
+    colmap_model(capture, capture / "found/sparse/0")
+    write_frame(capture / "found", frame())
+
+    def find_poses(source: Path, options: Any = None, *told: Any) -> Any:
+        return types.SimpleNamespace(
+            model=capture / "found/sparse/0", images=capture / "images", report=capture / "found", left_out={},
+            registered=12, given=12, reprojection_error=0.5,
+        )  # fmt: skip
+
+    monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses, raising=False)
+    folder = capture.parent / "photographs"
+    shutil.copytree(capture / "images", folder)
+    return folder
+
+
+def bundled(manager: BitymiDataManager, surfels: Any, folder: Path) -> Manifest:
+    write(folder, surfels(4, "sv"), world=world_of(manager))
+    bundle, checks = check_files(folder)
+    assert bundle is not None and all(check.ok for check in checks)
+    return bundle.info
+
+
+@pytest.mark.parametrize("read", ["transforms", "photographs"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"orientation_method": "vertical", "scale_factor": 3.0},
+        {"orientation_method": "none", "auto_scale_poses": False},
+    ],
+    ids=["up", "vertical", "none"],
+)
+def test_heights_and_distances_are_those_of_the_world(
+    capture: Path, tmp_path: Path, surfels: Any, monkeypatch: pytest.MonkeyPatch, read: str, options: Any
+) -> None:
+    data = capture if read == "transforms" else photographs(capture, monkeypatch)
+    if read == "transforms":
+        write_frame(capture, frame())
+    manager = load_any(data, eval_mode="all", **options)
+    world = bundled(manager, surfels, tmp_path / "bundle").world
+    assert world.up_from == "gps"
+    places = manager.train_dataset.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    known = known_places(capture)
+    heights = places @ world.up * world.metres_per_unit
+    np.testing.assert_allclose(heights - heights[0], known[:, 2] - known[0, 2], atol=1e-4)
+    spans = np.linalg.norm(places - places[0], axis=1) * world.metres_per_unit
+    np.testing.assert_allclose(spans, np.linalg.norm(known - known[0], axis=1), atol=1e-4)
+    assert check_place(world, world_of(manager)).ok
+    for wrong in ({"up": (0.0, 0.6, 0.8)}, {"metres_per_unit": 1.01 * world.metres_per_unit}, {"scale": 7.0}):
+        assert not check_place(world.but(**wrong), world_of(manager)).ok
+
+
+def test_every_camera_is_turned_with_its_capture(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = load_any(photographs(capture, monkeypatch), eval_mode="all", orientation_method="pca")
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    known = {Path(f["file_path"]).name: np.array(f["transform_matrix"])[:3, :3] for f in frames}
+    turn = np.array(manager.train_dataparser_outputs.dataparser_transform)[:3, :3]
+    cameras = manager.train_dataset.cameras.camera_to_worlds[:, :, :3].numpy()
+    for path, found in zip(manager.train_dataset.image_filenames, cameras, strict=True):
+        np.testing.assert_allclose(found, turn @ known[path.name], atol=1e-5)
+
+
+def test_up_without_a_scale(capture: Path, tmp_path: Path, surfels: Any) -> None:
+    write_frame(capture, frame("cameras", None))
+    info = bundled(load_any(capture), surfels, tmp_path / "bundle")
+    assert info.world.up_from == "cameras" and info.world.metres_per_unit is None
+    assert "metres_per_unit" not in json.loads((tmp_path / "bundle/bundle.json").read_text())["world"]
+
+
+@pytest.mark.parametrize(
+    "text", [None, "{}", "no json", "[1]", json.dumps({**frame().__dict__, "up": "aliens"}),
+             json.dumps({**frame().__dict__, "metres_per_unit": -1})]
+)  # fmt: skip
+def test_a_capture_that_came_with_its_poses_states_neither(
+    capture: Path, tmp_path: Path, surfels: Any, text: str | None
+) -> None:
+    if text is not None:  # another program's
+        (capture / "frame.json").write_text(text)
+    manager = load_any(capture)
+    assert world_of(manager).up is None
+    stated = bundled(manager, surfels, tmp_path / "bundle").world.model_dump()
+    assert set(stated) == {"transform", "scale"}
+    assert torch.tensor(stated["transform"]).shape == (3, 4)
+
+
+def test_the_report_stays_with_the_run(tmp_path: Path) -> None:
+    report, run = tmp_path / "poses-123", tmp_path / "run"
+    report.mkdir()
+    run.mkdir()
+    keep_poses_report(run, None)
+    keep_poses_report(run, report)
+    assert not list(run.iterdir())
+    for name in ("report.json", "cameras.png", "poses.json"):
+        (report / name).write_text(name)
+    write_frame(report, frame())
+    for _ in range(2):  # a resumed run writes it again
+        keep_poses_report(run, report)
+    assert sorted(path.name for path in (run / POSES).iterdir()) == ["cameras.png", "frame.json", "report.json"]
+
+
+def test_a_report_that_cannot_be_kept_does_not_stop_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_frame(tmp_path, frame())
+    (tmp_path / "run").write_text("a file in its place")
+    keep_poses_report(tmp_path / "run", tmp_path)
+    assert "is not kept with the run" in " ".join(capsys.readouterr().out.split())

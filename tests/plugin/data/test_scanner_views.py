@@ -1,0 +1,158 @@
+"""What scanning programs write is read with its poses, and only the photographs of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from tests.plugin.data.captures import expect, load_any, said
+
+Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""From a world with z up to ARKit's."""
+
+
+def frames_of(capture: Path) -> tuple[list[tuple[Path, np.ndarray]], dict[str, Any]]:
+    meta = json.loads((capture / "transforms.json").read_text())
+    return [(capture / f["file_path"], np.array(f["transform_matrix"])) for f in meta["frames"]], meta
+
+
+def put(file: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(file, target)
+
+
+def polycam(capture: Path, folder: Path, corrected: bool = True) -> Path:
+    frames, meta = frames_of(capture)
+    for kind in ("", "corrected_") if corrected else ("",):
+        for i, (file, pose) in enumerate(frames):
+            here = Y_UP @ pose
+            here[0, 3] += 0.0 if kind or not corrected else 0.3 * i  # the raw poses drift
+            values = {f"t_{r}{c}": here[r, c] for r in range(3) for c in range(4)}
+            camera = {"fx": meta["fl_x"], "fy": meta["fl_y"], "cx": meta["cx"], "cy": meta["cy"], "width": 48}
+            put(file, folder / f"keyframes/{kind}images/{i}.png")
+            place = folder / f"keyframes/{kind}cameras/{i}.json"
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(json.dumps({**values, **camera, "height": 36, "blur_score": 1.0}))
+            put(file, folder / f"keyframes/depth/{i}.png")
+    put(frames[0][0], folder / "thumbnail.png")
+    return folder
+
+
+def polycam_raw(capture: Path, folder: Path) -> Path:
+    return polycam(capture, folder, corrected=False)
+
+
+def record3d(capture: Path, folder: Path) -> Path:
+    frames, meta = frames_of(capture)
+    poses = []
+    for i, (file, pose) in enumerate(frames):
+        here = Y_UP @ pose
+        poses.append([*Rotation.from_matrix(here[:3, :3]).as_quat().tolist(), *here[:3, 3].tolist()])
+        put(file, folder / f"rgb/{i}.png")
+        put(file, folder / f"depth/{i}.png")
+    K = [2 * meta["fl_x"], 0, 0, 0, 2 * meta["fl_y"], 0, 2 * meta["cx"], 2 * meta["cy"], 1]
+    (folder / "metadata").write_text(json.dumps({"K": K, "w": 96, "h": 72, "poses": poses, "fps": 60}))
+    return folder
+
+
+def scannet(capture: Path, folder: Path) -> Path:
+    frames, meta = frames_of(capture)
+    for i, (file, pose) in enumerate(frames):
+        put(file, folder / f"color/{i}.png")
+        put(file, folder / f"depth/{i}.png")
+        (folder / "pose").mkdir(exist_ok=True)
+        np.savetxt(folder / f"pose/{i}.txt", pose @ np.diag([1, -1, -1, 1]))
+    (folder / "intrinsic").mkdir()
+    K = [[meta["fl_x"], 0, meta["cx"], 0], [0, meta["fl_y"], meta["cy"], 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    np.savetxt(folder / "intrinsic/intrinsic_color.txt", K)
+    return folder
+
+
+def seven_scenes(capture: Path, folder: Path) -> Path:
+    frames, meta = frames_of(capture)
+    for i, (file, pose) in enumerate(frames):
+        put(file, folder / f"frame-{i:06d}.color.png")
+        put(file, folder / f"frame-{i:06d}.depth.png")
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose @ np.diag([1, -1, -1, 1]))
+    (folder / "intrinsics.txt").write_text(f"{meta['fl_x']} {meta['fl_y']} {meta['cx']} {meta['cy']}\n")
+    return folder
+
+
+LAYOUTS = [polycam, polycam_raw, record3d, scannet, seven_scenes]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_scans_are_read_with_their_poses(
+    capture: Path, tmp_path: Path, layout: Callable[[Path, Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = load_any(capture, eval_mode="all").train_dataset
+    capsys.readouterr()
+    other = load_any(layout(capture, tmp_path / "scan"), eval_mode="all").train_dataset
+    assert len(other) == 12 and len({path.parent for path in other.image_filenames}) == 1
+    assert not any("depth" in str(path) or "thumb" in path.name for path in other.image_filenames)
+    shown = [
+        int(path.name.removesuffix(".png").removesuffix(".color").rpartition("-")[2]) for path in other.image_filenames
+    ]
+    a = one.cameras.camera_to_worlds.double().numpy()[shown]
+    b = other.cameras.camera_to_worlds.double().numpy()
+    scale = np.linalg.norm(a[1:, :, 3] - a[0, :, 3]) / np.linalg.norm(b[1:, :, 3] - b[0, :, 3])
+    for x, y in zip(a, b, strict=True):  # seen from the first camera
+        np.testing.assert_allclose(a[0, :, :3].T @ x[:, :3], b[0, :, :3].T @ y[:, :3], atol=1e-4)
+        here, there = (m[0, :, :3].T @ (n[:, 3] - m[0, :, 3]) for m, n in ((a, x), (b, y)))
+        np.testing.assert_allclose(here, scale * there, atol=1e-4)
+    assert np.allclose(other.cameras.fx, one.cameras.fx, atol=1e-3) and np.allclose(other.cameras.cy, one.cameras.cy)
+    assert b[:, 2, 1].mean() > 0.5  # z is up
+    assert "12 photographs with their poses" in (text := said(capsys))
+    assert "depth maps" in text or "depth map" in text
+
+
+def test_scans_that_are_damaged(capture: Path, tmp_path: Path) -> None:
+    folder = polycam(capture, tmp_path / "scan")
+    path = folder / "keyframes/corrected_cameras/3.json"
+    values = json.loads(path.read_text())
+    values.pop("t_01")
+    path.write_text(json.dumps(values))
+    with expect("read as polycam, is damaged: the entry 't_01' is missing"):
+        load_any(folder)
+    for change, why in (
+        ({"t_01": float("nan")}, "the pose or camera of 3.png is not finite"),
+        ({"t_01": 0.0, "width": 0}, "its picture has no pixels"),
+        ({"t_01": 0.0, "width": float("inf")}, "infinity"),
+        ({"t_01": [[]] * 3}, "float"),
+    ):
+        path.write_text(json.dumps({**values, **change}))
+        with expect(f"read as polycam, is damaged: .*{why}"):
+            load_any(folder)
+    path.write_text("[" * 100_000)
+    with expect("read as polycam, is damaged: it is nested too deeply"):
+        load_any(folder)
+    path.unlink()
+    (folder / "keyframes/corrected_images/5.png").unlink()
+    with expect("1 of 11 photographs of .* are missing: .*corrected_images/5"):
+        load_any(folder)
+    folder = scannet(capture, tmp_path / "set")
+    shutil.rmtree(folder / "intrinsic")
+    with expect("has poses, but no file with the camera .* `bitymi-data --format photographs`"):
+        load_any(folder)
+
+
+def test_a_pose_that_was_lost(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = scannet(capture, tmp_path / "set")
+    np.savetxt(folder / "pose/4.txt", np.full((4, 4), -np.inf))
+    assert len(load_any(folder, eval_mode="all").train_dataset) == 11
+    assert "1 photographs of" in said(capsys)
+
+
+def test_pictures_of_another_shape(capture: Path, tmp_path: Path) -> None:
+    folder = record3d(capture, tmp_path / "scan")
+    Image.new("RGB", (36, 48)).save(folder / "rgb/2.png")
+    with expect("2.png has 36 x 48 pixels, but its camera is for 96 x 72, which is another shape"):
+        load_any(folder)

@@ -1,0 +1,49 @@
+"""Photographs without poses: what the finding of poses is given of a capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+import bitymi_ns.capture
+from bitymi_ns.capture.recognise import recognise
+from bitymi_ns.capture.types import CaptureError, SfmSettings
+from bitymi_ns.plugin.data import sfm_poses
+from bitymi_ns.plugin.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("photographs", "data", "given", "masks"),
+    [
+        ("bed/shots", "bed", None, "bed/masks"),  # not a usual name, but below what was named
+        ("bed/images", "bed/images", None, "bed/masks"),
+        ("bed/images", "bed", Path("mine"), "bed/mine"),
+        ("bed", "bed", None, "bed/masks"),
+        ("bed/all/fox", "bed/all/fox", None, None),
+    ],
+)
+def test_poses_are_found_with_the_masks_of_the_training(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    photographs: str,
+    data: str,
+    given: Path | None,
+    masks: str | None,
+) -> None:
+    asked: list[Any] = []
+
+    def find_poses(source: Path, options: Any, *told: Any) -> None:
+        asked.append(options.masks)
+        raise CaptureError("not now")
+
+    monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses)
+    for folder in (photographs, "bed/masks", "bed/mine", "bed/all/masks"):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (8, 6)).save(tmp_path / photographs / "a.png")
+    found = recognise(tmp_path / data, "photographs")
+    with pytest.raises(InputError, match="not now"):
+        sfm_poses.source_of(found, given, 1, SfmSettings())
+    assert asked == [None if masks is None else tmp_path / masks]

@@ -1,0 +1,83 @@
+"""Which photographs are held out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bitymi_ns.plugin.data import splits
+from tests.plugin.data.captures import expect
+
+NAMES = [Path(f"/c/images/{n:02}.jpg") for n in range(20)]
+TWINS = [Path("/c/left/a.jpg"), Path("/c/left/b c.jpg"), Path("/c/right/a.jpg"), Path("/c/right/\u00e4.jpg")]
+
+
+def test_every_eighth_by_name() -> None:
+    split = splits.by_mode(NAMES, "interval", 8, 0.9)
+    assert split.held_out == [0, 8, 16] and sorted(split.train + split.held_out) == list(range(20))
+    assert split.told(NAMES) == (
+        "Held out for evaluation: 3 of 20 photographs, every 8th by name (00.jpg, 08.jpg and 1 more)."
+    )
+
+
+def test_ordinals() -> None:
+    numbers = (1, 2, 3, 4, 10, 11, 12, 13, 20, 21, 22, 23, 101, 111, 112, 1013)
+    text = "1st 2nd 3rd 4th 10th 11th 12th 13th 20th 21st 22nd 23rd 101st 111th 112th 1013th"
+    assert " ".join(map(splits.ordinal, numbers)) == text
+    assert "every 21st by name" in splits.by_mode(NAMES, "interval", 21, 0.9).told(NAMES)
+
+
+def test_the_other_rules() -> None:
+    assert splits.by_mode(NAMES, "all", 8, 0.9).held_out == list(range(20))
+    assert len(splits.by_mode(NAMES, "fraction", 8, 0.9).train) == 18
+    named = [Path("eval_1.jpg"), Path("train_1.jpg"), Path("train_2.jpg")]
+    assert splits.by_mode(named, "filename", 8, 0.9)[:2] == ([1, 2], [0])
+    with expect("--eval-mode filename: .*Use `--eval-names`"):
+        splits.by_mode(NAMES, "filename", 8, 0.9)
+
+
+def test_names_with_as_many_folders_as_they_need() -> None:
+    assert splits.by_names(TWINS, ["right/a.jpg", "b c.jpg", "\u00e4.jpg"], "--eval-names").held_out == [1, 2, 3]
+    assert splits.by_names(TWINS, ["/c/left/a.jpg"], "--eval-names").train == [1, 2, 3]
+    with expect("a.jpg is the name of 2 photographs, /c/left/a.jpg, /c/right/a.jpg. Give its folder, too"):
+        splits.by_names(TWINS, ["a.jpg"], "--eval-names")
+    with expect(
+        "--eval-names: 2 of 3 names are of no photograph of the capture: x.jpg, right/b c.jpg. Its photographs"
+    ):
+        splits.by_names(TWINS, ["x.jpg", "left/a.jpg", "right/b c.jpg"], "--eval-names")
+    with expect("1 of 1 names"):
+        splits.by_names(TWINS, [""], "--eval-names")
+
+
+def test_names_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "held out.txt"
+    path.write_text("# these\n00.jpg\n\n 08.jpg \n", "utf8")
+    assert splits.read_names([str(path)]) == ("00.jpg", "08.jpg")
+    assert splits.read_names(["a.jpg", "b.txt"]) == ("a.jpg", "b.txt")
+    path.write_text("# none\n")
+    with expect("lists no names"):
+        splits.read_names([str(path)])
+    with expect("gone.txt cannot be read"):
+        splits.read_names([str(tmp_path / "gone.txt")])
+
+
+def test_nothing_held_out_is_said() -> None:
+    assert "none is held out" in splits.Split([0, 1], [], "by lists").told(NAMES[:2])
+
+
+def test_names_in_another_case_or_with_another_ending() -> None:
+    assert splits.find(TWINS, ["RIGHT/A.JPG", "b c.png", "a\u0308", "Left\\a"], "the lists") == [2, 1, 3, 0]
+    with expect("a.png is the name of 2 photographs"):
+        splits.find(TWINS, ["a.png"], "the lists")
+
+
+def test_names_of_another_machine() -> None:
+    names = ["D:\\scan\\left\\a.jpg", "/home/me/scan/right/a.jpg", "b c.jpg"]
+    assert splits.find(TWINS, names, "the lists", anywhere=True) == [0, 2, 1]
+    with expect("2 of 3 names are of no photograph"):  # a name that a user gives is meant as it is
+        splits.find(TWINS, names, "--eval-names")
+
+
+def test_a_file_of_names_with_a_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "held out.txt"
+    path.write_text("00.jpg\n08.jpg\n", "utf-16")
+    assert splits.read_names([str(path)]) == ("00.jpg", "08.jpg")

@@ -1,0 +1,432 @@
+"""Captures that other programs are known to read as another scene than they show, or not at all; each case by what is
+special about it, in every format that can have it."""
+
+from __future__ import annotations
+
+import json
+import unicodedata
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from nerfstudio.cameras.camera_utils import fisheye624_project
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.export.command import world_of
+from tests.plugin.data.captures import colmap_model, expect, images_of, load, load_any, load_with, said
+
+UTM = np.array([500123.0, 4649876.0, 312.0])
+Edit = Callable[[Path, Callable[[dict[str, Any]], Any]], None]
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    meta = json.loads(path.read_text("utf8"))
+    change(meta)
+    path.write_text(json.dumps(meta), "utf8")
+
+
+# formats: each makes the room a capture of one, with the same photographs and poses
+
+
+def nerfstudio(capture: Path) -> Path:
+    return capture / "transforms.json"
+
+
+def instant_ngp(capture: Path) -> Path:
+    def change(meta: dict[str, Any]) -> None:
+        for key in ("ply_file_path", "camera_model"):
+            meta.pop(key, None)
+        meta["aabb_scale"] = 4
+
+    rewrite(capture / "transforms.json", change)
+    return capture / "transforms.json"
+
+
+def blender(capture: Path) -> Path:
+    (capture / "transforms.json").rename(capture / "transforms_train.json")
+    rewrite(capture / "transforms_train.json", lambda meta: meta.pop("ply_file_path"))
+    return capture / "transforms_train.json"
+
+
+def colmap(capture: Path) -> Path:
+    colmap_model(capture, capture / "sparse/0")
+    (capture / "transforms.json").unlink()
+    return capture / "sparse/0"
+
+
+JSON = [nerfstudio, instant_ngp, blender]
+ALL = [*JSON, colmap]
+
+
+def poses_of(manager: BitymiDataManager) -> np.ndarray:
+    datasets = (manager.train_dataset, manager.eval_dataset)
+    return np.concatenate([dataset.cameras.camera_to_worlds.numpy() for dataset in datasets])
+
+
+# coordinates of a map
+
+
+def move(place: Path, shift: np.ndarray) -> None:
+    """The capture, its points included, that much further from the origin."""
+    if place.is_dir():
+        lines = (place / "images.txt").read_text().split("\n")
+        for i, line in enumerate(lines[::2]):
+            words = line.split()
+            if words:
+                turn = Rotation.from_quat(np.array(words[1:5], float)[[1, 2, 3, 0]])
+                words[5:8] = map(str, np.array(words[5:8], float) - turn.apply(shift))
+                lines[2 * i] = " ".join(words)
+        (place / "images.txt").write_text("\n".join(lines))
+        rows = [line.split() for line in (place / "points3D.txt").read_text().splitlines()]
+        for row in rows:
+            row[1:4] = map(str, np.array(row[1:4], float) + shift)
+        (place / "points3D.txt").write_text("".join(" ".join(row) + "\n" for row in rows))
+        return
+
+    def change(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            for row, by in zip(frame["transform_matrix"], shift, strict=False):
+                row[3] += by
+
+    rewrite(place, change)
+    points = np.array([[0, 0, 0.5], [0.1, 0, 0.5]]) + shift
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property double {c}\n" for c in "xyz")
+    colours = "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+    rows = "".join(f"{x!r} {y!r} {z!r} 200 10 10\n" for x, y, z in points.tolist())
+    (place.parent / "sparse_pc.ply").write_text(f"{header}{colours}end_header\n{rows}")
+
+
+@pytest.mark.parametrize("centred", ["poses", "none"])
+@pytest.mark.parametrize("form", ALL)
+def test_coordinates_of_a_map(
+    capture: Path, form: Callable[[Path], Path], centred: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    move(place, np.zeros(3))
+    fixed = form in (instant_ngp, blender)
+    options: dict[str, Any] = {} if fixed else {"center_method": centred}
+    if centred == "none" and not fixed:  # else the scale depends on where the origin is
+        options["auto_scale_poses"] = False
+    if form is blender:
+        options["ply_path"] = Path("sparse_pc.ply")
+    one = load_any(capture, **options)
+    move(place, UTM)
+    other = load_any(capture, **options)
+    (a, p), (b, q) = ((poses_of(m), m.train_dataparser_outputs.metadata.get("points3D_xyz")) for m in (one, other))
+    apart = [pose[:, :, 3] - pose[:, :, 3].mean(0) for pose in (a, b)]
+    np.testing.assert_allclose(apart[0], apart[1], atol=1e-5)
+    np.testing.assert_allclose(a[:, :, :3], b[:, :, :3], atol=1e-5)
+    if p is not None and q is not None:
+        np.testing.assert_allclose(p - a[:, :, 3].mean(0), q - b[:, :, 3].mean(0), atol=1e-5)
+    # the place of the scene in the capture is kept to less than a hundredth of a unit, seven digits before the point
+    for manager, offset in ((one, np.zeros(3)), (other, UTM)):
+        world = world_of(manager).described()
+        transform = np.asarray(world["transform"], float)
+        found = world["scale"] * (transform[:, :3] @ (offset + [0, 0, 0.5]) + transform[:, 3])
+        points = manager.train_dataparser_outputs.metadata.get("points3D_xyz")
+        if points is not None:
+            np.testing.assert_allclose(found, points[0], atol=1e-5)
+        outputs = manager.train_dataparser_outputs
+        back = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds)
+        assert np.abs(back[:, :, 3].numpy().mean(0) - offset).max() < 10.0
+    moved = "float32 would blur the scene: their middle becomes the origin" in said(capsys)
+    assert moved is (centred == "none" or fixed)
+
+
+@pytest.mark.parametrize("form", [nerfstudio, colmap])
+def test_nerfstudios_own_readers_blur_them(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    reader = (
+        NerfstudioDataParserConfig() if form is nerfstudio else ColmapDataParserConfig(colmap_path=Path("sparse/0"))
+    )
+    load_with(capture, reader)
+    assert "blurs" not in said(capsys)
+    move(place, UTM)
+    load_with(capture, reader)
+    assert "blurs their positions. Read it with `bitymi-data`, the default" in said(capsys)
+
+
+# entries of a camera
+
+
+CAMERA = {"w": 40, "h": 30, "fl_x": 44.0, "fl_y": 46.0, "cx": 21.0, "cy": 14.0}
+
+
+@pytest.mark.parametrize("at_top", [True, False])
+@pytest.mark.parametrize("form", JSON)
+def test_every_entry_of_a_camera_is_used(capture: Path, form: Callable[[Path], Path], at_top: bool) -> None:
+    """Blender's own export has them beside camera_angle_x, which is of the longer side."""
+    place = form(capture)
+
+    def change(meta: dict[str, Any]) -> None:
+        for key in (*CAMERA, "k1", "k2", "p1", "p2", "camera_model"):
+            meta.pop(key, None)
+        meta["camera_angle_x"] = 1.0
+        for holder in [meta] if at_top else meta["frames"]:
+            holder.update(CAMERA)
+
+    rewrite(place, change)
+    for path in images_of(capture):
+        Image.open(path).resize((40, 30)).save(path)
+    cameras = load_any(place).train_dataset.cameras
+    found = [cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy]
+    assert [float(column[3]) for column in found] == list(CAMERA.values())
+
+
+FISHEYE = {"camera_model": "OPENCV_FISHEYE", "fl_x": 14.0, "fl_y": 14.0, "k1": 0.01, "k4": 0.001}
+
+
+@pytest.mark.parametrize("which", ["all frames", "some frames", "top"])
+@pytest.mark.parametrize("form", JSON)
+def test_a_camera_model_wherever_it_stands(
+    capture: Path, form: Callable[[Path], Path], which: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+
+    def change(meta: dict[str, Any]) -> None:
+        meta.pop("camera_model", None)
+        holders = {"all frames": meta["frames"], "some frames": meta["frames"][::2], "top": [meta]}
+        for holder in holders[which]:
+            holder.update(FISHEYE)
+
+    rewrite(place, change)
+    manager = load_any(place)
+    lenses = [lens for data in (manager.train_dataset, manager.eval_dataset) for lens in data.metadata["lenses"]]
+    fisheyes = [lens for lens in lenses if lens.model == "OPENCV_FISHEYE"]
+    assert len(fisheyes) == (6 if which == "some frames" else 12)
+    assert fisheyes[0].params[4:] == (0.01, 0.0, 0.0, 0.001)
+    assert "is OPENCV_FISHEYE: its photographs are used as pinhole pictures" in said(capsys)
+
+
+def test_nerfstudios_own_reader_takes_one_camera_model(capture: Path) -> None:
+    rewrite(capture / "transforms.json", lambda meta: [frame.update(FISHEYE) for frame in meta["frames"]])
+    assert load(capture).train_dataset.cameras.camera_type.unique().tolist() == [CameraType.FISHEYE.value]
+    rewrite(capture / "transforms.json", lambda meta: meta["frames"][3].pop("camera_model"))
+    with expect("frames with a camera_model of their own .* Read it with `bitymi-data`"):
+        load(capture)
+
+
+@pytest.mark.parametrize("form", JSON)
+def test_entries_that_nothing_reads_are_named(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def change(meta: dict[str, Any]) -> None:
+        meta.update(fisheye_crop_radius=12.0)
+        meta["frames"][2].update(depth_file_path="depth.png", rotation=0.1)
+
+    place = form(capture)
+    rewrite(place, change)
+    load_any(place)
+    assert f"Entries of {place} that are not used: fisheye_crop_radius, depth_file_path of frames." in said(capsys)
+
+
+def test_aria_s_camera(capture: Path) -> None:
+    """FISHEYE624 is COLMAP's RAD_TAN_THIN_PRISM_FISHEYE: rays are seen at the same pixels."""
+    params = [0.02, -0.01, 0.004, 0.001, -0.0005, 0.0001, 0.002, -0.001, 0.0015, -0.0007, 0.0004, 0.0003]
+    camera = {"camera_model": "FISHEYE624", "fl_x": 20.0, "fl_y": 20.0, "distortion_params": params}
+    rewrite(capture / "transforms.json", lambda meta: meta.update(camera))
+    lens = load_any(capture).train_dataset.metadata["lenses"][0]
+    assert lens.model == "RAD_TAN_THIN_PRISM_FISHEYE"
+    rays = torch.tensor([[0.1, 0.2, 1.0], [-0.5, 0.3, 1.0], [0.4, -0.6, 1.0]])
+    theirs = fisheye624_project(rays[None], torch.tensor([[20.0, *lens.params[2:4], *params]]))[0]
+    ours = pycolmap.Camera(model=lens.model, width=48, height=36, params=list(lens.params)).img_from_cam(rays.numpy())
+    np.testing.assert_allclose(ours, theirs.numpy(), atol=1e-3)
+
+
+# names of photographs
+
+
+def name_frames(place: Path, change: Callable[[str], str]) -> None:
+    """Change the names of the photographs in the capture's file, seen from the folder of the capture."""
+    if place.is_dir():
+        text = (place / "images.txt").read_text("utf8").split("\n")
+        for i in range(0, len(text) - 1, 2):
+            words = text[i].split(" ")
+            text[i] = " ".join([*words[:9], change(words[9])])
+        (place / "images.txt").write_text("\n".join(text), "utf8")
+    else:
+        rewrite(place, lambda meta: [frame.update(file_path=change(frame["file_path"])) for frame in meta["frames"]])
+
+
+NAMES = {
+    "case": lambda name: name.upper(),
+    "ending": lambda name: name.replace(".png", ".JPG"),
+    "no ending": lambda name: name.replace(".png", ""),
+    "backslashes": lambda name: ".\\" + name.replace("/", "\\"),
+    "absolute": lambda name: f"/home/somebody/project/{name}",
+    "drive": lambda name: "C:\\Users\\somebody\\" + name.replace("/", "\\"),
+    "unicode": lambda name: unicodedata.normalize("NFD", name),
+}
+
+
+@pytest.mark.parametrize("difference", NAMES)
+@pytest.mark.parametrize("form", ALL)
+def test_names_of_another_machine_or_program(
+    capture: Path, form: Callable[[Path], Path], difference: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    for path in images_of(capture):
+        path.rename(path.with_name(path.name.replace("frame_", "f\u00fcr_")))
+    name_frames(place, lambda name: NAMES[difference](name.replace("frame_", "f\u00fcr_")))
+    manager = load_any(capture)
+    assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
+    assert {path.parent for path in manager.train_dataset.image_filenames} == {capture / "images"}
+    assert manager.cached_train[0]["image"].shape == (36, 48, 3)
+    told = "of 12 photographs have other names than it says" in said(capsys)
+    assert told is (difference not in ("backslashes", "no ending"))
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_a_name_that_is_nearly_there(capture: Path, form: Callable[[Path], Path]) -> None:
+    place = form(capture)
+    for path in images_of(capture):
+        path.rename(path.with_name(path.name.replace("frame_", "fr\u0430me_")))  # a Cyrillic letter
+    with expect(r"(?s)but there is \S*fr\u0430me_\d+.png, '\S*fr\\u0430me_\d+.png', instead of '\S*frame_\d+.png'"):
+        load_any(place)
+
+
+def test_one_file_is_not_taken_for_two_photographs(capture: Path) -> None:
+    rewrite(capture / "transforms.json", lambda meta: meta["frames"][3].update(file_path="images/FRAME_00003.png"))
+    with expect(r"(?s)1 of 12 photographs of .* are missing:\s+\S*images/FRAME_00003.png"):
+        load_any(capture)
+
+
+def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_capture(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = project / "sparse/0/images.txt"
+    text = images.read_text()
+    images.write_text(text.replace("frame_00004.png", "../../frame_00004.png"))
+    assert len(load_any(project, eval_mode="all").train_dataset) == 12
+    assert "frame_00004.png for ../../frame_00004.png" in said(capsys)
+    elsewhere = tmp_path / "elsewhere/private.png"
+    elsewhere.parent.mkdir()
+    Image.new("RGB", (48, 36)).save(elsewhere)
+    for name in (str(elsewhere), "../../elsewhere/private.png", "..\\..\\elsewhere\\private.png"):
+        images.write_text(text.replace("frame_00004.png", name))
+        with expect(r"(?s)1 of 12 images of the capture are missing:.*private.png"):
+            load_any(project)
+
+
+@pytest.mark.parametrize("form", JSON)
+def test_photographs_outside_of_the_capture_are_named(
+    capture: Path, form: Callable[[Path], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place, picture = form(capture), images_of(capture)[3]
+    picture.rename(tmp_path / "elsewhere.png")
+    rewrite(place, lambda meta: meta["frames"][3].update(file_path=str(tmp_path / "elsewhere.png")))
+    load_any(capture)
+    assert f"names pictures outside of its folder, which are read there: {tmp_path}/elsewhere.png." in said(capsys)
+
+
+# files of a model, and sizes
+
+
+@pytest.mark.parametrize("wrong", ["nan 40 24 18", "40 inf 24 18", "40 40 24 nan"])
+def test_the_camera_of_a_model_that_is_no_number(project: Path, wrong: str) -> None:
+    path = project / "sparse/0/cameras.txt"
+    path.write_text("# cameras\n" + path.read_text().replace("40 40 24 18", wrong))
+    with expect(rf"{path}, line 2: camera 1 \(PINHOLE 48 36 {wrong}\) cannot be used"):
+        load_any(project)
+    with expect("camera 1 .* cannot be used"):
+        load_with(project, ColmapDataParserConfig(colmap_path=Path("sparse/0")))
+
+
+def test_points_of_a_model_in_a_ply_file_alone(project: Path) -> None:
+    (project / "sparse/0/points3D.txt").unlink()
+    path = project / "sparse/0/points3D.ply"
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {c}\n" for c in "xyz")
+    header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    path.write_text(f"{header}0 0 0.5 200 10 10\n0.1 0 0.5 200 10 10\n")
+    metadata = load_any(project).train_dataparser_outputs.metadata
+    assert metadata["points3D_rgb"].tolist() == [[200, 10, 10]] * 2
+    path.write_text(header)
+    with expect("the point cloud .*points3D.ply is cut off: it has 0 of 2 points"):
+        load_any(project)
+
+
+def test_points_of_a_model_that_are_no_numbers(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = project / "sparse/0/points3D.txt"
+    path.write_text(path.read_text() + "3 nan 0 0.5 200 10 10 0.5\n")
+    assert len(load_any(project).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
+    assert f"{path}: 1 of 3 points, the first is point 3, are not finite" in said(capsys)
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -> None:
+    """`--downscale-factor` without a folder of copies is the same for every format."""
+    manager = load_any(form(capture), downscale_factor=2)
+    assert manager.cached_train[0]["image"].shape == (18, 24, 3)
+    assert int(manager.train_dataset.cameras.width[0]) == 24
+
+
+# Blender's files
+
+
+def test_blenders_names_with_two_endings(capture: Path) -> None:
+    """nerfstudio's reader appends .png to all of them."""
+    place = blender(capture)
+    for path in images_of(capture):
+        path.rename(path.with_name(f"{path.stem}.jpg.png"))
+    name_frames(place, lambda name: f"./{name.replace('.png', '.jpg')}")
+    assert load_any(capture).train_dataset.image_filenames[0].name == "frame_00002.jpg.png"
+
+
+@pytest.mark.parametrize("lacking", ["all", "some"])
+def test_held_out_views_of_blender_without_photographs(
+    capture: Path, lacking: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = blender(capture)
+    meta = json.loads(place.read_text())
+    frames, test = meta["frames"][:8], meta["frames"][8:]
+    place.write_text(json.dumps({**meta, "frames": frames}))
+    for frame in test if lacking == "all" else test[1:]:
+        frame["file_path"] = f"./test/r_{frame['file_path'][-5:-4]}"
+    (capture / "transforms_test.json").write_text(json.dumps({**meta, "frames": test}))
+    manager = load_any(capture)
+    assert (len(manager.train_dataset), len(manager.eval_dataset)) == ((7, 1) if lacking == "all" else (8, 1))
+    text = said(capsys)
+    what = "all" if lacking == "all" else "3"
+    assert f"transforms_test.json lacks {what} of its 4 photographs, left out: {capture}/test/r_" in text
+
+
+# another unit
+
+
+@pytest.mark.parametrize("form", [instant_ngp, blender])
+def test_millimetres_where_the_format_has_no_scale(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = form(capture)
+    load_any(capture)
+    assert "the capture is scaled by" not in said(capsys)
+
+    def change(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 1000.0
+
+    rewrite(path, change)
+    manager = load_any(capture)
+    assert "units from their middle, where those of this format usually lie" in (text := said(capsys))
+    assert "the capture is scaled by 0.0" in text
+    box = float(manager.train_dataset.scene_box.aabb[1, 0])
+    centers = manager.train_dataset.cameras.camera_to_worlds[:, :, 3]
+    assert 1.0 < float((centers - centers.mean(0)).norm(dim=1).median()) / box < 4.0
+    parser = manager.dataparser
+    original = parser.splits["train"].transform_poses_to_original_space(manager.train_dataset.cameras.camera_to_worlds)
+    assert original[:, :, 3].abs().max() > 1000.0
+    if form is blender:
+        load_any(capture, scale_factor=0.5)
+        assert "the capture is scaled by" not in said(capsys)

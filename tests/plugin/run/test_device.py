@@ -1,0 +1,98 @@
+"""The GPU is used where the kernels can run on it; else a message says why and what to do."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from types import ModuleType
+
+import pytest
+import torch
+
+from bitymi_ns.plugin.run import device
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """A card that torch sees, and a module of kernels that finds nothing wrong with it."""
+    kernels = ModuleType("bitymi_ns._cuda")
+    kernels.device_problem = lambda number: ""
+    monkeypatch.setitem(sys.modules, "bitymi_ns._cuda", kernels)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: kernels)
+    device._device_problem.cache_clear()
+    device._say_once.cache_clear()
+    yield kernels
+    device._device_problem.cache_clear()
+
+
+def test_a_usable_card_is_used(card: ModuleType) -> None:
+    assert device.default_device_type() == "cuda" and device.kernel_device("cuda:0") == torch.device("cuda:0")
+    assert device.kernel_device("cpu").type == "cpu"
+
+
+def test_a_card_that_the_kernels_cannot_run_on_is_left_alone_with_one_message(
+    card: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    card.device_problem = lambda number: "the kernels were built for 90, and this card has 75: install again"
+    for _ in range(2):
+        assert device.kernel_device("cuda").type == "cpu"
+    assert " ".join(capsys.readouterr().out.split()).count("and this card has 75: install again") == 1
+
+
+def test_each_card_is_tried(card: ModuleType) -> None:
+    card.device_problem = lambda number: "too old" if number else ""
+    assert device.kernel_device("cuda:0").type == "cuda" and device.kernel_device("cuda:1").type == "cpu"
+    assert device.why_not_cuda() is None and device.why_not_cuda(1) == "too old"
+
+
+def test_an_installation_without_kernels_says_how_to_get_them(
+    card: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
+    assert "nvcc" in device.why_not_cuda() and device.default_device_type() == "cpu"
+
+
+def test_kernels_that_cannot_be_loaded_are_no_traceback(card: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bitymi_ns._cuda", None)
+    assert "cannot be loaded" in device.why_not_cuda()
+
+
+@pytest.fixture
+def config():
+    """Of a run. nerfstudio is imported before a card is made up: its libraries ask for one."""
+    pytest.importorskip("nerfstudio")
+    from bitymi_ns.plugin.run.config import method_config
+
+    return method_config("bitymi").config
+
+
+@pytest.mark.parametrize("texture", ["hash", "texels", "none"])
+def test_a_card_trains_any_texture(config, card: ModuleType, texture: str) -> None:
+    assert config.pipeline.model.scene.texture == "texels"
+    config.machine.device_type, config.pipeline.model.scene.texture = "cuda", texture
+    config.set_timestamp()
+    assert config.machine.device_type == "cuda" and config.pipeline.model.scene.texture == texture
+
+
+@pytest.mark.parametrize("option", ["mixed_precision", "use_grad_scaler"])
+def test_what_scales_the_loss_is_refused(config, option: str) -> None:
+    setattr(config, option, True)
+    with pytest.raises(SystemExit, match=rf"--{option.replace('_', '-')} True is not supported"):
+        config.set_timestamp()
+
+
+def test_there_are_no_more_processes_than_cards(config, card: ModuleType) -> None:
+    config.machine.device_type, config.machine.num_devices = "cuda", 2
+    with pytest.raises(SystemExit, match=r"1 of 2 GPUs that .*--machine.num-devices"):
+        config.set_timestamp()
+
+
+def test_no_card_and_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    device._device_problem.cache_clear()
+    assert device.why_not_cuda() and device.kernel_device("cuda").type == "cpu"
+    assert device.kernel_device("mps").type == "cpu"
+    device._device_problem.cache_clear()

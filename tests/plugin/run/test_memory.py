@@ -1,0 +1,136 @@
+"""The statement of the memory that a run will take."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import psutil
+import pytest
+import torch
+
+from bitymi_ns.ops import trace_cpu
+from bitymi_ns.plugin.run import memory
+from bitymi_ns.scene import Camera, Scene
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train import texels
+from bitymi_ns.train.config import TexelConfig
+from tests.scene import bands
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def scene() -> tuple[Scene, Camera]:
+    return bands.make(CPU, 0)
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    return " ".join(capsys.readouterr().out.split())
+
+
+def gigabytes(text: str) -> float:
+    return float(text.split(" GB")[0].split()[-1])
+
+
+@pytest.mark.parametrize("what", ["training", "export"])
+def test_one_line_says_what_will_be_taken(
+    scene: tuple[Scene, Camera], what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = {"training": memory.state_training, "export": memory.state_export}[what]
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**12))
+    state(scene[0], [scene[1]] * 20, 0)
+    text = said(capsys)
+    assert "will take about" in text and "20 training photographs of 24 x 150" in text and "available" not in text
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))
+    monkeypatch.setattr(memory, "PROGRAM", 1e15)
+    state(scene[0], [scene[1]] * 20, 0)
+    assert "GB that this machine has available" in said(capsys)
+
+
+def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, camera = scene
+    with torch.no_grad():
+        count = len(one.render(camera).fragments)
+    assert memory.most_fragments(one, [camera] * 5) == int(memory.MARGIN * count)
+    assert memory.most_fragments(one, [camera], 1000) == 1000
+    monkeypatch.setattr(memory, "PER_FRAGMENT", 1e6)
+    memory.state_training(one, [camera], 0)
+    assert gigabytes(said(capsys)) == pytest.approx(0.8 + 1e-3 * memory.MARGIN * count, abs=0.1)
+    monkeypatch.setattr(texels, "FEW", 0)
+    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    for to_come, views in ((1000, memory.VIEWS_OF_TEXELS / 2.0), (20, 2.0)):
+        monkeypatch.setattr(memory, "PER_TEXEL", 0)
+        memory.state_training(one, [camera], 0, options, to_come)
+        monkeypatch.setattr(memory, "PER_TEXEL", 1e6)
+        memory.state_training(one, [camera], 0, options, to_come)
+        few, many = said(capsys).split("Training will take")[1:]
+        most = memory.SMALLEST**2 * len(one) + views * camera.width * camera.height
+        assert gigabytes(many) - gigabytes(few) == pytest.approx(1e-3 * most, rel=0.1)
+    large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs alone: more than are kept
+    monkeypatch.setattr(memory, "most_fragments", lambda *_: 0)
+    needed = []
+    for views in (100, 1000):
+        memory.state_training(one, [large] * views, 0)
+        memory.state_export(one, [large] * views, 1e9)
+        needed.append(said(capsys).split(" for ")[0])
+    assert needed[0] == needed[1]
+
+
+def test_surfels_that_learn_in_an_export_take_what_they_take_in_training(
+    scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = []
+    for learning in (0, 1_000_000):
+        memory.state_export(scene[0], [scene[1]], 0, learning)
+        needed.append(gigabytes(said(capsys)))
+    assert needed[1] - needed[0] == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
+
+
+@pytest.mark.parametrize(("compact", "bytes_each"), [(False, 2), (True, 6)])
+def test_an_export_holds_what_every_view_shows_of_every_surfel(
+    scene: tuple[Scene, Camera],
+    compact: bool,
+    bytes_each: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(memory, "_state", lambda what, needed, *more: stated.append(needed))
+    stated: list[float] = []
+    for views in (30_000, 40_000):  # whose photographs are more than are kept
+        memory.state_export(scene[0], [scene[1]] * views, 0, compact=compact)
+    assert stated[1] - stated[0] == 10_000 * bytes_each * len(scene[0])
+    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    for views in (30_000, 40_000):
+        memory.state_training(scene[0], [scene[1]] * views, 0, options, 1000)
+    assert stated[3] - stated[2] == 10_000 * len(scene[0])
+
+
+def test_views_are_counted_where_the_fine_tuning_keeps_them(
+    scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = []
+    for views in (10, 300_000):
+        memory.state_export(scene[0], [scene[1]] * views, 2e9)
+        needed.append(gigabytes(said(capsys)))
+    assert needed[0] - needed[1] == pytest.approx(2.0 - memory.PHOTOGRAPH_BYTES / 1e9, abs=0.11)
+
+
+def test_an_export_takes_copies_of_the_texels_that_were_learned(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, camera = scene
+    texels = TexelField.blank(len(one), 5000, one.surfels["means"].detach())
+    monkeypatch.setattr(memory, "PER_BAKED_TEXEL", 1e6)
+    needed = []
+    for field in (None, texels):
+        one.field = field
+        memory.state_export(one, [camera], 0)
+        needed.append(gigabytes(said(capsys)))
+    assert needed[1] - needed[0] == pytest.approx(5.0, abs=0.11)
+
+
+def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:
+    output = scene[0].render(scene[1])
+    assert trace_cpu.count(output.projection) == len(output.fragments)

@@ -1,0 +1,135 @@
+"""Image metrics, the training curve and honest clocks."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.run import metrics
+from bitymi_ns.plugin.run.curve import TrainingCurve, points
+from bitymi_ns.plugin.run.pipeline import BitymiPipeline
+from bitymi_ns.train.clock import Stopwatch
+
+
+def pair() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(40, 50, 3, generator=generator)
+    return (reference + 0.1).clamp(0, 1), reference
+
+
+def test_equal_images_are_perfect(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_lpips_missing", [True])
+    image = pair()[1]
+    result = metrics.image_metrics(image, image)
+    assert result["ssim"] == pytest.approx(1.0) and result["flip"] == pytest.approx(0.0, abs=1e-6)
+    assert "lpips" not in result
+
+
+def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    flip_evaluator = pytest.importorskip("flip_evaluator")
+    monkeypatch.setattr(metrics, "_lpips_missing", [True])
+    image, reference = pair()
+    result = metrics.image_metrics(image, reference)
+    _, flip, _ = flip_evaluator.evaluate(reference.numpy(), image.numpy(), "LDR")
+    assert result["flip"] == pytest.approx(flip, abs=1e-6)
+    assert 0 < result["ssim"] < 1 and all(isinstance(v, float) and math.isfinite(v) for v in result.values())
+
+
+def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_lpips_missing", [True])
+    _, reference = pair()
+    darker = 0.7 * reference + 0.02
+    result = metrics.image_metrics(darker, reference)
+    assert result["psnr"] < 20 and result["cc_psnr"] > 80
+    mask = torch.zeros(40, 50, 1, dtype=torch.bool)
+    mask[:, :25] = True
+    spoilt = torch.where(mask, darker, 1.0)
+    assert metrics.image_metrics(spoilt, reference, mask)["cc_psnr"] > 80
+    assert metrics.image_metrics(spoilt, reference)["cc_psnr"] < 30
+
+
+def test_lpips_that_cannot_be_had_is_left_out_with_one_warning(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def offline(backbone: str) -> None:
+        raise metrics.lpips.LpipsUnavailable("pip is offline")
+
+    monkeypatch.setattr(metrics, "_lpips_missing", [])
+    monkeypatch.setattr(metrics.lpips, "load", offline)
+    metrics.lpips._on_device.cache_clear()
+    for _ in range(2):
+        assert "lpips" not in metrics.image_metrics(*pair())
+    output = " ".join(capsys.readouterr().out.split())
+    assert output.count("LPIPS is left out") == 1 and "pip is offline" in output
+
+
+def test_images_too_small_for_lpips_go_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_lpips_missing", [])
+    monkeypatch.setattr(metrics.lpips, "lpips", lambda *_: 0.25)
+    assert metrics.image_metrics(*pair())["lpips_vgg"] == 0.25
+    image = torch.rand(40, 31, 3)
+    assert "lpips" not in metrics.image_metrics(image, image)
+
+
+def test_rendering_is_timed_alone() -> None:
+    calls = []
+
+    def render() -> None:
+        calls.append(1)
+        time.sleep(0.05 if len(calls) == 1 else 0.01)  # the first run is slow
+
+    assert 8 < metrics.render_milliseconds(render, torch.device("cpu")) < 40
+    assert len(calls) == 4
+
+
+def test_the_clock_counts_between_start_and_stop_only() -> None:
+    clock = Stopwatch(1.0, 2.0)
+    clock.start()
+    clock.stop()
+    time.sleep(0.02)
+    clock.stop()
+    assert 1.0 <= clock.seconds < 1.015 and clock.cpu_seconds >= 2.0
+
+
+def test_curve_points_end_with_the_run() -> None:
+    assert sorted(points(100, 4)) == [24, 49, 74, 99]
+    assert max(points(7, 20)) == 6 and min(points(7, 20)) == 0
+    assert points(10, 0) == frozenset()
+
+
+def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
+    first = TrainingCurve(tmp_path / "a.jsonl")
+    for step in (10, 20, 30):
+        first.add({"step": step})
+    with open(tmp_path / "a.jsonl", "a") as file:
+        file.write('{"step": 4')  # the run was killed here
+    TrainingCurve(tmp_path / "b.jsonl", tmp_path / "a.jsonl", steps_done=20).add({"step": 40})
+    assert [json.loads(line)["step"] for line in (tmp_path / "b.jsonl").read_text().splitlines()] == [10, 20, 40]
+    TrainingCurve(tmp_path / "a.jsonl")
+    assert (tmp_path / "a.jsonl").read_text() == ""
+
+
+def test_a_full_disk_costs_a_point_and_not_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    curve = TrainingCurve(tmp_path / "a.jsonl")
+    curve.path = tmp_path / "missing" / "a.jsonl"
+    curve.add({"step": 1})
+    assert "could not be written" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_metric_that_a_view_has_none_of_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    averages = {"psnr": math.nan, "psnr_std": math.nan, "ssim": 0.9, "ssim_std": math.nan}
+    monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", lambda self, views: averages)
+    pipeline = BitymiPipeline.__new__(BitymiPipeline)
+    assert BitymiPipeline.get_average_image_metrics(pipeline, ["a view"]) == {"ssim": 0.9, "ssim_std": 0.0}
+    assert "psnr is left out" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(InputError, match="no held-out view to evaluate"):
+        BitymiPipeline.get_average_image_metrics(pipeline, [])

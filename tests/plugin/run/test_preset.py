@@ -1,0 +1,125 @@
+"""Presets state what differs from the declared defaults, and errors name the file and the key."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bitymi_ns.bake import BakeOptions
+from bitymi_ns.plugin.run.preset import DataOptions, Preset, PresetError, TrainerOptions, load_preset
+from bitymi_ns.presets import preset_names, preset_path
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import AdamConfig
+
+METHODS = [
+    "bitymi",
+    "bitymi-quality",
+    "bitymi-fast",
+    "bitymi-sb",
+    "bitymi-sg",
+    "bitymi-sh",
+    "bitymi-field",
+    "bitymi-notexture",
+]
+
+
+def test_the_presets_are_those_that_are_registered() -> None:
+    assert sorted(METHODS) == preset_names()
+
+
+def test_the_default_preset_is_the_declared_defaults_but_for_the_texture() -> None:
+    preset = load_preset("bitymi")
+    assert preset == Preset("bitymi", preset.description, scene=SceneConfig(texture="texels"))
+
+
+def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
+    """Keys to which a preset gives the default again."""
+    found = []
+    for key, value in values.items():
+        default = getattr(defaults, key)
+        if isinstance(value, dict):
+            found += repeated(value, default, f"{prefix}{key}.")
+        elif value == default:
+            found.append(prefix + key)
+    return found
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_preset_states_no_default_again(name: str) -> None:
+    values = yaml.safe_load(preset_path(name).read_text("utf8"))
+    base = values.pop("base", None)
+    assert repeated(values, Preset(name) if base is None else load_preset(base)) == []
+
+
+def documented(cls: type) -> list[str]:
+    """Options without a line that says what they are, which the command line's help would lack."""
+    (tree,) = ast.parse(inspect.cleandoc("\n" + inspect.getsource(cls))).body
+    assert isinstance(tree, ast.ClassDef)
+    pairs = zip(tree.body, [*tree.body[1:], None], strict=True)
+    return [
+        ast.unparse(node.target)
+        for node, after in pairs
+        if isinstance(node, ast.AnnAssign)
+        and not (isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant))
+    ]
+
+
+@pytest.mark.parametrize("cls", [TrainerOptions, DataOptions, SceneConfig, AdamConfig, BakeOptions])
+def test_every_option_is_documented_where_it_is_declared(cls: type) -> None:
+    assert documented(cls) == []
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_preset_loads_and_describes_itself(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.name == name
+    assert len(preset.description) > 20
+
+
+def test_the_variants_differ_where_they_should() -> None:
+    base = load_preset("bitymi")
+    quality = load_preset("bitymi-quality")
+    assert quality.train.loss.falloff_weight == 0.0 and base.train.loss.falloff_weight == 0.005
+    assert quality.scene == base.scene
+    fast = load_preset("bitymi-fast")
+    assert fast.train.loss.overdraw_weight > 0.0 == base.train.loss.overdraw_weight
+    assert fast.scene == base.scene and fast.train.densify == base.train.densify
+    assert [load_preset(f"bitymi-{c}").scene.view_color for c in ("sh", "sb", "sg")] == ["sh", "sb", "sg"]
+    assert load_preset("bitymi-notexture").scene.texture == "none"
+    assert load_preset("bitymi-field").scene.texture == "hash"
+
+
+def write(folder: Path, text: str, name: str = "mine") -> Path:
+    (folder / f"{name}.yaml").write_text(text, "utf8")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("train:\n  loss:\n    falloff_wieght: 1.0", r"mine\.yaml: train\.loss\.falloff_wieght: unknown key"),
+        ("scene:\n  levels: four", r"mine\.yaml: scene\.levels: expected int, found 'four'"),
+        ("scene:\n  levels: true", r"scene\.levels: expected int"),
+        ("scene:\n  view_color: xy", r"scene\.view_color: expected one of sv, sh, sb, sg"),
+        ("bake:\n  tolerance: 1.0", r"mine\.yaml: bake: unknown key; known here: .*scene, train"),
+        ("scene: 3", r"mine\.yaml: scene: expected a group of options"),
+        ("train:\n  lr:\n    means: [1.0]", r"train\.lr\.means: expected a list of 2 values"),
+        ("train:\n  densify:\n    final_prune_steps: [1, x]", r"final_prune_steps\[1\]: expected int"),
+        ("- a\n- b", r"mine\.yaml: expected a mapping"),
+        ("a: [", r"mine\.yaml: not valid YAML"),
+        ("base: nowhere", r"no preset file .*nowhere\.yaml .*named as base of mine\.yaml"),
+        ("base: mine", r"mine\.yaml: base: presets refer to each other in a circle"),
+        ("base: 3", r"mine\.yaml: base: expected the name of a preset"),
+    ],
+)
+def test_errors_name_file_and_key(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(PresetError, match=message):
+        load_preset("mine", write(tmp_path, text))
+
+
+def test_a_variant_overrides_single_keys_of_its_base(tmp_path: Path) -> None:
+    write(tmp_path, "description: d\nscene:\n  levels: 3\n  near: 1e-1", "below")
+    preset = load_preset("mine", write(tmp_path, "base: below\nscene:\n  levels: 2"))
+    assert (preset.scene.levels, preset.scene.near, preset.description) == (2, 0.1, "d")

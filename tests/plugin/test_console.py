@@ -1,0 +1,100 @@
+"""What a run prints: a few lines of its own, none of nerfstudio's about itself, and nothing before it is checked."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+import rich
+import yaml
+from nerfstudio.scripts import train as ns_train
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.console import Console
+from rich.panel import Panel
+
+from bitymi_ns.plugin import console
+from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
+
+
+def run_on(capture: Path, output: Path) -> BitymiTrainerConfig:
+    config = method_config("bitymi").config
+    config.data, config.output_dir, config.experiment_name, config.timestamp = capture, output, "room", "run"
+    config.vis, config.max_num_iterations, config.pipeline.model.curve_points = "none", 4, 2
+    config.pipeline.model.scene.log2_table_size, config.pipeline.model.scene.min_resolution = 10, 16
+    return config
+
+
+def test_a_missing_capture_is_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = run_on(tmp_path / "nowhere", tmp_path / "outputs")
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        ns_train.main(config)
+    printed = [line for line in capsys.readouterr().out.splitlines() if "Using --data alias" not in line]
+    assert printed == []
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_a_run_without_a_terminal_prints_what_it_is_and_a_line_a_report(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        config = run_on(capture, tmp_path / "outputs")
+        config.vis = "tensorboard"
+        ns_train.main(config)
+    printed = capsys.readouterr().out
+    lines = [line for line in printed.splitlines() if line.strip()]
+    assert f"capture  {capture}" in lines and "length   4 steps on cpu" in lines
+    assert sum(line.startswith("step ") for line in lines) == 2
+    assert "\r" not in printed and "\x1b" not in printed and "local writer" not in printed
+    assert len(lines) < 21, printed
+    assert not [str(w.message) for w in warned if "nerfstudio" in w.filename and "torch" in str(w.message)]
+    assert not [str(w.message) for w in warned if "requires_grad" in str(w.message)]
+    saved = yaml.load((tmp_path / "outputs/room/bitymi/run/config.yml").read_text(), Loader=yaml.Loader)
+    assert saved.pipeline.model.train.densify.interval == 500 and saved.optimizers  # it is all there
+
+
+def test_only_known_remarks_are_dropped_and_only_for_a_while(capsys: pytest.CaptureFixture[str]) -> None:
+    def say() -> str:
+        CONSOLE.print("Mixed precision is disabled for CPU training.")
+        CONSOLE.log("Auto image downscale factor of 1")
+        CONSOLE.log("Auto image downscale factor of 16")
+        CONSOLE.print("[bold yellow]Warning: load_3D_points set to true but no point cloud found.")
+        rich.print(Panel("http", title="[bold]viser[/bold]"))
+        rich.print("a line")
+        warnings.warn_explicit("old", FutureWarning, "trainer.py", 1, "nerfstudio.engine.trainer")
+        return capsys.readouterr().out
+
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        with console.quiet_host():
+            said = say()
+        assert not warned
+        for kept in ("factor of 16", "test_console.py", "no point cloud found", "a line"):
+            assert kept in said
+        for dropped in ("Mixed", "factor of 1 ", "http"):
+            assert dropped not in said
+        said = say()
+        assert len(warned) == 1
+    for shown in ("Mixed", "factor of 1 ", "http"):
+        assert shown in said
+
+
+def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(console, "CONSOLE", Console(file=screen, force_terminal=True, width=80))
+    with console.step_bar(10, 40) as show_step:
+        show_step(19)
+        console.CONSOLE.print("a report")
+    assert "20/40" in screen.getvalue() and "a report\n" in screen.getvalue()
+
+
+def test_brackets_in_what_the_host_says_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    with console.quiet_host():
+        CONSOLE.print("logging events to: o[/b]/run")
+    assert "o[/b]/run" in capsys.readouterr().out

@@ -1,0 +1,169 @@
+"""The registry entries, what they do on a machine without a GPU, and that they never break nerfstudio."""
+
+import importlib
+import re
+import sys
+import warnings
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+import torch
+import tyro
+from nerfstudio.plugins.types import MethodSpecification
+
+import bitymi_ns.plugin.run.config as config
+from bitymi_ns.plugin import methods
+from bitymi_ns.plugin.errors import InputError
+
+NAMES = [
+    "bitymi",
+    "bitymi-quality",
+    "bitymi-fast",
+    "bitymi-sh",
+    "bitymi-sb",
+    "bitymi-sg",
+    "bitymi-field",
+    "bitymi-notexture",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_method_is_registered_under_its_name(name: str) -> None:
+    specification = getattr(methods, name.replace("-", "_"))
+    assert isinstance(specification, MethodSpecification)
+    assert specification.config.method_name == name
+    assert not specification.description.startswith("not available")
+
+
+def test_a_method_parses_from_the_command_line() -> None:
+    default = methods.bitymi.config
+    args = [
+        "--pipeline.model.train.loss.falloff-weight",
+        "0.001",
+        "--vis",
+        "none",
+        "--pipeline.model.scene.levels",
+        "3",
+    ]
+    parsed = tyro.cli(type(default), default=default, args=args)
+    assert parsed.pipeline.model.train.loss.falloff_weight == 0.001
+    assert parsed.pipeline.model.scene.levels == 3
+    assert parsed.vis == "none" and not parsed.is_viewer_enabled()
+    assert parsed.max_num_iterations is None
+
+
+def test_the_help_explains_every_option_that_does_something(capsys: pytest.CaptureFixture[str]) -> None:
+    default = methods.bitymi.config
+    with pytest.raises(SystemExit):
+        tyro.cli(type(default), default=default, args=["--help"])
+    text = capsys.readouterr().out
+    # an option is a line of its own, what it means the indented lines below it
+    lines = [line.strip("│| ") for line in text.splitlines()]
+    options = [i for i, line in enumerate(lines) if re.match("--[a-z]", line)]
+    assert len(options) > 100
+    for i in options:
+        following = " ".join(lines[i + 1 : i + 3])
+        assert len(following.split("(default")[0]) > 10, lines[i]
+    # these are nerfstudio's and have no effect here
+    for dead in ("--optimizers.", "collider", "fps", "loss-coefficients", "eval-num-rays", "prompt"):
+        assert dead not in text
+
+
+def test_the_protocol_is_that_of_3dgs() -> None:
+    dataparser = methods.bitymi.config.pipeline.datamanager.dataparser
+    assert (dataparser.eval_mode, dataparser.eval_interval, dataparser.points) == ("interval", 8, "auto")
+
+
+def fresh() -> config.BitymiTrainerConfig:
+    return config.method_config("bitymi").config
+
+
+def test_a_cpu_gets_a_short_run_and_says_so() -> None:
+    run = fresh()
+    run.machine.device_type = "cpu"
+    run.set_timestamp()
+    assert run.max_num_iterations == 3000 and run.steps_per_save == 600
+    assert "3,000 steps on cpu, the short schedule" in run.length()
+    run.max_num_iterations = 500
+    assert run.length() == "500 steps on cpu"
+
+
+def test_a_gpu_gets_the_full_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "why_not_cuda", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    run = fresh()
+    run.machine.device_type = "cuda"
+    run.set_timestamp()
+    assert run.max_num_iterations == 30_000
+
+
+def test_a_device_without_kernels_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(config, "why_not_cuda", lambda: "the card is too old")
+    run = fresh()
+    run.machine.device_type = "cuda"
+    run.set_timestamp()
+    assert run.machine.device_type == "cpu" and run.max_num_iterations == 3000
+    assert "on the CPU instead of cuda: the card is too old" in capsys.readouterr().out
+
+
+def test_a_given_length_is_kept() -> None:
+    run = fresh()
+    run.machine.device_type, run.max_num_iterations, run.steps_per_save = "cpu", 77, 5
+    run.set_timestamp()
+    assert (run.max_num_iterations, run.steps_per_save) == (77, 5)
+
+
+def test_a_senseless_length_is_refused() -> None:
+    run = fresh()
+    run.max_num_iterations = 0
+    with pytest.raises(SystemExit, match="at least 1"):
+        run.set_timestamp()
+
+
+def test_the_device_is_the_cpu_without_a_gpu() -> None:
+    if not torch.cuda.is_available():
+        assert fresh().machine.device_type == "cpu"
+
+
+def test_paths_in_the_saved_configuration_are_absolute() -> None:
+    run = fresh()
+    run.pipeline.datamanager.data = config.Path("some/capture")
+    run.set_timestamp()
+    assert run.pipeline.datamanager.data.is_absolute()
+
+
+def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bitymi_ns.plugin.run.config", None)  # its import raises ImportError
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            importlib.reload(methods)
+        assert sum("not available" in str(w.message) for w in caught) == 1
+        specification = methods.bitymi_sh
+        assert isinstance(specification, MethodSpecification)
+        assert specification.config.method_name == "bitymi-sh"
+        assert "not available" in specification.description
+        union = tyro.extras.subcommand_type_from_defaults({"bitymi": methods.bitymi.config, "other": fresh()})
+        parsed = tyro.cli(tyro.conf.FlagConversionOff[union], args=["bitymi"])
+        with pytest.raises(SystemExit, match="bitymi is not available: "):
+            parsed.set_timestamp()
+    finally:
+        monkeypatch.undo()
+        importlib.reload(methods)
+
+
+def test_errors_for_the_user_end_the_process_with_status_1_and_a_message() -> None:
+    error = InputError("no such capture")
+    assert isinstance(error, SystemExit) and error.code == "bitymi: no such capture"
+
+
+def test_a_capture_given_to_its_parser_names_the_experiment() -> None:
+    run = fresh()
+    run.pipeline.datamanager.dataparser.data = config.Path("captures/lego")
+    run.set_timestamp()
+    run.set_experiment_name()
+    assert run.experiment_name == "lego"

@@ -18,7 +18,7 @@ from bitymi_ns.bake.photo_resolution import photographed
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import AtlasCost, KeptSurfels, Statistics
 from bitymi_ns.codec.packing import Packing, pack
-from bitymi_ns.codec.pages import moved_texels, paged_texels, tile_means
+from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
 from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
 from bitymi_ns.ops.view_kinds import kind_of
@@ -128,10 +128,11 @@ class Baked:
         if bool(kept.all()):
             return self
         surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
-        packing = pack(torch.from_numpy(self.packing.tiles)[kept, 3:], self.options.page_width, self.options.page_rows)
+        before = replace(self.packing, tiles=self.packing.tiles[kept.numpy()])
+        packing = pack(before.tiles[:, 3:], self.options.page_width, self.options.page_rows)
         texels = None
         if self.texels is not None and packing.texels:
-            texels = moved_texels(self.texels, torch.from_numpy(self.packing.tiles)[kept], packing)
+            texels = paged_texels(listed_texels(self.texels, before, self.mean_residual[kept]), packing)
         in_front = None if self.in_front is None else self.in_front[kept]
         some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept], in_front=in_front)
         return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.mean_residual[kept]))

@@ -12,10 +12,9 @@ from typing import TypeVar
 if importlib.util.find_spec("bitymi_ns") is None:  # not installed, or not yet: gpu.py builds it
     sys.path.append(str(Path(__file__).resolve().parent.parent))
 
-from bitymi_ns.measure.bench.commands import read_curve
+from bitymi_ns.measure.bench.engine import read_curve
 from bitymi_ns.measure.bench.process import CommandFailed, say
-from bitymi_ns.measure.bench.tables import difference, number, page
-from bitymi_ns.measure.markdown import table
+from bitymi_ns.measure.markdown import difference, number, page, table
 
 T = TypeVar("T")
 __all__ = ["CommandFailed", "cpu_milliseconds", "difference", "number", "page", "publish", "read_curve", "say", "table"]

@@ -304,7 +304,7 @@ def main() -> None:
     from common import say, table
 
     from bitymi_ns.files import write_file
-    from bitymi_ns.measure.bench.machine import processor
+    from bitymi_ns.measure.machine import processor
 
     settings = Settings(options.steps, options.tuning, options.seeds)
     empty = {"settings": asdict(settings), "processor": processor(), "scenes": {}}

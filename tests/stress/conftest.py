@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bitymi_ns.measure.stability.backends import BACKENDS, Backend, missing
+from bitymi_ns.measure.stability.errors import BACKENDS, Backend, missing
 from tests.required import skip_without
 
 

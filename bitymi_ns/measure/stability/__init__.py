@@ -1,1 +1,1 @@
-"""How far float32 can be trusted: extreme scenes, errors against float64 and extended precision, a page of them."""
+"""Float32 accuracy: extreme scenes, errors against float64 and extended precision, and a page of them."""

@@ -1,9 +1,9 @@
-"""Templates escape what they are given, and miss no value in silence."""
+"""Templates: no missing value goes unnoticed, and Markdown is not escaped."""
 
 import jinja2
 import pytest
 
-from bitymi_ns.measure.templates import rendered
+from bitymi_ns.measure.markdown import rendered
 
 
 def test_a_value_that_is_missing_is_an_error() -> None:

@@ -1,4 +1,4 @@
-"""Run every test that takes `backend` on all of them, on a card where there is one; a new one is an entry of BACKENDS."""
+"""Run every test that takes `backend` on all backends, on a card where there is one; a new one is a BACKENDS entry."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 
 from bitymi_ns.measure.stability.backends import BACKENDS, Backend, missing
 from tests.required import REQUIRED, skip_without
-
 
 NAMES = sorted(name for name in BACKENDS if name != "cuda" or torch.cuda.is_available() or "cuda" in REQUIRED)
 

@@ -1,4 +1,4 @@
-"""Where the operations can run. A backend is a device, and what has to be in place while its kernels are used."""
+"""Backends of the measurement: a device, and what has to be in place while its kernels are used."""
 
 from __future__ import annotations
 

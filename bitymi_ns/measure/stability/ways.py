@@ -53,7 +53,7 @@ WAYS = (Way(TEXELS, texels=True), Way("pixel", through_pixel=True, rim=0.0))
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:
-    """Where the texels [T, 3] of the surfels lie."""
+    """Tiles of TILE texels each for the surfels' texels [T, 3]."""
     n = len(texels) // (TILE[0] * TILE[1])
     size = torch.tensor(TILE, dtype=torch.int32, device=texels.device).expand(n, 2)
     return TexelTiles.of_sizes(size, texels.new_full((n,), float(SUPPORT)))

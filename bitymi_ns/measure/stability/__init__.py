@@ -1,1 +1,1 @@
-"""Float32 accuracy: extreme scenes, errors against float64 and extended precision, and a page of them."""
+"""Float32 errors of extreme scenes against float64 and extended precision, and the page that lists them."""

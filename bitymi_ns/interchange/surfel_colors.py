@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.directions import view_directions
-from bitymi_ns.bake.field.texels import texel_centres
 from bitymi_ns.bake.lean_color import shown_at
+from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
@@ -99,7 +99,7 @@ def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None
     flat = scene.residuals().reshape(-1, 3)
     for r_u, r_v, rows in size_classes(scene.tiles):
         for part in rows.split(max(1, chunk // (r_u * r_v))):
-            u, v = (texel_centres(r, extent[part, None]) for r in (r_u, r_v))
+            u, v = (texel_centers(r, extent[part, None]) for r in (r_u, r_v))
             rest = (1 - (u[:, None, :].square() + v[:, :, None].square()) / SUPPORT**2).clamp(min=0)
             weight = (rest ** beta[part, None, None]).where(rest > 0, 0.0) + 1e-6
             texels = flat[texel_index(scene.tiles[part], (r_u, r_v), width, height)]

@@ -1,4 +1,4 @@
-"""What each quality knob costs and saves: error against the exact setting, beside milliseconds and bytes."""
+"""Cost and saving of each quality knob: error against the exact setting, beside milliseconds and bytes."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class Lens:
         return _distorts(_camera(self))
 
     def undistort(self, image: Image.Image) -> Image.Image:
-        """Undistort an 8-bit image of any mode, which may have been decoded at less than `stored`, but at least `size`."""
+        """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below `size`."""
         if image.size != self.size:
             image = image.resize(self.size, Image.Resampling.BOX)
         if not self.distorts:

@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns.bundle import Bundle, Check, check_field, check_place, check_view_color
+from bitymi_ns.bake.verify import check_field, check_view_color
+from bitymi_ns.bundle import Bundle, Check, check_place
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.errors import fail
 from bitymi_ns.plugin.export.command import held_out_psnr, load_trained, world_of

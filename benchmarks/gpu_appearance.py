@@ -175,7 +175,7 @@ def _texel_cases(n: int, width: int, height: int, device: torch.device) -> list[
     fragments = replace(fragments, weight=weight, uv=uv)
     projection = replace(projection, geom=projection.geom.detach().requires_grad_())
     f, t, e = len(fragments), int((weight >= bound).sum()), len(field.texels)
-    b, p = fragments.layout.pairs, width * height
+    b, p = fragments.layout.handle.pairs, width * height
     base = scene.base_color(projection).detach().requires_grad_()
 
     def image() -> Tensor:

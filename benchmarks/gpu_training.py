@@ -185,7 +185,7 @@ def _steps(
         def render(scene: Scene = scene, camera: Camera = camera, mode: str = mode) -> Tensor:
             return scene.render(camera, field_mode=mode).rgb
 
-        pairs = scene.render(camera, field_mode="off").fragments.layout.pairs
+        pairs = scene.render(camera, field_mode="off").fragments.layout.handle.pairs
         cases.append((name, training_step(render, loss, parameters), pairs))
     return cases + (gpu_gsplat.steps(n, width, height, loss, training_step, device) if options.peers else [])
 

@@ -59,7 +59,7 @@ def test_one_surfel_of_any_tile(
 
 
 def test_a_part_of_the_fragments_gives_its_part_of_the_image(device: torch.device) -> None:
-    check_parts(Case(200, device=device, width=150, height=90))
+    check_parts(Case(40, device=device, width=50, height=40))
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -29,10 +29,10 @@ def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -
     """
     files: dict[str, bytes] = {}
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    rows = [_row(name, camera, False) for name, camera in zip(names, train, strict=True)]
+    rows = [camera_row(name, camera, False) for name, camera in zip(names, train, strict=True)]
     for i, path in enumerate(datamanager.eval_dataset.image_filenames):
         view = datamanager.eval_views[i]
-        row = _row(path.name, view.camera.to("cpu"), True)
+        row = camera_row(path.name, view.camera.to("cpu"), True)
         if photographs:
             row["photograph"] = f"photograph-{i + 1:04d}.jpg"
             files[row["photograph"]] = _jpeg(view.target(torch.zeros(3), "cpu"))
@@ -40,7 +40,8 @@ def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -
     return {CAMERAS: (json.dumps({"cameras": rows}) + "\n").encode(), **files}
 
 
-def _row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
+def camera_row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
+    """One camera of cameras.json: intrinsics in pixels, viewmat [16] by rows (world to camera, OpenCV axes)."""
     K = camera.K.cpu().tolist()
     return {
         "name": name,

@@ -22,11 +22,11 @@ from PIL import Image
 
 from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn, rich_progress
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
 from bitymi_ns.bundle.folder import CONFIG
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.read import download_bytes
+from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
@@ -171,7 +171,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
-        cameras = datamanager.undistorted_train_cameras()
+        cameras = datamanager.train_dataset.cameras
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
         shown = preview(model, first, "JPEG" if self._is_compact else "PNG")

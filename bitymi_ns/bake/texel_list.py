@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.codings import C, Coding, Cosines, CosineTexels, Pages, PageTexels
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, Looks, gain, set_aside
-from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tuning_views import TuningViews
 from bitymi_ns.bundle.statistics import FineTuning

@@ -1,4 +1,4 @@
-"""A bundle: the folder that the renderers read. surfels.ply, atlas.ktx2, bundle.json; no pickle anywhere."""
+"""Writing of bundles: compact columns, or surfels.ply and atlas.ktx2; and bundle.json."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import torch
 
 from bitymi_ns import __version__
 from bitymi_ns.bundle import compact, ktx2, ply
-from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,
@@ -33,6 +32,7 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
+from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.statistics import Statistics
 from bitymi_ns.bundle.surfel_table import (
@@ -57,8 +57,7 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class World:
-    """How the scene's frame lies in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and how that
-    lies in the real world.
+    """Frame of the scene in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and in the real world.
 
     Attributes:
         transform: [3, 4] (the dataparser's transform).
@@ -75,7 +74,7 @@ class World:
     metres_per_unit: float | None = None
 
     def described(self) -> dict[str, Any]:
-        """`manifest.Place`: up and length in the scene's own frame."""
+        """`manifest.WorldFrame`: up and length in the scene's own frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
         place: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:
@@ -119,7 +118,7 @@ def export(
     interchange: bool = False,
     first: Camera | None = None,
 ) -> Path:
-    """Writes a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
+    """Write a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
 
     `statistics` is added to those of the bake. `first` is the camera with which a viewer opens, the first of
     cameras.json that was held out, or its first: the poster is drawn from there; None = the bundle gets no poster.
@@ -156,7 +155,7 @@ def write_bundle(
     interchange: bool = False,
     poster: Pixels | None = None,
 ) -> Path:
-    """Writes a bundle; the folder appears complete or not at all.
+    """Write a bundle; the folder appears complete or not at all.
 
     Args:
         folder: the bundle's folder.
@@ -213,12 +212,12 @@ def write_bundle(
 
 
 def _scene_bytes(folder: Path, parts: Mapping[str, bytes]) -> int:
-    """Of surfels and texels: of the two files of a compact bundle, or of what else there is so far."""
+    """Bytes of surfels and texels: of the two files of a compact bundle, or of the files so far."""
     return sum(map(len, parts.values())) if parts else sum(path.stat().st_size for path in folder.iterdir())
 
 
 def write_surfels(path: Path, scene: BakedScene) -> None:
-    """Writes the surfels of a scene on the CPU as a PLY file, which viewers of Gaussian splats open, too."""
+    """Write the surfels of a scene on the CPU as a PLY file, which viewers of Gaussian splats open, too."""
     columns = to_columns(scene.surfels, scene.tiles.numpy(), scene.mean_residual, scene.extent, scene.view_color)
     terms = {TERMS: term_columns(scene.surfels)} if "view_terms" in scene.surfels else None
     ply.write_ply(path, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
@@ -226,12 +225,12 @@ def write_surfels(path: Path, scene: BakedScene) -> None:
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """The two files of a compact bundle; their description goes into `info`."""
-    of_surfels, surfels = compact.pack_surfels(codes.surfels, codes.residual, codes.residual_step)
+    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
     info["version"] = f"{VERSION[0]}.{VERSION[1]}"
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
-        of_texels, parts[TEXELS] = compact.pack_texels(codes.texels)
+        of_texels, parts[TEXELS] = compact.encode_texels(codes.texels)
         pages = {"page_width": codes.page_width, "page_rows": codes.page_rows}
         info["atlas"] |= {"file": TEXELS, "format": "dct", **pages, **of_texels}
         info["atlas"].pop("extent_column")
@@ -248,7 +247,7 @@ def _describe(
     world: World,
     statistics: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """What `manifest.describe` takes, without the list of files; what is the same for all bundles stands there."""
+    """Arguments of `manifest.describe` without the list of files."""
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels

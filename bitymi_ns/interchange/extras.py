@@ -19,10 +19,10 @@ from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
 from bitymi_ns.interchange.glb import glb_bytes
-from bitymi_ns.interchange.looks import Looks, fit_looks, shown_residual
 from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.interchange.splat import draw_gaussians
+from bitymi_ns.interchange.surfel_colors import SurfelColors, fit_colors, weighted_residuals
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -36,20 +36,19 @@ Frame = Literal["scene", "capture"]
 FILES: dict[str, str] = {"gaussians": "gaussians.ply", "mesh": "mesh.glb"}
 SUMMARY = "extras.json"
 SUFFIX = ".extras"
-"""Of the name of the folder beside a bundle."""
+"""Suffix of the folder beside a bundle."""
 LEVEL = 0.15
-"""Of the opacity at which the quads of a mesh end."""
+"""Opacity at which the quads of a mesh end."""
 SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
-"""Longer side in pixels of the pictures by which it is found what the cameras see, those that colour a mesh, and those
-in which the files are measured."""
+"""Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
 COLORED_VIEWS, MEASURED_VIEWS = 64, 4
-"""At most so many training views colour a mesh; in so many held-out views the files are measured."""
+"""Training views that colour a mesh, and held-out views in which the files are measured, at most."""
 _UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
 
 
 @dataclass(frozen=True)
 class Written:
-    """What was written of a kind.
+    """Result of a written kind.
 
     Attributes:
         file: its name.
@@ -68,14 +67,14 @@ class Written:
     views: int
 
 
-def place_of(bundle: Path) -> Path:
+def extras_folder(bundle: Path) -> Path:
     """The folder for the extras of a bundle: beside it, with its name and `SUFFIX`."""
     bundle = bundle.absolute()
     return bundle.with_name((bundle.stem if bundle.suffix == ".bitymi" else bundle.name) + SUFFIX)
 
 
 def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
-    """Checks what is asked for and its place, before the work.
+    """Check the kinds and the folder before the work.
 
     Raises:
         BundleError: there is no such kind, or the folder is there and may not be replaced, or holds more.
@@ -87,9 +86,9 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / SUMMARY).is_file():
-        raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another place")
+        raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another folder")
     if not overwrite:
-        raise BundleError(f"{folder} is there already: choose another place, or add --overwrite")
+        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite")
     try:
         keep(folder, [SUMMARY, *FILES.values()])
     except Refused as error:
@@ -107,12 +106,12 @@ def write_extras(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> dict[str, Written]:
-    """Writes a folder with a file for each kind and extras.json, which says how well they show held-out photographs;
+    """Write a folder with a file for each kind and extras.json, which says how well they show held-out photographs;
     whole or not at all.
 
     Args:
         bundle: on the CPU, texels decoded.
-        folder: the place.
+        folder: to write.
         kinds: gaussians, mesh.
         frame: in which the files are: the scene's, or the capture's own, which bundle.json leads to.
         cameras: of the training photographs: colours are fitted to what they see. Without any, harmonics are fitted
@@ -134,7 +133,7 @@ def write_extras(
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
     chosen = [view.to("cpu") for view in evenly(held_out, MEASURED_VIEWS)]
     views = [at_size(view, smaller(view.camera, MEASURED_SIDE), "cpu") for view in chosen]
-    looks = _looks(scene, cameras, progress)
+    colors = _fitted_colors(scene, cameras, progress)
     base = _psnr(lambda camera: scene.render(camera, background).rgb, views, background)
     written: dict[str, Written] = {}
     try:
@@ -142,14 +141,14 @@ def write_extras(
             for kind in dict.fromkeys(kinds):
                 path = new / FILES[kind]
                 if kind == "gaussians":
-                    gaussians = gaussians_of(scene, looks.harmonics)
+                    gaussians = gaussians_of(scene, colors.harmonics)
                     count = len(gaussians)
                     value = _psnr(
                         lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background
                     )
                     write_gaussians(path, gaussians if to is None else gaussians.moved(to))
                 else:
-                    quads = quads_of(scene, looks.color, LEVEL)
+                    quads = quads_of(scene, colors.color, LEVEL)
                     if not len(quads):
                         raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
                     chosen = [smaller(camera, COLORED_SIDE) for camera in evenly(cameras, COLORED_VIEWS)]
@@ -167,8 +166,8 @@ def write_extras(
     return written
 
 
-def described(written: Written) -> str:
-    """What was written, in a line for people."""
+def summary_line(written: Written) -> str:
+    """One line about a written file."""
     line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB"
     if written.psnr is None or written.psnr_bundle is None:
         return line
@@ -186,11 +185,11 @@ def smaller(camera: Camera, side: int) -> Camera:
     return camera.scaled(min(1.0, side / max(camera.width, camera.height)))
 
 
-def _looks(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> Looks:
+def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     """Fitted to what the cameras see."""
     chosen = [smaller(camera, SEEN_SIDE) for camera in cameras]
     seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.through_pixel, progress).seen
-    return fit_looks(scene, shown_residual(scene), seen, centers_of(cameras, scene.surfels["means"]))
+    return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 
 
 def _picture(scene: BakedScene, background: Tensor) -> Callable[[Camera], Tensor]:

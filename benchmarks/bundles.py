@@ -57,7 +57,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.fit import fit
 from bitymi_ns.train.init import first_surfels_for
-from bitymi_ns.train.views import View, judging_background
+from bitymi_ns.train.views import View, eval_background
 
 COLUMNS = (
     "scene", "seed", "form", "surfels", "their bytes", "each", "view colours", "texels", "all", "PSNR", "SSIM", "FLIP",
@@ -113,7 +113,7 @@ def trained(capture: Capture, seed: int, steps: int) -> dict[str, Any]:
     centers, options = torch.stack([camera.center for camera in cameras]), SceneConfig(texture="texels")
     scene, _ = build_scene(capture.points, capture.colours, centers, options, config, bounded, pixels)
     log = fit(scene, capture.train, capture.held_out, config, steps)
-    background = judging_background(config, "cpu")
+    background = eval_background(config, "cpu")
     last = log.entries[-1]
     return {
         "scene": scene,

@@ -24,7 +24,7 @@ from common import number, page, publish, say, table
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
 from bitymi_ns.bundle import export, read_bundle
 from bitymi_ns.measure.bench.tables import difference
-from bitymi_ns.plugin.export.command import load_trained
+from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.plugin.run.preset import build
 from bitymi_ns.train.views import View

@@ -34,7 +34,7 @@ from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.losses import mean_psnr, psnr
-from bitymi_ns.train.views import judging_background
+from bitymi_ns.train.views import eval_background
 
 
 class Stages:
@@ -181,7 +181,7 @@ def run(
     with torch.no_grad():
         frame = milliseconds(lambda: scene.render(camera, field_mode="frozen"), options)
     start = time.perf_counter()
-    background = judging_background(preset.train, torch.device("cpu"))
+    background = eval_background(preset.train, torch.device("cpu"))
     cameras = [view.camera.to(device) for view in capture.train]
     stages = Stages()
     made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning(), stages)  # nothing learns
@@ -201,7 +201,7 @@ def run(
 
 
 def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.device) -> float:
-    background = judging_background(preset.train, device)
+    background = eval_background(preset.train, device)
     values = []
     for view in (view.to(device) for view in capture.held_out):
         rgb = baked.render(view.camera, background).rgb.clamp(0, 1)

@@ -25,8 +25,8 @@ from bitymi_ns.sample.room import Room
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import LearningRates, TrainConfig
+from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.domain import build_scene
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View

@@ -40,7 +40,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.sampling import averaged, size_of
 from bitymi_ns.train.evaluate import evenly_spaced
 from bitymi_ns.train.losses import psnr
-from bitymi_ns.train.views import View, as_float, reduce_image
+from bitymi_ns.train.views import View, as_float, downscale_image
 
 SIZES = ("scene", "size", "before", "now", "averaged", "to avg", "before, ms", "now, ms", "samples", "blended, million")
 FLICKER = ("scene", "to size", "before", "now", "averaged", "before, off", "now, off", "worst step", "averaged there")
@@ -89,11 +89,11 @@ class Bundle:
         """Of a held-out view, reduced to a camera's size; from the folder of large photographs if it has to be."""
         view = self.views[i]
         if camera.width <= view.camera.width:
-            return reduce_image(view.target(self.background, "cpu"), camera.width, camera.height)
+            return downscale_image(view.target(self.background, "cpu"), camera.width, camera.height)
         assert self.large is not None
         found = next(self.large.rglob(self.files[i].name))
         image = as_float(torch.from_numpy(np.array(Image.open(found).convert("RGB"))))
-        return reduce_image(image, camera.width, camera.height)
+        return downscale_image(image, camera.width, camera.height)
 
 
 def sizes(bundle: Bundle, wanted: list[float], repeats: int) -> list[list[str]]:

@@ -226,7 +226,7 @@ class Verify:
 
         bundle, checks = check_files(self.bundle)
         if bundle is not None and self.run_config is not None:
-            from bitymi_ns.plugin.export.verify import check_run
+            from bitymi_ns.plugin.export.trained import check_run
 
             checks += check_run(bundle, self.run_config, self.views)
         table = Table("", "check", "result", title=escape(printable(f"Bundle {self.bundle}")))

@@ -18,12 +18,11 @@ from torch.nn import Parameter
 from torch.nn.functional import embedding
 from torch.optim import SparseAdam
 
-from bitymi_ns.train.agreement import measure_agreement
 from bitymi_ns.train.config import ExposureKind
-from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.exposure_gains import estimate_gains
 from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import OnDemand, View
 
 LIMIT = 2.0
 """Largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops."""
@@ -73,7 +72,7 @@ class Exposure:
             near: nearest drawn depth, camera z.
         """
         self.decided = True
-        agreement = measure_agreement(points, views, near)
+        agreement = estimate_gains(points, views, near)
         prior = seeds(self._exif, len(views))
         if self.kind == "auto":
             if math.isnan(agreement.explained):

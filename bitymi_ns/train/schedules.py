@@ -6,8 +6,7 @@ import math
 from dataclasses import replace
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
-from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
-from bitymi_ns.train.options import check_ranges
+from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig, check_ranges
 
 PATIENT_STEPS = 3000
 """Steps of a run from which it has time for full size as early as the options say."""

@@ -24,10 +24,10 @@ from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.picture_cuda import note_centers
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
+from bitymi_ns.train.init import tangents
+from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
-from bitymi_ns.train.rotations import tangents
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.score import Scores, multi_view_scores
 from bitymi_ns.train.views import View

@@ -19,17 +19,16 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
+from bitymi_ns.train.init import tangents
 from bitymi_ns.train.losses import numbers
-from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.rotations import tangents
-from bitymi_ns.train.views import at_size, spread
+from bitymi_ns.train.views import OnDemand, at_size, spread
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from bitymi_ns.train.config import TexelConfig
     from bitymi_ns.train.schedules import Schedule
-    from bitymi_ns.train.views import ReducedViews, View
+    from bitymi_ns.train.views import DownscaledViews, View
 
 FEWEST_VIEWS = 32
 """That are looked through for the tiles, however short the run."""
@@ -43,7 +42,7 @@ LEAST_SHARE = 0.25
 """What a texel counts as seen by, at least, where not all views are looked through: this share of what one view can
 show of it. So no step is much longer than four times the rate. With all of it, texels that others hide learn too
 slowly."""
-LOOKED_PIXELS = 10_000
+SURVEY_PIXELS = 10_000
 """Pictures that are looked through have half the size of the photographs where so many pixels are left of each: these
 tell as much in half of the time, and their lists of fragments are shorter."""
 
@@ -62,7 +61,7 @@ class LearningTexels:
         self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
         self._rate: RemovableHandle | None = None
 
-    def begin(self, step: int, views: ReducedViews) -> bool:
+    def begin(self, step: int, views: DownscaledViews) -> bool:
         """Gives the surfels their tiles where this step is the first that needs them; whether it was."""
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
@@ -134,7 +133,7 @@ def blank_texels(
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound
-    size_looked = looked_size(cameras)
+    size_looked = survey_scale(cameras)
     smaller = [camera.scaled(size_looked) for camera in cameras]
     seen = visibility(surfels, smaller, scene.near, bound, scene.config.through_pixel)
     seen = replace(seen, pixels=seen.pixels / size_looked**2)
@@ -143,7 +142,7 @@ def blank_texels(
     looked = OnDemand(len(views), lambda i: at_size(views[i], smaller[i], extent.device))
     seen_in_all = coverage(scene, field, looked) * (count / max(1, len(views)) / size_looked**2)
     if len(views) < count:
-        least = LEAST_SHARE * in_one_view(surfels, cameras, size, extent, scene.near)
+        least = LEAST_SHARE * single_view_coverage(surfels, cameras, size, extent, scene.near)
         seen_in_all = torch.maximum(seen_in_all, least)
     field.share.copy_(1.0 / (seen_in_all + options.prior))
     return field
@@ -151,12 +150,12 @@ def blank_texels(
 
 def most_texels(options: TexelConfig, looked_at: float) -> float:
     """Texels of all tiles, for a part whose steps look at so many pixels."""
-    return max(FEW, looked_at / options.looked_pixels_per_texel)
+    return max(FEW, looked_at / options.rendered_pixels_per_texel)
 
 
-def looked_size(cameras: Sequence[Camera]) -> float:
+def survey_scale(cameras: Sequence[Camera]) -> float:
     """Size of the pictures that are looked through, as a share of that of the photographs."""
-    return 0.5 if cameras and mean_pixels(cameras) >= 4 * LOOKED_PIXELS else 1.0
+    return 0.5 if cameras and mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
 
 
 def mean_pixels(cameras: Sequence[Camera]) -> float:
@@ -164,7 +163,7 @@ def mean_pixels(cameras: Sequence[Camera]) -> float:
     return sum(camera.width * camera.height for camera in cameras) / max(1, len(cameras))
 
 
-def in_one_view(
+def single_view_coverage(
     surfels: Mapping[str, Tensor], cameras: Sequence[Camera], size: Tensor, extent: Tensor, near: float
 ) -> Tensor:
     """About as much as a view can show of every texel, pixels [T]: its area in the view that is nearest to it, whether

@@ -13,9 +13,9 @@ import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.plugin.run.curve import FILE
 from bitymi_ns.train import init
 from tests.e2e.runs import Start, checkpoint
 

@@ -15,7 +15,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 import bitymi_ns.plugin.run.config as config
 from bitymi_ns.plugin import methods
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 
 NAMES = [
     "bitymi",

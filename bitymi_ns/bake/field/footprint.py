@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import max_projected_extent
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:

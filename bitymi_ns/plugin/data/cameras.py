@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from bitymi_ns.capture.panorama import PANORAMAS
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
 UNDISTORTED = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)

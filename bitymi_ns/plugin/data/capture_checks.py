@@ -22,6 +22,7 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.recognise import PHOTOGRAPHS, Found, models_in
+from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data import transforms
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.colmap import check_model, options_for
@@ -34,7 +35,6 @@ from bitymi_ns.plugin.data.poses import check_spread
 from bitymi_ns.plugin.data.scanner_views import scanned
 from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
 from bitymi_ns.plugin.data.transforms_views import missing_photographs
-from bitymi_ns.plugin.errors import fail, warn
 from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
 from bitymi_ns.trust import json_of
 

@@ -16,9 +16,9 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils as reader
 
 from bitymi_ns.capture.recognise import is_model, models_in
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.point_cloud import point_count
 from bitymi_ns.plugin.data.poses import warn_of_far_off
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.trust import leads_inside
 
 

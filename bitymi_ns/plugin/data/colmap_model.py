@@ -21,10 +21,10 @@ import pycolmap
 
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.files import encoding_of
+from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.colmap import check_cameras, check_images, parameter_count, reading
 from bitymi_ns.plugin.data.ply import as_bytes, read_points
 from bitymi_ns.plugin.data.point_cloud import what_is_wrong_with
-from bitymi_ns.plugin.errors import fail, warn
 
 FORMS = (".txt", ".bin")
 

@@ -14,11 +14,11 @@ from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 from bitymi_ns.capture.masks import USUAL_FOLDERS, mask_folder, mask_of, smaller_masks
 from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError, SfmSettings
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model, read_model
 from bitymi_ns.plugin.data.names import Files, renamed
 from bitymi_ns.plugin.data.ply import Points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 from bitymi_ns.trust import leads_inside
 
 

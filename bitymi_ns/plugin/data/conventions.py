@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.plugin.console import warn
 from bitymi_ns.plugin.data.images import read_image
 from bitymi_ns.plugin.data.ply import Points
 from bitymi_ns.plugin.data.point_colors import sampled
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
-from bitymi_ns.plugin.errors import warn
 from bitymi_ns.train.views import spread
 
 Pose = npt.NDArray[np.float64]

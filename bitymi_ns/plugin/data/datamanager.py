@@ -18,6 +18,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data import duplicates
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, check_views, to_camera
@@ -34,10 +35,8 @@ from bitymi_ns.plugin.data.point_cloud import reporting_time
 from bitymi_ns.plugin.data.poses import check_cloud, check_places, orienting_all, warn_of_mirrored
 from bitymi_ns.plugin.data.transforms import corrected_files
 from bitymi_ns.plugin.data.views import ALONE
-from bitymi_ns.plugin.errors import fail, listed, warn
-from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import View, spread, training_order
+from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
 
 LOOKED_AT = 8
 """Photographs of which it is looked whether any pixel is transparent."""

@@ -20,6 +20,7 @@ from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.files import encoding_of
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data import conventions, kept_poses, sfm_poses, splits
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.colmap_views import (
@@ -38,7 +39,6 @@ from bitymi_ns.plugin.data.scanner_views import scanned
 from bitymi_ns.plugin.data.transforms import Lists, colmap_points
 from bitymi_ns.plugin.data.transforms_views import Transforms, missing_photographs, read_transforms
 from bitymi_ns.plugin.data.views import Photograph, Place, Views, in_proportion, views_of_capture
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model, which is found for those that come without."""

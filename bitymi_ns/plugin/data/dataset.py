@@ -14,12 +14,12 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.downscale import Reduction
 from bitymi_ns.plugin.data.images import Note, masks_without_pixels, note, read_image, read_mask, wrong_size
 from bitymi_ns.plugin.data.lens import Lens
 from bitymi_ns.plugin.data.poses import rotations
 from bitymi_ns.plugin.data.views import ALONE
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.plugin.run.commands import MOVED
 from bitymi_ns.train.views import over_background
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.lens import Lens
-from bitymi_ns.plugin.errors import fail, say
 
 LONGEST_SIDE = 1600
 """Pixels along the longer side of a photograph that is trained on; what papers on such captures use."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.plugin.errors import listed, warn
+from bitymi_ns.plugin.console import listed, warn
 
 Pair = tuple[int, int]
 """Number of a training photograph, and of a held-out one."""

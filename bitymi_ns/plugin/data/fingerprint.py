@@ -6,8 +6,8 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
+from bitymi_ns.plugin.console import warn
 from bitymi_ns.plugin.data.dataset import BitymiDataset
-from bitymi_ns.plugin.errors import warn
 
 STEP = 1e-4
 """Step in which poses are compared, in the units of the scene."""

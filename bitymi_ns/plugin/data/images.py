@@ -15,7 +15,7 @@ from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 from bitymi_ns.capture.masks import counted, has_transparency
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 
 T = TypeVar("T")
 ORIENTATION = 0x0112

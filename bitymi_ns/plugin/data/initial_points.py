@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 
 from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.ply import Points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, size_of
-from bitymi_ns.plugin.errors import say, warn
 
 Choice = Literal["auto", "triangulate", "random"]
 """auto = those of the capture, triangulated ones where it has none; triangulate = in any case; random = in any case."""

@@ -13,10 +13,10 @@ from typing import Any
 
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmSettings
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.colmap_model import Model, read_model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source
 from bitymi_ns.plugin.data.images import THREADS, of_header
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.trust import Refused, json_of, leads_inside
 
 MODEL = Path("sparse/0")

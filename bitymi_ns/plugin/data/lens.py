@@ -16,9 +16,9 @@ from PIL import Image
 
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.panorama import PANORAMAS
+from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.cameras import LITTLE_LEFT, NOTHING_LEFT
 from bitymi_ns.plugin.data.images import wrong_size
-from bitymi_ns.plugin.errors import fail, warn
 
 WIDEST = 110.0
 """Degrees that a pinhole picture of a photograph spans at most, across and down. Beyond, a picture grows fast and shows

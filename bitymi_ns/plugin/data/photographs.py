@@ -14,7 +14,7 @@ from rich.progress import track
 
 from bitymi_ns.plugin.data.capture_checks import reporting_input_errors
 from bitymi_ns.plugin.data.dataset import BitymiDataset
-from bitymi_ns.train.memory import MemoryBudget
+from bitymi_ns.train.views import MemoryBudget
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the photographs of a capture, training and held-out views together."""

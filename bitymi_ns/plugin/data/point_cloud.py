@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
+from bitymi_ns.plugin.console import say
 from bitymi_ns.plugin.data.ply import POINTS, bad_line
-from bitymi_ns.plugin.errors import say
 from bitymi_ns.ply import PlyError, read_header, rows_there
 
 MANY_POINTS = 500_000

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.images import read_image
 from bitymi_ns.plugin.data.initial_points import are_wanted
 from bitymi_ns.plugin.data.ply import Points, read_points
 from bitymi_ns.plugin.data.views import Photograph
-from bitymi_ns.plugin.errors import fail, say
 from bitymi_ns.ply import PlyError
 from bitymi_ns.train.views import spread
 

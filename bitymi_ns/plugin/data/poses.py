@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from nerfstudio.cameras import camera_utils
 
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 
 EXACT = 1e-3
 """Matrices this close to a rotation are taken as they are: float32, or four written digits."""

@@ -10,11 +10,11 @@ from bitymi_ns.capture.cache import read_from
 from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.recognise import Found, passed_over
 from bitymi_ns.capture.types import SfmSettings
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data import kept_poses
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, masks_of_capture, source_in
 from bitymi_ns.plugin.data.kept_poses import KeptPoses
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 
 
 def source_of(found: Found, masks_path: Path | None, reduction: int, settings: SfmSettings) -> Source:

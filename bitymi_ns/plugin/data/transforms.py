@@ -18,8 +18,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from bitymi_ns.capture.recognise import is_model
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.poses import rotations, warn_of_far_off
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.trust import json_of, leads_inside
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."

@@ -17,6 +17,7 @@ import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
 from bitymi_ns.capture.panorama import PANORAMAS
+from bitymi_ns.plugin.console import fail, listed, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.names import Files, renamed
 from bitymi_ns.plugin.data.transforms import (
@@ -30,7 +31,6 @@ from bitymi_ns.plugin.data.transforms import (
     tell_outside,
 )
 from bitymi_ns.plugin.data.views import Photograph, size_of
-from bitymi_ns.plugin.errors import fail, listed, say
 
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 """What says a focal length: in pixels, or by the angle that a picture spans in radians, or in degrees."""

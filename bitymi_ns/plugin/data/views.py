@@ -16,12 +16,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
+from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import THREADS, of_header
 from bitymi_ns.plugin.data.lens import Lens, Pinhole, lens, rescaled
 from bitymi_ns.plugin.data.ply import Points
 from bitymi_ns.plugin.data.poses import check_spread, is_far_off, oriented
-from bitymi_ns.plugin.errors import fail, say
 
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """[4, 4] from a camera with OpenCV's axes to one with nerfstudio's, which are OpenGL's, and back."""

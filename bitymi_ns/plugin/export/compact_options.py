@@ -8,7 +8,7 @@ from typing import Literal
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bundle.poster import most_bytes
-from bitymi_ns.plugin.errors import fail, say
+from bitymi_ns.plugin.console import fail, say
 
 BundleFormat = Literal["compact", "bc7", "uint8", "fp16"]
 _MUCH_SMALLER = 0.9

@@ -13,7 +13,7 @@ from bitymi_ns.bake.statistics import FineTuning, Percentiles
 from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
-from bitymi_ns.plugin.errors import say
+from bitymi_ns.plugin.console import say
 from bitymi_ns.trust import printable
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import sys
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +18,8 @@ from torch import Tensor
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.ops import webgpu
-from bitymi_ns.plugin.errors import fail
+from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.run.commands import folder_being_evaluated
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.scene.baked import FAST, BakedOutput
@@ -103,3 +108,44 @@ class BakedModel(SurfelModel):
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         """Nothing to load: everything is in the bundle."""
         return torch.nn.modules.module._IncompatibleKeys([], [])
+
+
+MANIFEST = "bundle.json"
+
+
+def find_bundle(recorded: Path) -> Path:
+    """The folder of the bundle whose config.yml is being loaded."""
+    candidates = [*_loaded_from(), recorded]
+    for folder in candidates:
+        if (folder / MANIFEST).is_file() or folder.is_file():
+            return folder.absolute()
+    places = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
+    fail(f"no bundle found (looked for {MANIFEST} in {places}). Keep config.yml in the bundle's folder.")
+
+
+def _loaded_from() -> list[Path]:
+    """Where the config.yml that is being loaded may be: by eval_setup or, should that change, by the command line."""
+    evaluated = folder_being_evaluated()
+    folders = [] if evaluated is None else [evaluated]
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config"):
+            value = value or (sys.argv[i + 1] if i + 1 < len(sys.argv) else "")
+            folders.append(Path(value).absolute().parent)
+    return folders
+
+
+def stub_checkpoint_dir(bundle: Path) -> Path:
+    """A temporary folder with an empty checkpoint, named after the bundle.
+
+    nerfstudio insists on a checkpoint file. It is not kept in the bundle, so that a bundle holds no pickled data. Its
+    path ends up in the results of ns-eval, where `bitymi report` tells by it that they are those of a bundle.
+    """
+    scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
+    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
+    folder = scratch / bundle.name / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    torch.save(
+        {"step": 0, "pipeline": {}, "optimizers": {}, "schedulers": {}, "scalers": {}}, folder / "step-000000000.ckpt"
+    )
+    return folder

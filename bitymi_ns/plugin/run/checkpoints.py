@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from bitymi_ns.files import complete_file, reason
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.config import SceneConfig
 
 EXTRA_STATE = "_extra_state"

@@ -16,22 +16,19 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns.files import reason, write_file
+from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data import kept_poses
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
-from bitymi_ns.plugin.run.bundle_config import find_bundle, stub_checkpoint_dir
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
-from bitymi_ns.plugin.run.commands import folder_being_evaluated, moved_capture, refuse_others
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, find_bundle, stub_checkpoint_dir
+from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_evaluated, moved_capture, refuse_others
 from bitymi_ns.plugin.run.device import default_device_type, has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
-from bitymi_ns.plugin.run.pipeline import BitymiPipelineConfig
 from bitymi_ns.plugin.run.preset import Preset, load_preset
-from bitymi_ns.plugin.run.trainer import BitymiTrainer
-from bitymi_ns.plugin.run.viewer import LOOPBACK, adopt_viewer
+from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.train.config import AdamConfig
 
 SEEDS = 1 << 32

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import torch
 
-from bitymi_ns.plugin.errors import warn
+from bitymi_ns.plugin.console import warn
 
 
 def has_cuda_kernels() -> bool:

@@ -28,7 +28,7 @@ import torch.distributed as dist
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import interpreter
-from bitymi_ns.plugin.errors import fail
+from bitymi_ns.plugin.console import fail
 from bitymi_ns.train.processes import ProcessLost
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ LOST = 3
 """Exit status of a process that ends because another one has."""
 
 
-class Others:
+class Workers:
     """The processes of a run beside this first one."""
 
     def __init__(self, config: TrainerConfig, count: int) -> None:

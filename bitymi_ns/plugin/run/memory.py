@@ -16,14 +16,14 @@ from bitymi_ns.bake.view_color_rate import choice_bytes
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.photographs import PHOTOGRAPH_BYTES
-from bitymi_ns.plugin.errors import say, warn
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
-from bitymi_ns.train.views import REDUCED_BYTES, spread
+from bitymi_ns.train.views import DOWNSCALED_BYTES, spread
 
 COUNTED_VIEWS = 3
 """Views whose fragments are counted."""
@@ -86,7 +86,7 @@ def state_training(
         processes: of the run, each of which takes as much.
     """
     pixels, total = _pixels(cameras)
-    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
+    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
     surfels = max(len(scene), most_surfels)

@@ -11,12 +11,12 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data import datamanager as module
 from bitymi_ns.plugin.data import photographs
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataset import BitymiDataset
 from bitymi_ns.plugin.data.photographs import AT_ONCE, RECENT
-from bitymi_ns.plugin.errors import InputError
 from bitymi_ns.sample import generate
 
 WIDTH, HEIGHT = 48, 36

@@ -11,7 +11,7 @@ import torch
 from bitymi_ns.plugin.data import point_cloud
 from bitymi_ns.plugin.data.ply import colours
 from bitymi_ns.plugin.data.point_cloud import what_is_wrong_with
-from bitymi_ns.plugin.run.scene_setup import new_scene
+from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from tests.plugin.data.captures import load, said

@@ -59,7 +59,7 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     memory.state_training(one, [camera], 0)
     assert gigabytes(said(capsys)) == pytest.approx(0.8 + 1e-3 * memory.MARGIN * count, abs=0.1)
     monkeypatch.setattr(texels, "FEW", 0)
-    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    options = TexelConfig(pixels_per_texel=2.0, rendered_pixels_per_texel=10.0)
     for to_come, views in ((1000, memory.VIEWS_OF_TEXELS / 2.0), (20, 2.0)):
         monkeypatch.setattr(memory, "PER_TEXEL", 0)
         memory.state_training(one, [camera], 0, options, to_come)
@@ -101,7 +101,7 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
     for views in (30_000, 40_000):  # whose photographs are more than are kept
         memory.state_export(scene[0], [scene[1]] * views, 0, compact=compact)
     assert stated[1] - stated[0] == 10_000 * bytes_each * len(scene[0])
-    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    options = TexelConfig(pixels_per_texel=2.0, rendered_pixels_per_texel=10.0)
     for views in (30_000, 40_000):
         memory.state_training(scene[0], [scene[1]] * views, 0, options, 1000)
     assert stated[3] - stated[2] == 10_000 * len(scene[0])

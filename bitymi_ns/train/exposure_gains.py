@@ -40,7 +40,7 @@ FEWEST_TESTED = 1000
 """With fewer observations the two halves of the points prove nothing."""
 
 
-class Agreement(NamedTuple):
+class ExposureGains(NamedTuple):
     """What the photographs' colours of the points say.
 
     Attributes:
@@ -63,7 +63,7 @@ class Agreement(NamedTuple):
 
 
 @torch.no_grad()
-def measure_agreement(points: Tensor, views: Sequence[View], near: float) -> Agreement:
+def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
     """Compares the photographs at the points.
 
     Args:
@@ -84,7 +84,7 @@ def measure_agreement(points: Tensor, views: Sequence[View], near: float) -> Agr
     before = after = math.nan
     if int(other.isfinite().sum()) >= FEWEST_TESTED:
         before, after = _disagreement(other), _disagreement(other - _log_gains(half)[:, None])
-    return Agreement(_log_gains(logs), count, before, after)
+    return ExposureGains(_log_gains(logs), count, before, after)
 
 
 def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 

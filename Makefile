@@ -144,8 +144,6 @@ bench: setup $(WORK)/captures/demo/transforms.json
 	$(MATRIX) --methods $(METHODS) --knobs --output $(WORK)/captures.md || failed=1; \
 	for plan in $(PLANS); do $(MATRIX) --plan $$plan --output $(WORK)/$$plan.md || failed=1; done; \
 	$(BIN)/bitymi stability --output $(WORK)/stability.md || failed=1; \
-	$(BIN)/python benchmarks/seeds.py --seeds 20 --output $(WORK)/seeds.md || failed=1; \
-	$(BIN)/python benchmarks/seeds.py --seeds 10 --rates 10 --output $(WORK)/seeds-rates-10.md || failed=1; \
 	$(BIN)/bitymi report $(WORK) --output-dir $(WORK)/report --title "bitymi bench" || failed=1; \
 	exit $$failed
 

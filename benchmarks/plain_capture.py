@@ -1,9 +1,8 @@
-"""Captures read without nerfstudio, with a transforms.json or one for each split: photographs, poses and points."""
+"""Read an undistorted capture with a transforms.json without nerfstudio: photographs, poses and points."""
 
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,31 +75,6 @@ def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture
     held_out = [view for i, view in enumerate(views) if i % interval == 0]
     train = [view for i, view in enumerate(views) if i % interval]
     return Capture(train, held_out, points, colours, middle, scale)
-
-
-def load_split_capture(folder: Path, points: str, downscale: int = 1) -> Capture:
-    """Reads a capture of the Blender data set's kind: transforms_train.json, and transforms_test.json with the views
-    that are held out. The frame stays; photographs keep their alpha.
-
-    Args:
-        folder: with both files.
-        points: name of the PLY file of the points to start from.
-        downscale: whole factor by which photographs are reduced.
-    """
-    middle, splits = torch.zeros(3, dtype=torch.float64), []
-    for split in ("train", "test"):
-        meta, views = json.loads((folder / f"transforms_{split}.json").read_text("utf8")), []
-        for frame in meta["frames"]:
-            image = Image.open((folder / frame["file_path"]).with_suffix(".png")).convert("RGBA")
-            size = (image.width // downscale, image.height // downscale)
-            picture = np.array(image if downscale == 1 else image.resize(size, Image.Resampling.BOX))
-            focal = 0.5 * image.width / math.tan(0.5 * meta["camera_angle_x"])
-            values = {"w": image.width, "h": image.height, "fl_x": focal, "fl_y": focal}
-            values |= {"cx": 0.5 * image.width, "cy": 0.5 * image.height}
-            pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
-            views.append(View(_camera(values, pose, middle, 1.0, *size), torch.from_numpy(picture)))
-        splits.append(views)
-    return Capture(*splits, *_points(folder / points))
 
 
 def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, width: int, height: int) -> Camera:

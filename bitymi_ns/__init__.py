@@ -1,7 +1,26 @@
-"""Textured Beta-surfel splatting: a nerfstudio method."""
+"""Textured Beta-surfel splatting: a nerfstudio method.
+
+The public functions are `rasterize`, `train_scene`, `bake_scene` and `read_bundle` (bitymi_ns/api.py).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bitymi_ns.api import Bundle, Camera, View, bake_scene, rasterize, read_bundle, train_scene
 
 __version__ = "0.1.0"
+__all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]
 
 
 class KernelsUnavailable(RuntimeError):
     """The compiled kernels are missing, or not for this machine; the message says what to do."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'bitymi_ns' has no attribute '{name}'")
+    from bitymi_ns import api  # not before it is asked for: nerfstudio imports this package to list its methods
+
+    return getattr(api, name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,7 +34,8 @@ from bitymi_ns.codec.quantise import Profile, Range, bc7_blocks, decode_pages
 from bitymi_ns.codec.streams import StreamError
 from bitymi_ns.codec.texel_codes import constants
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked import BakedOutput, BakedScene
+from bitymi_ns.scene.camera import Camera
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """What to do about a damaged bundle."""
@@ -62,6 +63,22 @@ class Bundle:
 
     def __len__(self) -> int:
         return len(self.scene)
+
+    def to(self, device: torch.device | str) -> Bundle:
+        """The bundle with its scene on a device."""
+        return replace(self, scene=self.scene.to(device))
+
+    def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
+        """Render a view over the bundle's background; see `BakedScene.render`.
+
+        Args:
+            camera: the view, on the scene's device.
+            background: [3] color behind the scene; None = the bundle's own.
+            maps: also beta, depth, normals and overdraw.
+        """
+        if background is None:
+            background = torch.tensor(self.info.render.background, device=self.scene.tiles.device)
+        return self.scene.render(camera, background, maps)
 
 
 def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) -> Bundle:

@@ -1,9 +1,9 @@
-"""docs/stability.md: what float32 costs, case by case and along each kind of stiffness."""
+"""Write docs/stability.md: errors of float32, case by case and along each kind of stiffness."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.stability.backends import BACKENDS, Backend
 from bitymi_ns.measure.stability.cases import cases
-from bitymi_ns.measure.stability.errors import PROBES, ROUNDING, Errors, ExtendedErrors, against_extended, measure
+from bitymi_ns.measure.stability.errors import PROBES, Errors, ExtendedErrors, against_extended, measure
 from bitymi_ns.measure.stability.scenes import SceneCase
 from bitymi_ns.measure.stability.sweeps import SWEEPS, Sweep
 from bitymi_ns.measure.stability.ways import PLAIN, RIM, WAYS, Way
@@ -29,18 +29,29 @@ STEPS = round(1 / (255 * ACCURATE))
 """An 8-bit step in units of ACCURATE."""
 ALLOWANCE = 4.0
 """A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
+LIMITED = "as the inputs allow"
 EXTENDED_SIZE = 20_000
 """Largest number of pixels times surfels for which extended precision is evaluated."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured on one scene."""
+    """Errors measured on one scene."""
 
     label: str
     single: Errors
     double: Errors
     trust: ExtendedErrors | None
+
+    @property
+    def exact(self) -> float:
+        """Largest error of the kernels in double, of images and gradients."""
+        return max(self.double.forward, self.double.gradient)
+
+    @property
+    def trusted(self) -> float | None:
+        """Largest error of the float64 reference against extended precision; None where that was too large to run."""
+        return max(self.trust.forward, self.trust.gradient) if self.trust else None
 
     @property
     def verdict(self) -> str:
@@ -58,12 +69,12 @@ class Row:
         if all(error <= ACCURATE for error, _ in pairs):
             return "accurate"
         if all(error <= max(ACCURATE, ALLOWANCE * allowed) for error, allowed in pairs):
-            return "as the inputs allow"
+            return LIMITED
         return "**loses figures**"
 
 
 def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> Row:
-    """Everything that a line of a table shows."""
+    """Measure one scene: float32, float64, and extended precision where it is small enough."""
     size = scene.width * scene.height * len(scene.params["means"])
     trust = against_extended(scene, near=near) if way is PLAIN and size <= EXTENDED_SIZE else None
     double = measure(scene, backend, torch.float64, near, way)
@@ -114,53 +125,58 @@ def _page(backend: Backend, named: dict[str, list[Row]], swept: dict[str, list[R
         steps=STEPS,
         allowance=f"{ALLOWANCE:g}",
         picture=picture,
-        sweeps=[(sweep, _table(sweep.name, swept[sweep.name])) for sweep in SWEEPS],
-        cases={name: _table("case", rows) for name, rows in named.items()},
+        sweeps=_sweeps(swept),
+        cases={name: _cases(rows) for name, rows in named.items()},
+        nothing=", ".join(row.label for row in named[PLAIN.name] if row.verdict == "nothing drawn"),
     )
 
 
-HEADER = (
-    "drawn",
-    "condition",
-    "forward",
-    "inputs",
-    "gradient",
-    "inputs",
-    "worst in",
-    "flipped",
-    "float64 forward",
-    "float64 gradient",
-    "reference forward",
-    "reference gradient",
-    "verdict",
-)
+CASES = ("case", "forward", "inputs", "gradient", "inputs", "worst in", "flipped", "float64", "reference", "verdict")
+SWEPT = ("kind", "values", "forward", "inputs", "gradient", "inputs", "float64", "reference", "not accurate at")
 
 
-def _table(first: str, rows: Sequence[Row]) -> str:
+def _cases(rows: Sequence[Row]) -> str:
+    """One line for each scene of which something is drawn."""
     lines = []
     for row in rows:
-        e, d = row.single, row.double
-        cells = [
-            f"{e.drawn:,}",
-            f"{max(e.input_forward, e.input_gradient) / ROUNDING[torch.float32]:.0e}",
-            _short(e.forward),
-            _short(e.input_forward),
-            _short(e.gradient),
-            _short(e.input_gradient),
-            e.worst if e.gradient else "",
-            f"{100 * e.flipped:.2g} %" if e.flipped else "0",
-            _short(d.forward),
-            _short(d.gradient),
-            _short(row.trust.forward) if row.trust else "-",
-            _short(row.trust.gradient) if row.trust else "-",
-            row.verdict,
+        e = row.single
+        if e.drawn or row.verdict.startswith("**"):
+            flipped = f"{100 * e.flipped:.2g} %" if e.flipped else "0"
+            errors = [_short(value) for value in (e.forward, e.input_forward, e.gradient, e.input_gradient)]
+            exact = [_short(row.exact), _short(row.trusted)]
+            lines.append([row.label, *errors, e.worst if e.gradient else "", flipped, *exact, row.verdict])
+    return markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
+
+
+def _sweeps(swept: Mapping[str, Sequence[Row]]) -> str:
+    """One line for each sweep: the largest errors, and where the verdict is not "accurate"."""
+    lines = []
+    for sweep in SWEEPS:
+        rows = swept[sweep.name]
+        singles = [row.single for row in rows]
+        errors = [
+            max(values)
+            for values in (
+                [e.forward for e in singles],
+                [e.input_forward for e in singles],
+                [e.gradient for e in singles],
+                [e.input_gradient for e in singles],
+                [row.exact for row in rows],
+                [row.trusted or 0.0 for row in rows],
+            )
         ]
-        lines.append([row.label, *cells])
-    return markdown.table([first, *HEADER], lines, (0, len(HEADER)))
+        inexact = [
+            f"{row.label}{'' if row.verdict == LIMITED else f' ({row.verdict})'}"
+            for row in rows
+            if row.verdict != "accurate"
+        ]
+        values = f"{rows[0].label} to {rows[-1].label}"
+        lines.append([sweep.axis, values, *map(_short, errors), ", ".join(inexact) or "-"])
+    return markdown.table(SWEPT, lines, (0, 1, len(SWEPT) - 1))
 
 
-def _short(value: float) -> str:
-    return "0" if value == 0 else f"{value:.1e}"
+def _short(value: float | None) -> str:
+    return "-" if value is None else "0" if value == 0 else f"{value:.1e}"
 
 
 FORWARD, GRADIENT, DOUBLE = "#0b62b8", "#d1540b", "#6b6f76"

@@ -1,12 +1,11 @@
-"""A trained run as an export reads it: loading, comparing with its bundle, and its cameras as a file of the bundle."""
+"""A trained run as an export reads it: loading, previewing, and comparing with its bundle."""
 
 from __future__ import annotations
 
 import copy
 import io
-import json
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from PIL import Image
 from bitymi_ns.bake.statistics import HeldOut
 from bitymi_ns.bundle import Bundle, Check, check_field, check_place, check_view_color
 from bitymi_ns.bundle.manifest import MANIFEST
-from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.plugin.console import fail
@@ -155,49 +153,3 @@ def find_run(run: Path) -> tuple[Path, int | None]:
     if run.is_dir() and not (run / "config.yml").is_file() and (run.parent / "config.yml").is_file():
         run = run.parent  # the folder of its checkpoints
     return (run / "config.yml" if run.is_dir() else run), None
-
-
-MOST_PIXELS = 1600
-"""Longer side of a photograph in a bundle."""
-
-
-def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -> dict[str, bytes]:
-    """cameras.json: every camera with its name, its image's size, K as fx, fy, cx, cy, viewmat [16] by rows, and
-    whether it was held out; and the photographs of those.
-
-    Args:
-        datamanager: of the trained scene.
-        train: the training cameras.
-        photographs: also the held-out photographs, as JPEG of at most `MOST_PIXELS` along a side.
-    """
-    files: dict[str, bytes] = {}
-    names = [path.name for path in datamanager.train_dataset.image_filenames]
-    rows = [_row(name, camera, False) for name, camera in zip(names, train, strict=True)]
-    for i, path in enumerate(datamanager.eval_dataset.image_filenames):
-        view = datamanager.eval_views[i]
-        row = _row(path.name, view.camera.to("cpu"), True)
-        if photographs:
-            row["photograph"] = f"photograph-{i + 1:04d}.jpg"
-            files[row["photograph"]] = _jpeg(view.target(torch.zeros(3), "cpu"))
-        rows.append(row)
-    return {CAMERAS: (json.dumps({"cameras": rows}) + "\n").encode(), **files}
-
-
-def _row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
-    K = camera.K.cpu().tolist()
-    return {
-        "name": name,
-        "held_out": held_out,
-        "width": camera.width,
-        "height": camera.height,
-        **{"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
-        "viewmat": camera.viewmat.cpu().flatten().tolist(),
-    }
-
-
-def _jpeg(image: torch.Tensor) -> bytes:
-    picture = Image.fromarray(as_bytes(image).numpy())
-    picture.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    picture.save(buffer, format="JPEG", quality=88)
-    return buffer.getvalue()

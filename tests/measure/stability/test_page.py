@@ -23,7 +23,7 @@ def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert cli.main(["stability", "--output", str(target)]) == 0
     text = target.read_text("utf8")
     assert "(numbers.png)" in text and (tmp_path / "deep" / "numbers.png").read_bytes().startswith(b"\x89PNG")
-    assert text.count("accurate |") >= 6 and "through the camera plane" in text
+    assert text.count("accurate |") >= 3 and "through the camera plane" in text
     assert sorted(path.name for path in target.parent.iterdir()) == ["numbers.md", "numbers.png"]
     assert "13 scenes, 0 of them" in capsys.readouterr().out
     assert cli.main(["stability", "--backend", "abacus"]) == 1

@@ -1,0 +1,164 @@
+"""The public functions: rasterize surfels, train a scene, bake it, read a bundle. None of them needs nerfstudio."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn
+from bitymi_ns.bake.compact import Compact
+from bitymi_ns.bundle import Bundle, export, read_bundle
+from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.ops import blended_image, project, trace
+from bitymi_ns.ops.constants import COLOR_BIAS
+from bitymi_ns.plugin.export.cameras import camera_row
+from bitymi_ns.plugin.run.preset import load_preset
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
+from bitymi_ns.train.domain import build_scene
+from bitymi_ns.train.fit import TrainLog, fit
+from bitymi_ns.train.views import View
+
+__all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]
+
+TUNE_STEPS = 100
+"""Fine-tuning steps of texels that training has learned; a baked field gets `TuneOptions.steps`."""
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    betas: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    near: float = NEAR,
+    maps: bool = False,
+) -> RenderOutput:
+    """Rasterize 2D Beta surfels with one color each; differentiable in everything but the camera.
+
+    The blending weight of a surfel is w = sigma T with sigma = min(0.99, o (1 - (u^2 + v^2) / 9)^beta) at the
+    intersection (u, v) of the pixel's ray with the surfel's plane, in units of its scales.
+
+    Args:
+        means: [N, 3] centers, world frame.
+        quats: [N, 4] rotations, wxyz, of any length but 0; the surfel spans the first two columns of the matrix.
+        scales: [N, 2] > 0, lengths of the two tangents, world units; the disc ends at three times its scales.
+        opacities: [N] in (0, 1).
+        betas: [N] in (0, 4), exponent of the kernel: small = hard disc, 3.5 = nearly Gaussian.
+        colors: [N, 3] in the images' own scale; below 0 they count as 0.
+        camera: the view; its axes are OpenCV's.
+        background: [3] color behind the surfels; None = black.
+        near: surfels with a center nearer than this are not drawn (camera z, world units).
+        maps: also depth and normals.
+        All tensors are float32 or float64, of one dtype, on the CPU or on one CUDA device.
+
+    Returns:
+        `RenderOutput` with rgb [H, W, 3], alpha [H, W, 1], beta [H, W, 1] and, with `maps`, depth [H, W, 1] and normal
+        [H, W, 3], both summed with the blending weights, in the camera frame.
+
+    Raises:
+        ValueError: a shape, dtype or device does not fit, or the camera has skew.
+        TooManyFragments: the view's fragments do not fit into memory.
+    """
+    geometry = (means, quats, scales.log(), torch.logit(opacities), torch.logit(betas / 4.0))
+    projection = project(*geometry, camera, near)
+    fragments = trace(projection)
+    image = blended_image(fragments, projection, colors - COLOR_BIAS, maps=maps).view(camera.height, camera.width, -1)
+    rgb, alpha = image[..., :3], image[..., 3:4]
+    if background is not None:
+        rgb = rgb + (1.0 - alpha) * background
+    depth, normal = (image[..., 5:6], image[..., 6:9]) if maps else (None, None)
+    return RenderOutput(rgb, alpha, image[..., 4:5], depth, normal, None, fragments, projection)
+
+
+def train_scene(
+    views: Sequence[View],
+    points: Tensor,
+    colors: Tensor,
+    *,
+    steps: int = 1500,
+    method: str = "bitymi",
+    eval_views: Sequence[View] = (),
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    callback: Callable[[int, float], None] | None = None,
+) -> tuple[Scene, TrainLog]:
+    """Train a scene on photographs with poses: the steps of `ns-train`, without nerfstudio.
+
+    Args:
+        views: photographs with their cameras, at full size.
+        points: [M, 3] world positions of the first surfels, such as a sparse point cloud; M may be 0.
+        colors: [M, 3] in [0, 1], of the points.
+        steps: length of the run; all schedules scale with it.
+        method: preset, the name of a file in method_configs/.
+        eval_views: held-out photographs; the log states their PSNR.
+        seed: of everything random in the run.
+        device: where training runs.
+        callback: called after every step with its number and the loss. Reading the loss waits for a CUDA device.
+
+    Returns:
+        The scene on `device`, and the log with the PSNR of `eval_views` at the end.
+
+    Raises:
+        ValueError: there are no views, or nothing to start from.
+        PresetError: there is no such preset.
+    """
+    preset = load_preset(method)
+    config = replace(copy.deepcopy(preset.train), seed=seed)
+    centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    bounded = any(view.image.shape[-1] == 4 for view in views)
+    scene, _ = build_scene(points.cpu(), colors.cpu(), centers, preset.scene, config, bounded, pixels)
+    scene, views = scene.to(device), [view.to(device) for view in views]
+    step_done = None if callback is None else lambda trainer, *_: callback(trainer.step, trainer.loss)
+    return scene, fit(scene, views, [view.to(device) for view in eval_views], config, steps, step_done)
+
+
+def bake_scene(
+    scene: Scene,
+    views: Sequence[View],
+    folder: str | Path,
+    *,
+    background: Tensor | None = None,
+    overwrite: bool = False,
+    options: BakeOptions | None = None,
+) -> Bundle:
+    """Bake a trained scene into a compact bundle and read it back: what `ns-export bitymi-atlas` does.
+
+    Args:
+        scene: of `train_scene`, with its texture as texels, as a field, or without texture.
+        views: the training photographs, on which texels are fine-tuned.
+        folder: of the bundle; appears complete or not at all.
+        background: [3] color behind the scene; None = black.
+        overwrite: replace a bundle that is there.
+        options: of the bake.
+
+    Returns:
+        The bundle as read from the folder.
+
+    Raises:
+        ValueError: no surfel is left, or the atlas would be too large.
+        BundleError: the folder exists or cannot be written.
+    """
+    background = torch.zeros(3) if background is None else background.cpu()
+    textured, has_texels = scene.field is not None, isinstance(scene.field, TexelField)
+    tune = None
+    if textured:
+        tune = TuneOptions.of_learned(steps=TUNE_STEPS) if has_texels else TuneOptions(steps=TUNE_STEPS)
+    learning = Learning(PolishOptions() if textured and not has_texels else None, tune, compact=Compact())
+    cameras = [view.camera for view in views]
+    baked = bake_and_learn(scene, cameras, views, background, options or BakeOptions(), learning)
+    rows = [camera_row(f"{i:04d}", camera, held_out=False) for i, camera in enumerate(cameras)]
+    beside = {CAMERAS: json.dumps({"cameras": rows}).encode()}
+    export(baked, folder, background=background.tolist(), first=cameras[0], loose_files=beside, overwrite=overwrite)
+    return read_bundle(folder)

@@ -1,0 +1,61 @@
+"""The capture's cameras as a file of the bundle, for viewers; and held-out photographs, if they may be given away."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from PIL import Image
+
+from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import as_bytes
+
+MOST_PIXELS = 1600
+"""Longer side of a photograph in a bundle."""
+
+
+def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -> dict[str, bytes]:
+    """cameras.json: every camera with its name, its image's size, K as fx, fy, cx, cy, viewmat [16] by rows, and
+    whether it was held out; and the photographs of those.
+
+    Args:
+        datamanager: of the trained scene.
+        train: the training cameras.
+        photographs: also the held-out photographs, as JPEG of at most `MOST_PIXELS` along a side.
+    """
+    files: dict[str, bytes] = {}
+    names = [path.name for path in datamanager.train_dataset.image_filenames]
+    rows = [camera_row(name, camera, False) for name, camera in zip(names, train, strict=True)]
+    for i, path in enumerate(datamanager.eval_dataset.image_filenames):
+        view = datamanager.eval_views[i]
+        row = camera_row(path.name, view.camera.to("cpu"), True)
+        if photographs:
+            row["photograph"] = f"photograph-{i + 1:04d}.jpg"
+            files[row["photograph"]] = _jpeg(view.target(torch.zeros(3), "cpu"))
+        rows.append(row)
+    return {CAMERAS: (json.dumps({"cameras": rows}) + "\n").encode(), **files}
+
+
+def camera_row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
+    """One camera of cameras.json: intrinsics in pixels, viewmat [16] by rows (world to camera, OpenCV axes)."""
+    K = camera.K.cpu().tolist()
+    return {
+        "name": name,
+        "held_out": held_out,
+        "width": camera.width,
+        "height": camera.height,
+        **{"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
+        "viewmat": camera.viewmat.cpu().flatten().tolist(),
+    }
+
+
+def _jpeg(image: torch.Tensor) -> bytes:
+    picture = Image.fromarray(as_bytes(image).numpy())
+    picture.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=88)
+    return buffer.getvalue()

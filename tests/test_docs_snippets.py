@@ -1,0 +1,72 @@
+"""Python snippets of the documentation run, in the order of their page, on a tiny scene."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import bitymi_ns
+from bitymi_ns import sample
+from tests.test_docs import PAGES, ROOT
+
+FENCE = re.compile(r"^```python[ \t]*([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+UNTOUCHED = re.compile(r"no-run: \S.*")
+"""Info string of a snippet that does not run: ```python no-run: the reason."""
+N = 200
+"""Points and surfels."""
+STEPS = re.compile(r"\bsteps=\d+")
+
+
+def snippets(text: str) -> tuple[list[str], list[str]]:
+    """The snippets of a page that run, and info strings that say neither nothing nor a reason."""
+    found = FENCE.findall(text)
+    return [code for info, code in found if not info], [info for info, _ in found if info and not UNTOUCHED.match(info)]
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    """What snippets may use without defining it: views and points of a room, and surfels at these points."""
+    room = sample.generate(tmp_path_factory.mktemp("snippets") / "room", views=6, width=48, height=36, points=200)
+    info = json.loads((room / "transforms.json").read_text("utf8"))
+    views = []
+    for frame in info["frames"]:
+        image = torch.from_numpy(np.array(Image.open(room / frame["file_path"])))
+        viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        fx, fy, cx, cy = (info.get(name, frame.get(name)) for name in ("fl_x", "fl_y", "cx", "cy"))
+        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        camera = bitymi_ns.Camera(torch.from_numpy(viewmat).float(), K, image.shape[1], image.shape[0])
+        views.append(bitymi_ns.View(camera, image))
+    g = torch.Generator().manual_seed(0)
+    centers = torch.stack([view.camera.center for view in views])
+    surfels = {
+        "means": centers.mean(0) + torch.randn(N, 3, generator=g),
+        "quats": torch.randn(N, 4, generator=g),
+        "scales": 0.1 + torch.rand(N, 2, generator=g),
+        "opacities": 0.2 + 0.7 * torch.rand(N, generator=g),
+        "betas": 0.5 + 3.0 * torch.rand(N, generator=g),
+        "colors": torch.rand(N, 3, generator=g),
+    }
+    return {"views": views, "camera": views[0].camera, "points": surfels["means"], **surfels}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_snippets_run(page: Path, names: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runnable, wrong = snippets(page.read_text("utf8"))
+    assert not wrong, f"{page.name}: {wrong} is no reason: write ```python no-run: the reason"
+    monkeypatch.chdir(tmp_path)
+    namespace = dict(names)
+    for code in runnable:
+        exec(compile(STEPS.sub("steps=10", code), str(page), "exec"), namespace)
+
+
+def test_a_broken_snippet_is_found() -> None:
+    runnable, wrong = snippets(
+        "```python\na = 1\n```\n\n```python no-run: needs a card\nb\n```\n```python later\nc\n```\n"
+    )
+    assert runnable == ["a = 1\n"] and wrong == ["later"]

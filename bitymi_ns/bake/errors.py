@@ -11,10 +11,10 @@ from torch import Tensor
 from bitymi_ns.bake.field.footprint import averaged, cells_per_pixel
 from bitymi_ns.bake.field.plan import Field, Plan, Shown
 from bitymi_ns.bake.field.reference import references, weights
-from bitymi_ns.bake.options import STEPS
 from bitymi_ns.bake.resample import read_at
-from bitymi_ns.bake.statistics import Certificate, Percentiles, TileError
+from bitymi_ns.bundle.statistics import Certificate, Percentiles, TileError
 from bitymi_ns.codec.pages import size_classes, texel_index
+from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import TexelTiles
 from bitymi_ns.progress import Progress, no_progress
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.statistics import LeftOut
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import LeftOut
 from bitymi_ns.codec.limits import within
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import kind_of

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
-from bitymi_ns.bake.options import STEPS
-from bitymi_ns.bake.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
+from bitymi_ns.bundle.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.codec.limits import beyond
+from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.shade import view_base

@@ -11,10 +11,10 @@ from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
 from bitymi_ns.bake.trained_texels import learned
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera

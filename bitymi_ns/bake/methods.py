@@ -15,9 +15,9 @@ from bitymi_ns.bake.field.reference import held, references
 from bitymi_ns.bake.field.texels import evaluate_tiles
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, describe, reduce_view_color, view_color_errors
-from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.reduce import Reduced, reduce_tiles
-from bitymi_ns.bake.statistics import FieldLevels, ViewColorError
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import FieldLevels, ViewColorError
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import tile_means
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of

@@ -14,14 +14,13 @@ from bitymi_ns.bake.errors import tile_errors
 from bitymi_ns.bake.field.plan import Field, paper_texels
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable
 from bitymi_ns.bake.methods import BakeMethod, FineBake, Tiles, bake_method, reduced_tiles
-from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.photo_resolution import photographed
-from bitymi_ns.bake.statistics import AtlasCost, KeptSurfels, Statistics
-from bitymi_ns.codec.codes import Codes
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import AtlasCost, KeptSurfels, Statistics
 from bitymi_ns.codec.packing import Packing, pack
-from bitymi_ns.codec.pages import moved_texels, tile_means
+from bitymi_ns.codec.pages import moved_texels, paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
-from bitymi_ns.codec.texel_codes import TexelCodes, pages
+from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
@@ -63,7 +62,7 @@ class Baked:
     atlas: EncodedAtlas | None
     options: BakeOptions
     statistics: Statistics = field(default_factory=Statistics)
-    codes: Codes | None = None
+    codes: SceneCodes | None = None
     uncoded: Tensor | None = None
     in_front: Tensor | None = None
 
@@ -161,7 +160,7 @@ class Baked:
         """The same bake with the residual colours of codes, which are those of its tiles, and were made of `uncoded`
         [T, 3]."""
         assert self.codes is not None
-        texels = pages(codes, self.packing)
+        texels = paged_texels(codes.texels(), self.packing)
         value_range = choose_range(
             texels.numpy(), self.packing, self.options.range, self.options.range_samples, self.options.seed
         )

@@ -7,9 +7,9 @@ import copy
 import torch
 
 from bitymi_ns.bake.inputs import drawable
-from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import BakeableScene, Baked
-from bitymi_ns.bake.statistics import KeptSurfels, KeptTexels, Statistics
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, Statistics
 from bitymi_ns.codec.packing import pack
 from bitymi_ns.codec.pages import paged_texels, tile_means
 from bitymi_ns.ops.view_kinds import kind_of

@@ -3,7 +3,7 @@
 from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle, verify_bundle
-from bitymi_ns.bundle.verify import Check, check_field, check_files, check_place, check_view_color
+from bitymi_ns.bundle.verify import Check, check_files, check_place
 from bitymi_ns.bundle.write import World, export, write_bundle
 
 __all__ = [
@@ -12,11 +12,9 @@ __all__ = [
     "BundleError",
     "Check",
     "World",
-    "check_field",
     "check_files",
     "check_place",
     "check_target",
-    "check_view_color",
     "export",
     "read_bundle",
     "verify_bundle",

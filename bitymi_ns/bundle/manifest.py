@@ -15,8 +15,8 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
-from bitymi_ns.bake.statistics import Decibels, Part, Share, Statistics, Whole
 from bitymi_ns.bundle import strict_json
+from bitymi_ns.bundle.statistics import Decibels, Part, Share, Statistics, Whole
 from bitymi_ns.codec.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.codec.streams import MOST_PLANES
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN

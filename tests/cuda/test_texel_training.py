@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.options import BakeOptions
 from bitymi_ns.bake.pipeline import Baked, reduced
 from bitymi_ns.bake.trained_texels import learned
 from bitymi_ns.bake.view_color_rate import ColorChoices, color_choices
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import Bands
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.scene.field import TexelField

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.field.footprint import closest_pixels
-from bitymi_ns.bake.options import BakeOptions
-from bitymi_ns.bake.statistics import KeptTexels
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import (
     kernel_parameters,

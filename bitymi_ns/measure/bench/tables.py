@@ -120,7 +120,7 @@ BUNDLE_NOTES = (
 
 def bundles_table(matrix: Matrix, cells: Cells) -> str:
     """What sets the bundles of each run apart: size and error beside the first of them, and what they leave out."""
-    from bitymi_ns.bake.statistics import Statistics  # with torch, which nothing else of the benchmark needs
+    from bitymi_ns.bundle.statistics import Statistics  # with torch, which nothing else of the benchmark needs
 
     lines = []
     for run in matrix.runs():

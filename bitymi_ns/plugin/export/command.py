@@ -24,11 +24,10 @@ from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.interchange import Frame, Kind, check_extras, described, place_of, write_extras
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.compact_options import BundleFormat, CompactOptions
 from bitymi_ns.plugin.export.summary import print_summary
 from bitymi_ns.plugin.export.target import bundle_version, check_room, replace_file, reserve_bundle
-from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
+from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.plugin.run.model import BitymiModel

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL

@@ -16,9 +16,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from bitymi_ns.bake.statistics import HeldOut
-from bitymi_ns.bundle import Bundle, Check, check_field, check_place, check_view_color
+from bitymi_ns.bake.verify import check_field, check_view_color
+from bitymi_ns.bundle import Bundle, Check, check_place
 from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.plugin.console import fail

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_serializer
 from torch import Tensor
 
-from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bundle.bake_options import BakeOptions
 
 _LARGEST = 1e12
 _P = TypeVar("_P", bound="Part")
@@ -70,10 +70,6 @@ class TileError(Part):
     largest: Percentiles
 
 
-MARKS = 128
-"""Sums of signed texels by which a certificate is checked (`bake/certificate.py`)."""
-
-
 class Certificate(Part):
     """Of how many surfels the stored residual is within the tolerance, as the closest training view sees it: weighted
     by the blending weight, averaged over a pixel, root mean square over the tile."""
@@ -88,7 +84,7 @@ class Certificate(Part):
     texel_rms: Annotated[NotNegative | None, BeforeValidator(_number)] = None
     """Root mean square of the texels themselves, wherever they are seen, 8-bit steps."""
     marks: Annotated[str, Field(min_length=1368, max_length=1368, pattern=r"^[A-Za-z0-9+/]{1366}==$")] | None = None
-    """2 x 128 sums, before and as stored (`certificate.marks_text`)."""
+    """Count sketches, 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
 
     @classmethod
     def of(cls, errors: Tensor, tolerance: float, against: Literal["field", "texels"]) -> Certificate:

@@ -1,4 +1,4 @@
-"""Options of the bake."""
+"""Options of the bake, which bundle.json states."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import check_page
-from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, Format, Profile, RangeRule, bc7_encoder
+from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, STEPS, Format, Profile, RangeRule, bc7_encoder
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.tile_sizes import check_sides
-
-STEPS = 255.0
-"""8-bit steps in a colour of 1: the unit of errors and of the tolerance."""
 
 
 @dataclass

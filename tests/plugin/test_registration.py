@@ -11,11 +11,13 @@ pytest.importorskip("nerfstudio")
 
 import torch
 import tyro
+import yaml
 from nerfstudio.plugins.types import MethodSpecification
 
 import bitymi_ns.plugin.run.config as config
 from bitymi_ns.plugin import methods
 from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 
 NAMES = [
     "bitymi",
@@ -159,6 +161,27 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
 def test_errors_for_the_user_end_the_process_with_status_1_and_a_message() -> None:
     error = InputError("no such capture")
     assert isinstance(error, SystemExit) and error.code == "bitymi: no such capture"
+
+
+OLD_MODULES = {
+    **{f"plugin.data.{name}": f"host.{name}" for name in ("datamanager", "dataparser", "dataset")},
+    "plugin.run.model": "host.model",
+    "plugin.run.trainer.BitymiPipeline": "host.pipeline.BitymiPipeline",
+    "plugin.run.trainer.BitymiTrainer": "host.trainer.BitymiTrainer",
+    "plugin.run.config": "host.config",
+    "plugin.run.bundle_model": "host.bundle_config",
+}
+
+
+@pytest.mark.parametrize("model", [None, BakedModelConfig(background=(1.0, 1.0, 1.0))])
+def test_a_config_of_an_earlier_version_loads(model: BakedModelConfig | None) -> None:
+    run = fresh()
+    run.pipeline.model = model or run.pipeline.model
+    text = yaml.dump(run)
+    for new, old in OLD_MODULES.items():
+        text = text.replace(f"bitymi_ns.{new}", f"bitymi_ns.{old}")
+    assert "plugin" not in text
+    assert yaml.load(text, yaml.Loader) == run
 
 
 def test_a_capture_given_to_its_parser_names_the_experiment() -> None:

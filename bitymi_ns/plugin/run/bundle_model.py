@@ -1,4 +1,8 @@
-"""A bundle as a nerfstudio model: what ns-eval, ns-viewer and ns-render show of a baked scene."""
+"""A bundle as a nerfstudio model, for ns-eval, ns-viewer and ns-render.
+
+nerfstudio's tools read a config.yml and then look for a checkpoint at the path in it. A bundle has none, and may have
+been moved: `find_bundle` finds it, and `stub_checkpoint_dir` writes a stand-in for the checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,7 @@ from bitymi_ns.plugin.run.commands import folder_being_evaluated
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.scene.baked import FAST, BakedOutput
+from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 
 RENDERER = "BITYMI_RENDERER"
@@ -51,7 +56,7 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder, renderer = Path(self.config.bundle), self._renderer()
+        folder, renderer = Path(self.config.bundle), self._renderer_name()
         through_webgpu = renderer == "webgpu"
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
@@ -61,14 +66,14 @@ class BakedModel(SurfelModel):
         atlas = bundle.info.atlas
         self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
         self._bundle_bytes = download_bytes(folder, bundle.info)
-        self._scene = bundle.scene
-        self._scene.through_webgpu = through_webgpu
+        bundle.scene.through_webgpu = through_webgpu
         if renderer == "fast":
-            self._scene.transmittance_min = FAST
+            bundle.scene.transmittance_min = FAST
+        self._renderer = SceneRenderer(bundle.scene)
         self._count = len(bundle)
 
-    def _renderer(self) -> str:
-        """The renderer that is asked for; stops where there is none of that name, or no WebGPU."""
+    def _renderer_name(self) -> str:
+        """The renderer of the options; stops where it is unknown, or WebGPU is not available."""
         asked = os.environ.get(RENDERER) or self.config.renderer
         if asked not in ("kernels", "fast", "webgpu"):
             fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
@@ -81,10 +86,10 @@ class BakedModel(SurfelModel):
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         try:
-            drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+            drawn = self._renderer.render(camera.to(self.device), background.to(self.device), maps)
         except webgpu.WebGpuUnavailable as error:
             fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
-        if not self._scene.through_webgpu:
+        if not self._renderer.scene.through_webgpu:
             return drawn
         return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
 
@@ -101,8 +106,9 @@ class BakedModel(SurfelModel):
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)
-        if self._scene.tiles.device != self.device and not self._scene.through_webgpu:
-            self._scene = self._scene.to(self.device)
+        scene = self._renderer.scene
+        if scene.tiles.device != self.device and not scene.through_webgpu:
+            self._renderer = SceneRenderer(scene.to(self.device))
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:

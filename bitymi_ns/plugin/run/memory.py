@@ -1,4 +1,4 @@
-"""The memory that training or an export will take on the CPU, stated before it starts.
+"""Estimate of the memory that training or an export takes on the CPU, printed before it starts.
 
 What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
 a few views. The other numbers are measured; they belong to the default preset.
@@ -6,7 +6,10 @@ a few views. The other numbers are measured; they belong to the default preset.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 import psutil
 import torch
@@ -128,6 +131,29 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
 
 
+def available_memory() -> float:
+    """Bytes that this process may have, with what it has already: of the machine, within its control group's limit."""
+    return min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
+
+
+def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/proc/self/cgroup")) -> float:
+    """Bytes that the control groups (v2 and v1) of this process may take; infinite where none has a limit."""
+    found = [math.inf]
+    with suppress(OSError):  # no Linux
+        for line in cgroups.read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            base, name = (mount / "memory", "memory.limit_in_bytes") if controllers else (mount, "memory.max")
+            folder = base / path.lstrip("/")
+            for each in (folder, *folder.parents):
+                with suppress(OSError, ValueError):  # of another namespace; "max"
+                    found.append(float((each / name).read_text()))
+                if each == base:
+                    break
+    return min(found)
+
+
 def _per_fragment(scene: Scene) -> float:
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
@@ -144,8 +170,7 @@ def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> 
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
     say(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.")
-    # what this process has taken already is a part of what it needs
-    available = psutil.virtual_memory().available + psutil.Process().memory_info().rss
+    available = available_memory()
     if needed > available:
         warn(
             f"That is more than the {available / 1e9:.1f} GB that this machine has available. Close other programs, or "

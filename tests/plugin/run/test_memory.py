@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
@@ -134,3 +135,20 @@ def test_an_export_takes_copies_of_the_texels_that_were_learned(
 def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:
     output = scene[0].render(scene[1])
     assert trace_cpu.count(output.projection) == len(output.fragments)
+
+
+@pytest.mark.parametrize(
+    ("groups", "file", "limit"),
+    [
+        ("0::/a/b", "a/memory.max", 5e9),
+        ("4:cpu:/a\n3:memory:/a/b", "memory/a/b/memory.limit_in_bytes", 5e9),
+        ("0::/a/b", "a/b/other", float("inf")),
+    ],
+)
+def test_the_limit_of_a_control_group_counts(tmp_path: Path, groups: str, file: str, limit: float) -> None:
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text("5000000000\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "cgroups").write_text(groups + "\n")
+    assert memory.memory_limit(tmp_path, tmp_path / "cgroups") == limit
+    assert memory.memory_limit(tmp_path, tmp_path / "none") == float("inf")

@@ -17,7 +17,7 @@ from bitymi_ns.bundle import Bundle, export, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.ops import blended_image, project, trace
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.plugin.export.trained import camera_row
+from bitymi_ns.plugin.export.cameras import camera_row
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField

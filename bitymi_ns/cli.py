@@ -4,7 +4,7 @@ are nerfstudio's own commands: ns-train, ns-export, ns-eval)."""
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Literal, TextIO
@@ -50,17 +50,9 @@ class Sample:
     def run(self) -> None:
         from bitymi_ns import sample
 
+        options = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "output_dir"}
         with explained(self.output_dir, ValueError):
-            folder = sample.generate(
-                self.output_dir,
-                views=self.views,
-                width=self.width,
-                height=self.height,
-                seed=self.seed,
-                points=self.points,
-                overwrite=self.overwrite,
-                progress=True,
-            )
+            folder = sample.generate(self.output_dir, **options, progress=True)
         say(f"Wrote {self.views} images and {self.points} points to {folder}")
 
 
@@ -71,7 +63,7 @@ class Sfm:
     source: tyro.conf.Positional[Path]
     """Folder of photographs (or with `images`, and `masks`, in it), or a video."""
     output: Path | None = None
-    """Folder to write the capture to; none = the poses are kept beside the photographs, and their place is printed."""
+    """Folder to write the capture to; none = the poses are kept beside the photographs, and their folder is printed."""
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
@@ -157,11 +149,10 @@ class BenchKnobs:
     repeats: int = 3
     """Timed renderings of each view; the median counts."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns.measure.knobs import measure_to_file
 
         measure_to_file(self.load_config, self.output, self.knobs, self.views, self.repeats)
-        return 0
 
 
 @dataclass
@@ -173,13 +164,12 @@ class BenchPictures:
     output_dir: Path = Path("pictures")
     """Folder for the PNG files and pictures.json."""
     views: int = 2
-    """How many of the worst views."""
+    """Number of worst views."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns.measure.pictures import draw_worst
 
         draw_worst(self.load_config, self.output_dir, self.views)
-        return 0
 
 
 def _suite(name: str, description: str) -> object:
@@ -208,7 +198,7 @@ class Bench:
 
 @dataclass
 class Verify:
-    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is given."""
+    """Check a bundle: files, hashes, formats, tiles; and optionally against the run it was baked from."""
 
     bundle: tyro.conf.Positional[Path]
     """Folder of the bundle, or its one file (bitymi pack)."""
@@ -270,9 +260,9 @@ class Pack:
         bundle = Path(os.path.realpath(self.bundle))
         output = self.output or bundle.with_name(bundle.name + SUFFIX)
         if output.exists() and not self.overwrite:
-            raise ValueError(f"{output} is there already: choose another place (--output), or add --overwrite")
+            raise ValueError(f"{output} is there already: choose another path (--output), or add --overwrite")
         if output.exists() and not is_single(output):
-            raise ValueError(f"{output} is no bundle and is not replaced: choose another place (--output)")
+            raise ValueError(f"{output} is no bundle and is not replaced: choose another path (--output)")
         with explained(output, ValueError):
             written = write_single(bundle, output)
         _say_left_out(written.left_out)
@@ -403,12 +393,11 @@ def main(args: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, BenchError, KernelsUnavailable) as error:
         say(f"bitymi: {error}", sys.stderr)
         return 1
-    except MemoryError:
-        say("bitymi: there is not enough memory for this; nothing was left half-written", sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        say("bitymi: interrupted, nothing was left half-written", sys.stderr)
-        return 130
+    except (MemoryError, KeyboardInterrupt) as error:
+        interrupted = isinstance(error, KeyboardInterrupt)
+        why = "interrupted" if interrupted else "there is not enough memory for this"
+        say(f"bitymi: {why}; nothing was left half-written", sys.stderr)
+        return 130 if interrupted else 1
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 REFERENCE_STEPS = 30_000
-"""The run length for which every step count below is given."""
+"""Run length that every step count below is stated for."""
 ExposureKind = Literal["auto", "off", "gain", "affine"]
 """Colour corrections of the photographs."""
 Background = Literal["auto", "black", "white", "random"]
@@ -33,7 +33,7 @@ class LossConfig:
     falloff_weight: NonNegative = 0.005
     """Weight lambda of the falloff loss; 0 turns it off (the paper's quality setting)."""
     falloff_gamma: NonNegative = 25.0
-    """How sharply the falloff and overdraw losses fade with the photometric error: omega = exp(-gamma e)."""
+    """Decay of the falloff and overdraw losses with the photometric error e: omega = exp(-gamma e)."""
     falloff_error: Literal["l1_sum", "mse"] = "l1_sum"
     """The error e in omega: L1 summed over rgb, or the mean squared error."""
     falloff_gradient: Literal["full", "beta_only"] = "full"
@@ -151,18 +151,17 @@ class AdamConfig:
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay of the running averages, of the surfels' parameters."""
     field_betas: tuple[float, float] = (0.9, 0.99)
-    """The same of the texture field, which forgets faster: its gradients are sparse and large early on."""
+    """Decay of the texture field's averages: its gradients are sparse, and large early on."""
 
 
 @dataclass
 class TexelSteps:
-    """How far texels move, in training and after it."""
+    """Step sizes of texels."""
 
     rate: NonNegative = 0.05
-    """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
+    """Largest step of a texel per pass over the views, in colour units; falls to 0 as a cosine."""
     prior: Positive = 0.3
-    """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
-    of the rate, one never seen not at all."""
+    """Coverage prior m0 in pixels: a texel of summed blending weight m moves at m / (m + m0) of the rate."""
 
 
 @dataclass
@@ -177,20 +176,19 @@ class TexelConfig(TexelSteps):
     pixels_per_texel: Positive = 0.25
     """A tile has at most a texel for so many pixels that its surfel makes up of the view that shows most of it."""
     rendered_pixels_per_texel: Positive = 32.0
-    """Where there would be more than 8 million texels, tiles together have at most one for so many pixels that the
-    steps of that part look at: more take memory that they are not worth."""
+    """Beyond 8 million texels, at most one for so many pixels that the steps of that part render; saves memory."""
     largest: Annotated[int, Field(ge=4, le=4096)] = 64
     """Largest side of a tile, texels, a power of two."""
     views: NonNegative = 0.25
-    """Views that are looked through to find what the tiles need, as a share of the steps of that part; 32 at least."""
+    """Views that tile sizes and coverage are measured on, as a share of the steps of that part; at least 32."""
 
 
 @dataclass
 class GuardConfig:
-    """What happens when training diverges."""
+    """Rollback of diverged training."""
 
     rollbacks: Count = 5
-    """How often a run may go back to its last good state; 0 = a loss that is not finite ends it."""
+    """Most rollbacks to the last good state; 0 = a loss that is not finite ends the run."""
     rates: PositiveShare = 0.3
     """Factor of all learning rates when it does; its square, cube, ... when that was not enough."""
     window: PositiveCount = 300
@@ -201,7 +199,7 @@ class GuardConfig:
 
 @dataclass
 class TrainConfig:
-    """How a scene is trained."""
+    """Options of training."""
 
     loss: LossConfig = field(default_factory=LossConfig)
     densify: DensifyConfig = field(default_factory=DensifyConfig)
@@ -211,7 +209,7 @@ class TrainConfig:
     freeze_after: Count = 5000
     """From this step on the texture field learns on one step in `freeze_every` only."""
     freeze_every: PositiveCount = 10
-    """How rarely the texture field learns after `freeze_after`; 1 = on every step."""
+    """Stride of the steps on which the texture field learns after `freeze_after`; 1 = every step."""
     freeze_min_updates: Count = 300
     """Short runs freeze less, so that the field still learns on about this many steps after `freeze_after`."""
     field_warmup: Count = 500
@@ -223,13 +221,12 @@ class TrainConfig:
     """Pixels of a photograph, of those that show something, with which they do not wait longer; with n times as many,
     by at most sqrt(n)."""
     num_downscales: Annotated[int, Field(ge=0, le=16)] = 2
-    """How many times the image size is halved at the start."""
+    """Halvings of the image size at the start."""
     init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first surfels."""
     first_surfels: int | None = None
     """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
-    1,000 pixels that the run looks at, because a surfel costs time in every step, and short runs on small pictures
-    cannot place more; else all points."""
+    1,000 pixels that the run renders; else all points."""
     random_points: PositiveCount = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
     exposure: ExposureKind = "off"

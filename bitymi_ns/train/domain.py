@@ -53,7 +53,7 @@ def build_scene(
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
     means = surfels["means"]
     near = NEAR * scene_extent(camera_centers, means)
-    if scene_config.texture != "hash":  # texels come later, when the surfels have found their places
+    if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report
     bounded = bounded or (declared is not None and box_is_small(declared, camera_centers))
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
@@ -87,8 +87,8 @@ def check_representation(config: SceneConfig) -> None:
 
 
 def box_is_small(box: Tensor, camera_centers: Tensor) -> bool:
-    """Whether a grid over the box [2, 3] is at least as fine as one over contracted space, where the cameras' ball has
-    half the width of the grid. Captures of open scenes may declare a box, too: a large one."""
+    """True where a grid over the box [2, 3] is at least as fine as one over contracted space, which is twice as wide as
+    the cameras' ball. Captures of open scenes may declare a large box."""
     return float((box[1] - box[0]).max()) <= 4 * scene_extent(camera_centers)
 
 
@@ -121,7 +121,7 @@ def table_size_of(image_pixels: int) -> int:
 
 
 SAMPLE = 4096
-"""Surfels that are looked for first: nearly all views see one of them."""
+"""Surfels that are tested first: nearly all views see one of them."""
 CHUNK = 1 << 20
 
 

@@ -1,4 +1,4 @@
-"""How well a scene shows views that it was not trained on."""
+"""Quality of held-out views."""
 
 from __future__ import annotations
 

@@ -37,16 +37,16 @@ class LogEntry:
     fragments: float
     """Blended fragments per view, mean over the evaluation views."""
     loss: float
-    """Of the last training step."""
+    """Objective of the last training step."""
     psnr: float
     """dB, mean over the evaluation views at full size; NaN without such views."""
     cc_psnr: float
-    """The same after the affine fit of each view's colours (`losses.color_corrected`)."""
+    """PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`)."""
 
 
 @dataclass
 class TrainLog:
-    """What happened in a run."""
+    """Log of a run."""
 
     entries: list[LogEntry] = field(default_factory=list)
     events: list[dict[str, float]] = field(default_factory=list)
@@ -78,7 +78,7 @@ class Trainer:
             config: training options.
             max_steps: length of the run; the schedules depend on it.
             extent: scene extent in world units; default: from the cameras.
-            processes: of the run, and how many views each looks at in a step; all are given the same.
+            processes: of the run, and the views of each per step; all are given the same.
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")

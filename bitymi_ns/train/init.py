@@ -19,7 +19,7 @@ BETA_RAW = 2.0
 MAX_SCALE = 0.25
 """Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
 PIXELS_PER_FIRST_SURFEL = 1000
-"""Pixels that a run looks at for each of its first surfels, at least."""
+"""Fewest pixels rendered in a run per first surfel."""
 FEWEST_FIRST = 5000
 """Points that are never thinned, however short the run."""
 MIN_SCALE = 1e-6
@@ -28,7 +28,7 @@ MIN_SCALE = 1e-6
 
 @dataclass
 class PointReport:
-    """What became of the sparse points."""
+    """Counts of the sparse points used and dropped."""
 
     given: int
     not_finite: int = 0

@@ -33,7 +33,7 @@ def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
 
 
 def make_optimizers(scene: Scene) -> dict[str, Adam]:
-    """Those of the surfels, and `field_table` and `field_mlp`."""
+    """Optimisers of the surfels, and `field_table` and `field_mlp`."""
     optimizers = surfel_optimizers(scene)
     if isinstance(scene.field, HashField):
         table, *mlp = scene.field.weights
@@ -43,7 +43,7 @@ def make_optimizers(scene: Scene) -> dict[str, Adam]:
 
 
 PLAIN = {"fused": True, "weight_decay": 0.0, "amsgrad": False, "maximize": False, "differentiable": False}
-"""What a group of Adam says that `step` takes together with others."""
+"""Options of Adam groups that `step` fuses."""
 
 
 def step(optimizers: Iterable[Optimizer]) -> None:
@@ -107,7 +107,7 @@ def _ready(optimizer: Optimizer, group: dict[str, Any]) -> list[list[torch.Tenso
 
 
 def set_rate(optimizer: Optimizer, rate: float) -> None:
-    """Gives an optimiser its learning rate."""
+    """Set the learning rate of an optimiser."""
     for group in optimizer.param_groups:
         group["lr"] = rate
 

@@ -103,7 +103,7 @@ class RollbackGuard:
         self._states: list[tuple[int, dict[str, Any]]] = []  # the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed run needs; it can go back no farther than to where it was resumed."""
+        """State for a resumed run; it can roll back no farther than to where it was resumed."""
         return {
             "factor": self.factor,
             "rollbacks": self.rollbacks,
@@ -124,11 +124,11 @@ class RollbackGuard:
 
     @property
     def on(self) -> bool:
-        """Whether the run may go back at all."""
+        """True where rollbacks are enabled."""
         return self.config.guard.rollbacks > 0
 
     def before(self, step: int, views: DownscaledViews) -> None:
-        """Call before each step: notes the state that the run starts from, and what its first scene is worth.
+        """Call before each step: keeps the state that the run starts from, and measures the loss of its first scene.
 
         Args:
             step: index of the step.
@@ -202,7 +202,7 @@ class RollbackGuard:
 
         Args:
             step: index of the step.
-            loss: scalar, photometric loss of the step, without graph. On a CUDA device it is looked at when a window
+            loss: scalar, photometric loss of the step, without graph. On a CUDA device it is read when a window
                 ends, and so is the next one; on the CPU at once.
             broken: [1] int32, surfels that could not be drawn because they are not finite.
 

@@ -40,7 +40,7 @@ def view_losses(
         view: on the scene's device, its picture at the size of its camera.
         schedule, step: which parts of the scene learn.
         config: training options.
-        watch: looks at the losses of the run; without one a step waits until its own loss is known.
+        watch: checks the losses of the run; without one a step waits until its own loss is known.
 
     Returns:
         The weighted terms of the loss (their sum is the objective), and the rendered view.
@@ -71,11 +71,11 @@ def view_losses(
 
 
 class Training:
-    """What a training step needs beside the scene, and what it does. The order of a step:
+    """A run of training steps. The order of a step:
 
     `begin` -> zero the gradients -> `losses` -> backward of their sum -> `combine` -> optimisers -> `finish`.
 
-    A step of several processes looks at several views, and does what one process would with the mean of their losses.
+    With more processes a step uses the mean loss of the views of all.
     Every process calls everything here at the same steps. `losses` and backward are called for each of its views.
 
     Attributes:
@@ -246,7 +246,7 @@ class Training:
         return loss / self.processes.views, most
 
     def state_dict(self) -> dict[str, Any]:
-        """What decides, beside the scene and its optimisers, how the run goes on."""
+        """State of the run beside the scene and its optimisers."""
         return {
             "strategy": self.strategy.state_dict(),
             "guard": self.guard.state_dict(),

@@ -72,7 +72,7 @@ class Strategy:
         """
         Args:
             config: training options.
-            schedule: says at which steps what takes place.
+            schedule: of the run's events.
             extent: scene extent in world units.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
@@ -273,8 +273,8 @@ class Strategy:
         over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
         if self.config.densify.max_surfels > 0 and over > 0:
             # only a scene loaded from elsewhere is over the cap: the faintest go
-            lots = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
-            invisible[lots[:over]] = True
+            order = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
+            invisible[order[:over]] = True
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
         self._remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}

@@ -54,13 +54,13 @@ class View(NamedTuple):
         return shown(rgb, self.correction, alpha, background)
 
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
-        """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
+        """[H, W, 3] the photograph over a colour [3] (None = black), on a device."""
         return over_background(as_float(self.image.to(device)), background)
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a run learns from.
+    """Inputs of a run.
 
     Attributes:
         views: training views at full size.
@@ -174,7 +174,7 @@ def background_color(
 
 
 def background_changes(config: TrainConfig, view: View) -> bool:
-    """Whether each step on a view has another colour behind the scene."""
+    """True where each step on a view has another colour behind the scene."""
     return config.background == "random" or (config.background == "auto" and view.image.shape[-1] == 4)
 
 
@@ -206,10 +206,10 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
     The picture may be of that size already.
     """
     image = as_float(view.image.to(device))
-    for given, what in ((view.image, "image"), (view.mask, "mask")):
+    for picture, what in ((view.image, "image"), (view.mask, "mask")):
         sizes = ((view.camera.height, view.camera.width), (camera.height, camera.width))
-        if given is not None and tuple(given.shape[:2]) not in sizes:
-            h, w = given.shape[:2]
+        if picture is not None and tuple(picture.shape[:2]) not in sizes:
+            h, w = picture.shape[:2]
             raise ValueError(
                 f"the {what} is {w} x {h} pixels, but its camera {view.camera.width} x {view.camera.height}"
             )
@@ -285,7 +285,7 @@ class DownscaledViews:
 
 
 def training_order(n: int, seed: int, step: int) -> int:
-    """Which of `n` views step number `step` trains on: every view once an epoch, in an order that is new each time.
+    """Index of the view of a training step: every view once an epoch, reshuffled each epoch.
 
     Depends on the arguments alone, so that a resumed run sees the same views.
     """
@@ -303,8 +303,8 @@ T = TypeVar("T")
 
 
 class MemoryBudget:
-    """Memory that caches may fill, several together. What fits first stays for good: views are looked at in turn, and a
-    cache that replaced the oldest would have dropped each one just before it is needed again.
+    """Byte budget shared by caches. What fits first stays: views are used in turn, so a cache that evicts the oldest
+    would drop each one just before its next use.
 
     Attributes:
         left: bytes that are not taken.
@@ -314,7 +314,7 @@ class MemoryBudget:
         self.left = nbytes
 
     def reserve(self, nbytes: int) -> bool:
-        """Whether so much is left; if so it is taken."""
+        """Take so many bytes if they are left; True where they were."""
         if nbytes > self.left:
             return False
         self.left -= nbytes

@@ -1,4 +1,4 @@
-"""What a browser may ask for: the built page, and the files of a bundle that the format names; nothing else."""
+"""Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BUNDLE = "bundle/"
 SINGLE = "scene.bitymi"
 """Name of the one file beside an exported page."""
 _ASKS = '<meta name="bundle" content="{}" />'
-"""Where the page reads which file it shows; empty = the folder beside it."""
+"""Tag that names the bundle file of the page; empty = the folder beside it."""
 
 
 class PageError(ValueError):
@@ -47,7 +47,7 @@ class PageError(ValueError):
 
 @dataclass(frozen=True)
 class Site:
-    """What is served.
+    """Files served.
 
     Attributes:
         files: path on the server, without the first slash, to the file.
@@ -128,9 +128,9 @@ def single_site(bundle: Path) -> Site:
 
 
 def _title(bundle: Path) -> Callable[[], bytes]:
-    """What view.json says of a bundle."""
-    place = Path(os.path.realpath(bundle))
-    title = place.stem if os.path.isfile(place) else place.parent.name if place.name == "bundle" else place.name
+    """Contents of view.json: the title of a bundle."""
+    path = Path(os.path.realpath(bundle))
+    title = path.stem if os.path.isfile(path) else path.parent.name if path.name == "bundle" else path.name
     text = json.dumps({"title": title}).encode()
     return lambda: text
 
@@ -155,7 +155,7 @@ class _Shown:
         path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
             found = os.stat(path)
-        except OSError:  # which is said when it is read
+        except OSError:  # reported when it is read
             return ()
         return found.st_ino, found.st_size, found.st_mtime_ns
 

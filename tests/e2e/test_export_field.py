@@ -95,7 +95,7 @@ def test_a_fine_tuning_that_ends_early_says_so(
     out = " ".join(capsys.readouterr().out.replace("│", " ").split())
     steps = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]["steps"]
     assert steps < 40
-    assert f"stopped early at step {steps} of 40: no gain on the set-aside training views for" in out
+    assert f"stopped early at step {steps} of 40: no gain on the validation views for" in out
     assert "tuning texels ━" in out and "100%" in out.split("tuning texels")[-1][:80]
 
 

@@ -24,10 +24,11 @@ from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.interchange import Frame, Kind, check_extras, described, place_of, write_extras
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.compact_options import BundleFormat, CompactOptions
 from bitymi_ns.plugin.export.summary import print_summary
 from bitymi_ns.plugin.export.target import bundle_version, check_room, replace_file, reserve_bundle
-from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
+from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.plugin.run.model import BitymiModel
@@ -40,8 +41,7 @@ INTERRUPTED = 130
 FEWEST_PASSES = 4
 """Steps of polish or fine-tuning per photograph; with fewer than this a line says that more may gain."""
 STEPS_AFTER_LEARNING = 100
-"""Of the fine-tuning of texels that learned in training or in the polish: what is left to learn is what the reduction
-of tiles and view colours changed."""
+"""Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
 
 
 @dataclass(kw_only=True)
@@ -88,8 +88,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     check_room: bool = True
     """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
     photographs: bool = False
-    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders; who is given the
-    bundle is given them."""
+    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders."""
 
     def main(self) -> None:
         """Run the export."""
@@ -112,7 +111,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             fail(str(error), error)
 
     def _options(self) -> BakeOptions:
-        """Those of the bake; stops where any is out of its range, before anything is loaded."""
+        """Options of the bake; stops where one is out of its range, before anything is loaded."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions) if f.name != "format"})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
@@ -141,7 +140,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         return self._form == "compact"
 
     def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
-        """What learns from so many training photographs, and whether the bundle is compact."""
+        """Optimisation after the bake for so many training photographs."""
         if self.exact:
             return Learning()
         has_learned, textured = isinstance(model.scene.field, TexelField), model.scene.field is not None

@@ -1,4 +1,4 @@
-"""Whether what a command makes will find its place: found out before the work."""
+"""Checks of the output folder before the work: writable, free, with enough disk space."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def require_writable(path: Path) -> None:
 
 @contextmanager
 def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
-    """Hold the place of a bundle; stop where another process does, or where a bundle may not or cannot be written."""
+    """Lock the folder of a bundle; stop where another process has it, or a bundle may not or cannot be written."""
     with ExitStack() as stack:
         try:
             stack.enter_context(reserved(folder, warn))
@@ -74,7 +74,7 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: 
 
 
 def bundle_version(folder: Path) -> tuple[int, int] | None:
-    """What tells a bundle from another one in its place; None where there is none."""
+    """Identity of the bundle file in a folder, inode and time; None where there is none."""
     try:
         found = (folder / MANIFEST).stat()
     except OSError:

@@ -65,7 +65,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
 
 
 def world_of(datamanager: Any) -> World:
-    """Where the scene lies in the capture's own frame, and that in the real world where its poses were found here."""
+    """Transform from the scene to the capture's frame, with up and metres where the poses come from our SfM."""
     outputs = datamanager.train_dataparser_outputs
     report = getattr(datamanager.dataparser, "poses_report", None)
     frame = None if report is None else read_frame(report)
@@ -98,7 +98,7 @@ def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera
 def held_out_psnr(
     model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
 ) -> list[list[float]]:
-    """Of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
+    """Rows of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
     bundle against photograph, and the last two after the affine fit of the colours."""
     rows = []
     background = model.background

@@ -31,7 +31,7 @@ from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 
 RENDERER = "BITYMI_RENDERER"
-"""Environment variable that goes before `BakedModelConfig.renderer`: ns-eval has no option for it."""
+"""Environment variable that overrides `BakedModelConfig.renderer`, because ns-eval has no option for it."""
 
 
 @dataclass
@@ -125,12 +125,12 @@ def find_bundle(recorded: Path) -> Path:
     for folder in candidates:
         if (folder / MANIFEST).is_file() or folder.is_file():
             return folder.absolute()
-    places = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
-    fail(f"no bundle found (looked for {MANIFEST} in {places}). Keep config.yml in the bundle's folder.")
+    tried = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
+    fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
 
 
 def _loaded_from() -> list[Path]:
-    """Where the config.yml that is being loaded may be: by eval_setup or, should that change, by the command line."""
+    """Folders that may hold the config.yml being loaded: of eval_setup, else of the command line."""
     evaluated = folder_being_evaluated()
     folders = [] if evaluated is None else [evaluated]
     for i, argument in enumerate(sys.argv):

@@ -1,5 +1,4 @@
-"""The nerfstudio command that loads one of our scenes: which it is, whether it can work on them, and where the capture
-is that it needs."""
+"""nerfstudio's other commands on our scenes: detection, refusal of unsupported ones, moved captures, and ns-viewer."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ REFUSED = {
     "ExportMarchingCubesMesh": f"ns-export marching-cubes needs a field of distances, which surfels have not. {_MESH}",
     "ExportGaussianSplat": f"ns-export gaussian-splat is for splatfacto. {_MESH}",
 }
-"""What cannot work on a scene of surfels, by the class of nerfstudio's script, and what does."""
+"""Classes of nerfstudio's scripts that cannot work on surfels, and what does instead."""
 SCRIPTS = ("nerfstudio.scripts.", "__main__")
 
 
@@ -59,18 +58,16 @@ def refuse_others() -> None:
 
 def moved_capture(datamanager: Any) -> None:
     """Read the capture where `DATA` says it is now, if it says anything."""
-    given = os.environ.get(DATA)
-    if not given:
+    if not os.environ.get(DATA):
         return
-    place = Path(os.path.expanduser(given)).absolute()
-    if not place.exists():
-        fail(f"{DATA} says that the capture is {place}, which does not exist. Correct it.")
-    datamanager.data = place
-    datamanager.dataparser.data = place
+    folder = Path(os.path.expanduser(os.environ[DATA])).absolute()
+    if not folder.exists():
+        fail(f"{DATA} names {folder} as the capture, which does not exist. Correct it.")
+    datamanager.data = datamanager.dataparser.data = folder
 
 
 def how_to_say_where() -> str:
-    """How to tell the running command where its capture is."""
+    """Advice: the option or variable by which the running command finds its capture."""
     return "Give its folder with --data." if folder_being_evaluated() is None else MOVED
 
 

@@ -119,7 +119,7 @@ class BitymiTrainerConfig(TrainerConfig):
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         except OSError as error:
             fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
-        # what follows in nerfstudio would start the processes its own way, see `several`
+        # what follows in nerfstudio would start the processes its own way, see `launcher`
         self.processes, self.machine = self.machine.num_devices, replace(self.machine, num_devices=1)
         say(self.summary())
 
@@ -223,7 +223,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return super().get_base_dir() if self.read_from is None else self.read_from
 
     def _read_cameras_of(self, bundle: Path) -> None:
-        """Where the capture of a bundle is gone, have the bundle's own cameras read instead of it."""
+        """Read the bundle's own cameras where its capture is gone."""
         datamanager = self.pipeline.datamanager
         data = datamanager.data or getattr(datamanager.dataparser, "data", None)
         if data is not None and not Path(data).exists() and has_cameras(bundle):

@@ -39,7 +39,7 @@ PER_FRAGMENT = 36
 PER_SHADED_FRAGMENT = 32
 """Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
 PER_PIXEL = 400
-"""Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
+"""Bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores."""
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
@@ -78,14 +78,14 @@ def state_training(
     to_come: int = 0,
     processes: int = 1,
 ) -> None:
-    """Say what a training run will take.
+    """Print the memory estimate of a training run.
 
     Args:
         scene: as the run finds it.
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
         texels: of those that will learn; None = none will.
-        to_come: views that they learn from, each counted as often as it is looked at.
+        to_come: views that they learn from, counted with repetition.
         processes: of the run, each of which takes as much.
     """
     pixels, total = _pixels(cameras)
@@ -105,7 +105,7 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Say what an export will take.
+    """Print the memory estimate of an export.
 
     Args:
         scene: a trained one.
@@ -159,7 +159,7 @@ def _per_fragment(scene: Scene) -> float:
 
 
 def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
-    """Those of the largest view, and of all together."""
+    """Pixels of the largest view, and of all views."""
     sizes = [camera.width * camera.height for camera in cameras]
     return max(sizes), sum(sizes)
 

@@ -43,9 +43,9 @@ class BitymiModelConfig(SurfelModelConfig):
 
     _target: type = field(default_factory=lambda: BitymiModel)
     scene: SceneConfig = field(default_factory=SceneConfig)
-    """What the scene is made of."""
+    """Representation of the scene."""
     train: TrainConfig = field(default_factory=TrainConfig)
-    """How it is trained."""
+    """Training options."""
     steps: tyro.conf.Suppress[int | None] = None
     """Length of the run, where one is going to be made."""
     curve_points: int = 20
@@ -110,7 +110,7 @@ class BitymiModel(SurfelModel):
         return len(self.scene)
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Of a training view the terms of its loss, of cameras the pictures."""
+        """Loss terms of a training view, or pictures of cameras."""
         if isinstance(ray_bundle, View):
             if self._run is None:
                 raise RuntimeError("losses exist in training only")
@@ -146,8 +146,7 @@ class BitymiModel(SurfelModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Of a training view what `get_outputs` found; of a held-out one, which nerfstudio asks for where
-        --steps-per-eval-batch is given, the photometric loss."""
+        """Loss terms from `get_outputs`; of a held-out view (--steps-per-eval-batch) the photometric loss."""
         if "losses" in outputs:
             return outputs["losses"]
         target, mask = self.photograph(batch, outputs["rgb"])

@@ -35,7 +35,7 @@ _Loader.add_implicit_resolver(
 
 @dataclass
 class TrainerOptions:
-    """How long a run is and what it leaves behind."""
+    """Length and outputs of a run."""
 
     iterations: int = 30_000
     """Steps of a run when --max-num-iterations is not given."""
@@ -55,16 +55,16 @@ class TrainerOptions:
 
 @dataclass
 class DataOptions:
-    """How a capture is split and read."""
+    """Split and reading of a capture."""
 
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
     """Rule by which photographs are held out, of nerfstudio's parsers."""
     eval_interval: int = 8
-    """Of so many photographs one is held out, as is usual for 3D Gaussian splatting."""
+    """Every eval_interval-th photograph is held out, as is usual for 3D Gaussian splatting."""
     points: Literal["auto", "triangulate", "random"] = "auto"
     """Points to start from: the capture's or, where it has none, triangulated ones; triangulated ones; random ones."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """How photographs are kept in memory."""
+    """Type of the photographs in memory."""
 
 
 @dataclass

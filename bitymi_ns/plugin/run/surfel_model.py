@@ -1,4 +1,4 @@
-"""What a trained and a baked scene have in common as nerfstudio models: outputs, metrics and images."""
+"""Base of the nerfstudio models of trained and baked scenes: outputs, metrics and images."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SurfelModel(Model):
     """Renders whole images from surfels."""
 
     measure_time = True
-    """Whether image metrics include the time of rendering; off while training."""
+    """Include render_ms in the image metrics; off while training."""
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -111,9 +111,9 @@ class SurfelModel(Model):
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
 
     def _say_once(self, message: str) -> None:
-        said: set[str] = self.__dict__.setdefault("_said", set())
-        if message not in said:
-            said.add(message)
+        warned: set[str] = self.__dict__.setdefault("_warned", set())
+        if message not in warned:
+            warned.add(message)
             warn(message)
 
     def _empty(self, height: int, width: int) -> dict[str, Tensor]:

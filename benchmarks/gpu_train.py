@@ -30,6 +30,7 @@ from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
 from bitymi_ns.plugin.run.preset import Preset, PresetError, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import REFERENCE_STEPS
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
@@ -245,7 +246,7 @@ def main() -> int:
     except PresetError as error:
         parser.error(str(error))
     for name, preset in runs:
-        steps = arguments.steps or preset.trainer.iterations
+        steps = arguments.steps or REFERENCE_STEPS
         points = min(arguments.points, steps)
         try:
             results.append(run(name, preset, capture, steps, points, device, options, arguments.keep))

@@ -241,8 +241,7 @@ def _say_left_out(names: Sequence[str]) -> None:
 
 @dataclass
 class Pack:
-    """Write a bundle as one file, its parts in the order of their use; verify and the loaders take it as they take the
-    folder."""
+    """Write a bundle as one file, its parts in the order of their use; everything reads it like the folder."""
 
     bundle: tyro.conf.Positional[Path]
     """Folder of the bundle, or its one file."""
@@ -251,7 +250,7 @@ class Pack:
     overwrite: Flag = False
     """Replace a bundle in one file that is there already."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
         from bitymi_ns.files import size_text
 
@@ -265,7 +264,6 @@ class Pack:
             written = write_single(bundle, output)
         _say_left_out(written.left_out)
         say(f"Wrote {output}, {size_text(written.bytes)}; the surfels are in its first {size_text(written.first)}.")
-        return 0
 
 
 @dataclass
@@ -283,7 +281,7 @@ class Extras:
     overwrite: Flag = False
     """Replace a folder of extras that is there already."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns import interchange
         from bitymi_ns.bundle import read_bundle
         from bitymi_ns.progress import rich_progress
@@ -308,7 +306,6 @@ class Extras:
             say(interchange.described(each))
         if not given.train:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
-        return 0
 
 
 @dataclass
@@ -324,14 +321,13 @@ class View:
     overwrite: Flag = False
     """Replace a page that was exported there before."""
     host: str = "127.0.0.1"
-    """Address to listen at. Any other than a loopback address shows the bundle to everyone who can reach this
-    machine."""
+    """Address to listen at. Others than loopback addresses show the bundle to all who can reach this machine."""
     port: int = 0
     """Port to listen at; 0 = any that is free."""
     open_browser: bool = True
     """Open the page in the browser."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         import webbrowser
 
         from bitymi_ns import view
@@ -345,7 +341,7 @@ class View:
             with explained(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)
             say(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
-            return 0
+            return
         server = view.serve(site, self.host, self.port)
         address = view.address_of(server)
         if not view.is_loopback(server):
@@ -356,10 +352,9 @@ class View:
                 webbrowser.open(address)
             server.serve_forever()
         except KeyboardInterrupt:
-            return 0
+            pass
         finally:
             server.server_close()
-        return 0
 
 
 Command = (

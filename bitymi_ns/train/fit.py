@@ -103,7 +103,7 @@ class Trainer:
             terms, output = self.training.losses(view)
             learning = [term for term in terms.values() if term.requires_grad]
             if learning:
-                torch.autograd.backward(learning, [_one(term) for term in learning])
+                torch.autograd.backward(learning, [_one(term.device, term.dtype) for term in learning])
         self.training.combine()
         step(self.optimizers.values())
         report = self.training.finish()
@@ -139,13 +139,9 @@ class Trainer:
 
 
 @functools.cache
-def _ones(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _one(device: torch.device, dtype: torch.dtype) -> Tensor:
+    """The gradient of a sum with respect to one of its terms."""
     return torch.ones((), device=device, dtype=dtype)
-
-
-def _one(term: Tensor) -> Tensor:
-    """The gradient of a sum with respect to one of its terms, made once."""
-    return _ones(term.device, term.dtype)
 
 
 def fit(

@@ -80,15 +80,6 @@ class RollbackGuard:
         exposure: Exposure | None = None,
         processes: Processes = ALONE,
     ) -> None:
-        """
-        Args:
-            scene, optimizers, strategy: what is restored; one optimiser per name.
-            schedule: of the run.
-            config: training options.
-            announce: told in a sentence whenever the run goes back, or surfels are dropped.
-            exposure: restored, too; None = there are no corrections.
-            processes: of the run.
-        """
         self.processes = processes
         self.exposure = exposure
         self.scene, self.optimizers, self.strategy = scene, optimizers, strategy

@@ -49,6 +49,7 @@ class Schedule:
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
         self.texels_start = min(max_steps, self.scaled(config.texels.start)) if texels else max_steps
         stop = min(densify.stop, config.texels.start) if texels else densify.stop
+        # after these steps surfels are cloned, split and pruned; opacities reset; the finished geometry pruned
         self.densify_steps = self._events(_multiples(interval, densify.start, stop))
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
@@ -86,14 +87,6 @@ class Schedule:
     def _events(self, steps_at_30k: list[int]) -> frozenset[int]:
         return frozenset(min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
 
-    def is_densify_step(self, step: int) -> bool:
-        """True where surfels are cloned, split and pruned after this step."""
-        return step in self.densify_steps
-
-    def is_reset_step(self, step: int) -> bool:
-        """True where opacities are reset after this step (after a densification of the same step)."""
-        return step in self.reset_steps
-
     def reset_opacity(self) -> float:
         """Opacity that a reset lowers to: `reset_opacity`, or more in a short run.
 
@@ -111,10 +104,6 @@ class Schedule:
     def recovering(self, step: int) -> bool:
         """True where the last opacity reset may still show: half of the time to the next one is not over."""
         return any(reset < step <= reset + max(1, self.reset_every // 2) for reset in self.reset_steps)
-
-    def is_final_prune_step(self, step: int) -> bool:
-        """True where the prune of the finished geometry takes place after this step."""
-        return step in self.final_prune_steps
 
     def overdraw_counts(self, step: int) -> bool:
         """True where the overdraw loss is part of this step's objective."""

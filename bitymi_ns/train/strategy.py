@@ -169,13 +169,13 @@ class Strategy:
             What was done, by name; empty when nothing was due.
         """
         report: dict[str, float] = {}
-        if self.schedule.is_densify_step(step):
+        if step in self.schedule.densify_steps:
             report |= self._densify(step, scene, optimizers, views)
-        if self.schedule.is_reset_step(step):
+        if step in self.schedule.reset_steps:
             report["opacity_reset"] = cap_opacity(
                 scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
             )
-        if self.schedule.is_final_prune_step(step):
+        if step in self.schedule.final_prune_steps:
             report |= self._final_prune(scene, optimizers, views)
         if report:
             report["surfels"] = len(scene)

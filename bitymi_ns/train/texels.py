@@ -50,13 +50,6 @@ class LearningTexels:
     """The part of a run in which texels learn."""
 
     def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
-        """
-        Args:
-            scene: gets a `TexelField` when the part begins.
-            schedule: of the run.
-            options: see `TexelConfig`.
-            processes: of the run.
-        """
         self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
         self._rate: RemovableHandle | None = None
 

@@ -70,9 +70,7 @@ def test_options_out_of_range(start: Start, group: str, option: str, value: Any,
         ns_train.main(config)
 
 
-@pytest.mark.parametrize(
-    "method", ["bitymi-quality", "bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"]
-)
+@pytest.mark.parametrize("method", ["bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"])
 def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
     config = start(method=method)
     config.max_num_iterations = 3

@@ -50,16 +50,6 @@ class TrainingRun:
         curve_points: int,
         curve_views: int,
     ) -> None:
-        """
-        Args:
-            scene: what is learned.
-            config: training options.
-            attributes: nerfstudio's trainer, pipeline and optimisers.
-            metadata: what the data manager says about the capture.
-            background: [3] colour behind held-out views.
-            resume_state: `state` of the run that is continued; empty = a new run.
-            curve_points, curve_views: of the training curve.
-        """
         trainer, pipeline = attributes.trainer, attributes.pipeline
         if trainer is None or pipeline is None or attributes.optimizers is None:
             raise ValueError("a training run needs nerfstudio's trainer, pipeline and optimisers")
@@ -238,15 +228,9 @@ FILE = "training_curve.jsonl"
 
 
 class TrainingCurve:
-    """Appends points to the file of a run."""
+    """Appends points to the file of a run; a resumed run keeps the points up to its checkpoint."""
 
     def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
-        """
-        Args:
-            path: the file; a new run starts it afresh.
-            resumed_from: curve of the run that is continued; its points up to the checkpoint are taken over.
-            steps_done: number of steps that the checkpoint contains; 0 = a new run.
-        """
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
         try:

@@ -249,48 +249,37 @@ class BitymiAdamConfig(OptimizerConfig):
     """Update all entries of a tensor in one pass."""
 
 
-def optimizers(options: AdamConfig) -> dict[str, Any]:
+def optimizers() -> dict[str, Any]:
     """nerfstudio's optimiser dictionary: one Adam per parameter group, no scheduler (the model sets the rates)."""
 
     def adam(group: str) -> BitymiAdamConfig:
-        betas = options.field_betas if group.startswith("field") else options.betas
-        return BitymiAdamConfig(lr=1e-3, eps=options.eps, betas=betas)
+        betas = AdamConfig.field_betas if group.startswith("field") else AdamConfig.betas
+        return BitymiAdamConfig(lr=1e-3, eps=AdamConfig.eps, betas=betas)
 
     return {group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS}
 
 
 def trainer_config(preset: Preset) -> BitymiTrainerConfig:
     """The configuration of a training run by a preset."""
-    trainer, data = preset.trainer, preset.data
-    dataparser = BitymiDataParserConfig(eval_mode=data.eval_mode, eval_interval=data.eval_interval, points=data.points)
     return BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]
-        default_iterations=trainer.iterations,
-        default_iterations_cpu=trainer.iterations_cpu,
-        default_saves=trainer.saves,
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
         mixed_precision=False,
         pipeline=BitymiPipelineConfig(
             datamanager=BitymiDataManagerConfig(
-                dataparser=dataparser,
-                cache_images_type=data.cache_images_type,
+                dataparser=BitymiDataParserConfig(),
+                cache_images_type="uint8",
                 cache_images="gpu" if has_cuda_kernels() else "cpu",
             ),
-            model=BitymiModelConfig(
-                scene=preset.scene,
-                train=preset.train,
-                curve_points=trainer.curve_points,
-                curve_views=trainer.curve_views,
-            ),
+            model=BitymiModelConfig(scene=preset.scene, train=preset.train),
         ),
-        optimizers=optimizers(preset.optimizer),
+        optimizers=optimizers(),
         # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
-        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=trainer.quit_on_train_completion),
-        vis=trainer.vis,  # type: ignore[arg-type]
+        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=True),
     )
 
 

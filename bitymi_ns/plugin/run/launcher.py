@@ -47,11 +47,6 @@ class Workers:
     """The worker processes of a run; this process is the first."""
 
     def __init__(self, config: TrainerConfig, count: int) -> None:
-        """
-        Args:
-            config: of the run, with its length.
-            count: of all processes of the run.
-        """
         self._cards = config.machine.device_type == "cuda"
         self._scratch = tempfile.TemporaryDirectory()
         self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)

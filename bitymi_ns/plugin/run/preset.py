@@ -10,14 +10,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import AdamConfig, TrainConfig
+from bitymi_ns.train.config import TrainConfig
 
 
 class PresetError(ValueError):
@@ -34,40 +34,6 @@ _Loader.add_implicit_resolver(
 
 
 @dataclass
-class TrainerOptions:
-    """Length and outputs of a run."""
-
-    iterations: int = 30_000
-    """Steps of a run when --max-num-iterations is not given."""
-    iterations_cpu: int = 3_000
-    """The same on a machine without a supported GPU."""
-    saves: int = 5
-    """Checkpoints written over a run."""
-    curve_points: int = 20
-    """Evaluations over a run, for the curve of quality against time; 0 = none."""
-    curve_views: int = 8
-    """Held-out views rendered for each of them, all for the last one; 0 = all."""
-    vis: str = "viewer"
-    """Default of --vis."""
-    quit_on_train_completion: bool = True
-    """End the process when training is done, also with the viewer."""
-
-
-@dataclass
-class DataOptions:
-    """Split and reading of a capture."""
-
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """Rule by which photographs are held out, of nerfstudio's parsers."""
-    eval_interval: int = 8
-    """Every eval_interval-th photograph is held out, as is usual for 3D Gaussian splatting."""
-    points: Literal["auto", "triangulate", "random"] = "auto"
-    """Points to start from: the capture's or, where it has none, triangulated ones; triangulated ones; random ones."""
-    cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """Type of the photographs in memory."""
-
-
-@dataclass
 class Preset:
     """One method: the defaults that the dataclasses declare, changed by what its YAML file says."""
 
@@ -75,9 +41,6 @@ class Preset:
 
     name: str
     description: str = ""
-    trainer: TrainerOptions = field(default_factory=TrainerOptions)
-    data: DataOptions = field(default_factory=DataOptions)
-    optimizer: AdamConfig = field(default_factory=AdamConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 

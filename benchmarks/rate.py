@@ -45,7 +45,7 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
     """The reduced bake of a run, its training views, its held-out views, and the background."""
     _, pipeline = load_trained(load_config)
     model, data = pipeline.model, pipeline.datamanager
-    cameras = data.undistorted_train_cameras()
+    cameras = data.train_dataset.cameras
     views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
     background, trained = model.background.cpu(), isinstance(model.scene.field, TexelField)

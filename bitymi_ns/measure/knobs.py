@@ -169,7 +169,7 @@ class Knobs:
         self.scene = model.scene
         self.background = model.background.cpu()
         self.options = replace(BakeOptions(), drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
-        cameras = pipeline.datamanager.undistorted_train_cameras()
+        cameras = pipeline.datamanager.train_dataset.cameras
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
         self.has_learned = isinstance(self.scene.field, TexelField)

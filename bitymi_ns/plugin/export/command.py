@@ -161,7 +161,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
-        cameras = datamanager.undistorted_train_cameras()
+        cameras = datamanager.train_dataset.cameras
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
         shown = preview(model, first, "JPEG" if self._is_compact else "PNG")

@@ -127,7 +127,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
         _, pipeline = load_trained(config, step)
     model, datamanager = pipeline.model, pipeline.datamanager
-    cameras = datamanager.undistorted_train_cameras()
+    cameras = datamanager.train_dataset.cameras
     train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     checks = [check_view_color(bundle, model.scene.surfels, train)]
     if isinstance(model.scene.field, HashField):

@@ -17,7 +17,7 @@ from torch.nn import Parameter
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
-from bitymi_ns.plugin.data.point_cloud import reporting_time
+from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.run.callbacks import TrainingRun
 from bitymi_ns.plugin.run.checkpoints import STATE_VERSION
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig

@@ -10,9 +10,8 @@ from functools import partial
 from importlib import resources
 from pathlib import Path
 
-from bitymi_ns.bundle.folder import files_of
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, files_of, is_known, left_out, parts_of, passed_on
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.single import joined
 from bitymi_ns.files import complete_folder

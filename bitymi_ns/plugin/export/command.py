@@ -18,10 +18,10 @@ import yaml
 from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
-from bitymi_ns.bundle.folder import CONFIG
 from bitymi_ns.bundle.manifest import MANIFEST, dump
+from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.interchange import Frame, Kind, check_extras, described, place_of, write_extras
+from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.export.cameras import camera_files
@@ -98,7 +98,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             with reserve_bundle(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
-                    check_extras(self.extras, place_of(self.output_dir), self.overwrite)
+                    check_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
                 if self.check_room:
                     check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
                 self._run(bake_options)
@@ -222,7 +222,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
         """Beside the bundle, which is complete already; says what was written."""
-        folder = place_of(self.output_dir)
+        folder = extras_folder(self.output_dir)
         with rich_progress() as progress:
             written = write_extras(
                 bundle,
@@ -235,7 +235,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 progress=progress,
             )
         for each in written.values():
-            say(f"In {folder}: {described(each)}")
+            say(f"In {folder}: {summary_line(each)}")
 
 
 def default_export() -> ExportAtlas:

@@ -17,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from bitymi_ns.bake.verify import check_field, check_view_color
-from bitymi_ns.bundle import Bundle, Check, check_place
+from bitymi_ns.bundle import Bundle, Check, check_world
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
@@ -141,7 +141,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         detail += "" if stated is None else f" (stated {stated:.2f})"
         detail += f"; against the photographs {photos:+.3f} dB"
         checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
-    return [*checks, check_place(bundle.info.world, world_of(datamanager))]
+    return [*checks, check_world(bundle.info.world, world_of(datamanager))]
 
 
 def find_run(run: Path) -> tuple[Path, int | None]:

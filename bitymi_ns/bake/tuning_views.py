@@ -13,8 +13,7 @@ from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.ops import Fragments, Projection, TexelDescent, blended_image, fitting_lists, select, view_color
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.losses import numbers, photometric
-from bitymi_ns.train.memory import MemoryBudget
-from bitymi_ns.train.views import View, shown
+from bitymi_ns.train.views import MemoryBudget, View, shown
 
 LEAST_KEPT = 1 / 8
 """Share of the views that fits where any are kept: of fewer, the memory is worth more than the time that they save."""

@@ -18,9 +18,8 @@ from bitymi_ns.scene import scene as scene_module
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.memory import MemoryBudget
 from bitymi_ns.train.score import multi_view_scores
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import MemoryBudget, View
 from tests.bake.test_tune import BACKGROUND, cameras
 from tests.scene import bands
 

@@ -16,8 +16,7 @@ from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tuning_views import TuningView, TuningViews
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.memory import MemoryBudget
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import MemoryBudget, View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 OPTIONS = TuneOptions(steps=60, rate=0.3, val_every=4, coded_steps=0)

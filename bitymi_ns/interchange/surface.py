@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 
 HALF = 0.5
 """Accumulated weight at which the median depth is reached."""
-TRUNCATION = 4.0
-"""Truncation distance of the TSDF in voxels."""
+TRUNCATION = 8.0
+"""Truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes."""
+SMOOTHING = 10
+"""Iterations of Taubin smoothing, which takes the noise of depths and keeps volumes."""
 QUANTILE = 0.01
 """Share of the observed points that the box leaves out at each of its sides."""
 REACH = 3.0
@@ -53,7 +55,7 @@ class SurfaceOptions:
         watertight: close the mesh by a Poisson reconstruction from its vertices and normals.
     """
 
-    resolution: int = 384
+    resolution: int = 256
     triangles: int = 500_000
     watertight: bool = False
 
@@ -223,6 +225,7 @@ def _finished(
     if options.triangles and len(mesh.triangles) > options.triangles:
         mesh = mesh.simplify_quadric_decimation(options.triangles)
         progress("simplifying", 1, 1)
+    mesh = mesh.filter_smooth_taubin(SMOOTHING)
     mesh.remove_degenerate_triangles()
     mesh.remove_unreferenced_vertices()
     mesh.compute_vertex_normals()

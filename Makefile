@@ -1,6 +1,6 @@
 # make setup   virtual environment, pinned dependencies, compiled extension
 # make demo    train, bake and evaluate the sample scene (or DATA=folder or video) into demo/
-# make test    the test suite
+# make test    the test suite, by WORKERS processes (as many as there are processors, at most 8)
 # make bench   quality, speed, size and stability on the demo scene and on your captures, with a report (hours; training
 #              and baking resume): make bench DATA="folder folder ..." [STEPS=1200] [SEEDS="0 1"]
 #              [METHODS="bitymi bitymi-quality"] [PLANS="atlas overdraw"]
@@ -27,6 +27,7 @@ METHODS ?= bitymi bitymi-quality
 PLANS  ?= atlas overdraw
 WORK   ?= outputs/bench
 CLANG  ?= clang++
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n < 8 ? n : 8)))
 TESTS  ?= tests/ops tests/stress tests/scene
 
 TORCH       := torch==2.13.0
@@ -88,8 +89,12 @@ $(VENV)/.stamp-build: $(VENV)/.stamp-deps CMakeLists.txt $(wildcard cmake/*.cmak
 demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash scripts/demo.sh $(if $(DATA),"$(DATA)")
 
+# A worker of pytest per processor, each with one thread: files of tests beside each other, the slow ones first. Fixtures
+# of a file are made once, as it stays with one worker. Tests of threads set their number themselves. Rewritten tests
+# and the package are compiled once, not by every process that tests start, hence bytecode is written.
 test: setup web-test
-	BITYMI_TESTS_REQUIRE=emulated $(BIN)/python -m pytest -q
+	BITYMI_TESTS_REQUIRE=emulated OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q \
+	  -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # npm records in node_modules what it installed from which lock file.
 web/node_modules/.package-lock.json: web/package-lock.json

@@ -15,7 +15,7 @@ import pytest
 import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
-ORDER = ["ops", "scene", "codec", "train", "bake", "bundle", "interchange", "view", "plugin", "measure"]
+ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "view", "plugin", "measure"]
 BESIDE = ["files", "interpreter", "ply", "presets", "progress", "sample", "capture", "trust"]
 """ORDER has the innermost first. These stand beside them and import none of them."""
 KNOW_NERFSTUDIO = ("plugin", "host", "measure/knobs.py", "measure/pictures.py")
@@ -112,6 +112,15 @@ def late():
         ("bitymi_ns.plugin.run.model", False),
         ("bitymi_ns.train.fit", False),
     }
+
+
+def test_reading_a_bundle_loads_neither_the_bake_nor_the_training() -> None:
+    code = (
+        "import sys; from bitymi_ns.bundle import check_files, read_bundle, write_bundle; "
+        "print([m for m in sys.modules if m.startswith(('bitymi_ns.bake', 'bitymi_ns.train'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_a_scene_can_be_built_and_trained_without_nerfstudio() -> None:

@@ -9,18 +9,24 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, set_aside
-from bitymi_ns.bake.methods import Tiles
-from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.statistics import Rounding, ViewColorError
 from bitymi_ns.bake.texel_scene import TexelScene
+from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
-from bitymi_ns.codec.codes import Codes
+from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec.packing import pack
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.codec.surfel_codes import code_surfels
-from bitymi_ns.codec.texel_codes import RESIDUAL_STEP, TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
+from bitymi_ns.codec.texel_codes import (
+    RESIDUAL_STEP,
+    SceneCodes,
+    TexelCodeOptions,
+    TexelCoder,
+    TexelCodes,
+    residual_codes,
+)
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.views import View
@@ -156,7 +162,7 @@ class Coder:
             moved = self._tiles.rows_of(order)
             texels, weights = self._texels[moved], self._weights[moved]
             pages = paged_texels(texels, packing)
-        kept = Codes(
+        kept = SceneCodes(
             codes, None, residual_codes(residual), RESIDUAL_STEP, baked.options.page_width, baked.options.page_rows
         )
         in_front = None if baked.in_front is None else baked.in_front[order]

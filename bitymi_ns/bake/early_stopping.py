@@ -8,7 +8,7 @@ from typing import Generic, Protocol, TypeVar
 
 from torch import Tensor
 
-from bitymi_ns.bake.statistics import FineTuning, Gain
+from bitymi_ns.bundle.statistics import FineTuning, Gain
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.losses import mean_psnr, psnr
 

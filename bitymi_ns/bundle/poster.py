@@ -12,7 +12,6 @@ from PIL import Image, features
 
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import as_bytes
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -32,7 +31,7 @@ def draw_poster(scene: BakedScene, camera: Camera, background: Sequence[float]) 
     view = camera.to("cpu").scaled(min(1.0, SIDE / max(camera.width, camera.height)))
     with torch.no_grad():
         rgb = scene.render(view, torch.tensor(background, dtype=torch.float32)).rgb
-    return as_bytes(rgb).numpy()
+    return (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 
 def most_bytes(scene: int) -> int:

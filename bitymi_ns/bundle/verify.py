@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,34 +9,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.certificate import marks, marks_of, measured_rms
-from bitymi_ns.bake.errors import tile_errors
-from bitymi_ns.bake.field.plan import Field
-from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.lean_color import centers_of, view_color_errors
-from bitymi_ns.bake.methods import bake_method
-from bitymi_ns.bake.options import STEPS, BakeOptions
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldFrame
 from bitymi_ns.bundle.parts import Parts, parts_of
 from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
+from bitymi_ns.bundle.sketch import estimated_rms, sketch, sketches_of
 from bitymi_ns.bundle.write import World
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import listed_texels
+from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.field import HashField
-from bitymi_ns.scene.tile_sizes import kernel_parameters
-from bitymi_ns.scene.visibility import visibility
 
-_SLACK = 1.02  # sums in another order, rotations that were written with length 1
-_SLACK_STEPS = 0.02
-_SLACK_COUNT = 2
-"""Surfels at the bound itself."""
+SLACK_STEPS = 0.02
+"""8-bit steps by which a measured error may exceed the stated one."""
 _SLACK_CODES = 4.0
-"""8-bit codes by which a mark may differ: what a transform leaves between two codes, processors round either way."""
-_SLACK_MARKS = 1.4
-"""The square that marks tell is within 1.96 times the true one: 7 standard deviations."""
+"""8-bit codes by which a sum of a sketch may differ: processors round values between two codes either way."""
+_SLACK_SKETCH = 1.4
+"""The square that sketches estimate is within 1.96 times the true one: 7 standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +75,13 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
     return bundle, [*checks, _tiles(bundle), _statements(bundle), *check_certificate(bundle)]
 
 
-def _real_world(place: Place) -> str:
+def _real_world(place: WorldFrame) -> str:
     """What is stated of up and of lengths."""
     text = "" if place.up is None else f", up ({', '.join(f'{x:.3f}' for x in place.up)}) by {place.up_from}"
     return text + ("" if place.metres_per_unit is None else f", {place.metres_per_unit:.4g} m per unit")
 
 
-def check_place(stated: Place, world: World) -> Check:
+def check_world(stated: WorldFrame, world: World) -> Check:
     """Compares what a bundle states of its place in the capture's frame and in the real world with that of its run.
 
     Args:
@@ -118,19 +106,19 @@ def check_certificate(bundle: Bundle) -> list[Check]:
         return []
     worst, count = stated.worst, stated.within + stated.beyond
     detail = f"{stated.within:,} of {count:,} surfels within {stated.tolerance:g} steps of the {stated.against} as seen"
-    detail += f", at most {_steps(worst)}"
+    detail += f", at most {steps_text(worst)}"
     if count > len(bundle) or (worst is not None and (worst > stated.tolerance) != (stated.beyond > 0)):
         return [Check("certificate", False, f"{detail}: these numbers contradict each other")]
     if stated.marks is None or stated.texel_rms is None or atlas is None:
         return [Check("certificate", True, detail)]
     scene = bundle.scene
-    before, stored = marks_of(stated.marks)
+    before, stored = sketches_of(stated.marks)
     texels = scene_texels(scene)
     code = atlas.scale / STEPS
     allowed = _SLACK_CODES * code * max(1.0, (len(texels) / 1e6) ** 0.5)
-    same = bool(np.abs(marks(texels) - stored).max() <= allowed)
-    found = measured_rms(texels, before)
-    near = found <= _SLACK_MARKS * stated.texel_rms + _SLACK_STEPS
+    same = bool(np.abs(sketch(texels) - stored).max() <= allowed)
+    found = estimated_rms(texels, before)
+    near = found <= _SLACK_SKETCH * stated.texel_rms + SLACK_STEPS
     detail += f"; texels {found:.2f} steps from those before they were stored (stated {stated.texel_rms:.2f})"
     detail += "" if same else "; these are not those that were measured"
     return [Check("certificate", same and near, detail)]
@@ -144,89 +132,7 @@ def scene_texels(scene: BakedScene) -> Tensor:
     return listed_texels(scene.residuals(), packing, scene.mean_residual)
 
 
-def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Check:
-    """Measures the stored tiles against the field anew, and compares with the error that bundle.json states.
-
-    Args:
-        bundle: what `check_files` read.
-        field: the residual field of the scene that was baked.
-        cameras: its training views.
-    """
-    name, statistics, render = "error against the field", bundle.info.statistics, bundle.info.render
-    stated = statistics.error
-    if stated is None:
-        return Check(name, True, "not stated: the texels were changed after the bake")
-    if statistics.field is not None and isinstance(field, HashField):
-        first, count = statistics.field.kept
-        if first + count > field.levels:
-            return Check(name, False, f"levels {first} to {first + count - 1} stated, the field has {field.levels}")
-        field = field.only(first, count)
-    options = statistics.options or BakeOptions()
-    inputs = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
-    plan = bake_method(options).plan(field, inputs.looked_at(options))
-    tiled = bundle.scene.tiles[:, 3] > 0
-    plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
-    residuals = None if bundle.scene.atlas is None else bundle.scene.residuals().numpy()
-    found = tile_errors(field, plan, bundle.scene.tiles.numpy(), bundle.scene.mean_residual, residuals)
-    lines, ok = [], True
-    for what, measured, bound in (("rms", found.rms, stated.rms.p100), ("largest", found.largest, stated.largest.p100)):
-        largest = float(measured.amax())
-        ok &= bound is not None and largest <= bound * _SLACK + _SLACK_STEPS
-        lines.append(f"{what} {largest:.3f} (stated {_steps(bound)})")
-    certificate = statistics.certificate
-    if certificate is not None:
-        again = found.certificate(certificate.tolerance)
-        assert again is not None
-        ok &= certificate.worst is not None and again.worst <= certificate.worst * _SLACK + _SLACK_STEPS
-        ok &= again.beyond <= certificate.beyond * _SLACK + _SLACK_COUNT
-        lines.append(f"as seen {again.beyond:,} beyond {certificate.tolerance:g} (stated {certificate.beyond:,})")
-    return Check(name, ok, ", ".join(lines) + " steps")
-
-
-def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
-    """Measures lean view colours against the trained ones anew, and compares with the error that bundle.json states.
-
-    Args:
-        bundle: what `check_files` read.
-        surfels: per-surfel parameters of the scene that was baked; a surfel of the bundle is found by its geometry.
-        cameras: its training views.
-    """
-    name = "error of the view colours"
-    if "view_terms" not in bundle.scene.surfels:
-        return Check(name, True, "none: all of them are kept")
-    stated = bundle.info.statistics.view_color
-    if stated is None:
-        return Check(name, True, "not stated")
-    if bundle.info.statistics.polish is not None and bundle.info.statistics.polish.steps:
-        return Check(name, True, "not measured: the surfels learned after the bake and are those of no run")
-    if bundle.info.statistics.rounding is not None:
-        return Check(name, True, "not measured: the surfels were rounded after it, for a compact bundle")
-    trained = {name: value.detach().float().cpu() for name, value in surfels.items()}
-    places = {key: row for row, key in enumerate(_keys(trained))}
-    rows = [places.get(key) for key in _keys(bundle.scene.surfels)]
-    if None in rows:
-        return Check(name, False, f"surfel {rows.index(None)} is none of the trained scene")
-    trained = {name: value[torch.tensor(rows)] for name, value in trained.items()}
-    means, render = bundle.scene.surfels["means"], bundle.info.render
-    seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
-    if cameras:
-        views = visibility(trained, cameras, render.near, through_pixel=bundle.scene.through_pixel)
-        seen, transmittance = views.seen, views.in_front
-    opacity, _ = kernel_parameters(trained, transmittance)
-    at = (means, seen, centers_of(cameras, means), opacity)
-    found = float(view_color_errors(bundle.scene.view_color, trained, bundle.scene.surfels, *at).amax())
-    bound = stated.error.p100
-    ok = bound is not None and found <= bound * _SLACK + _SLACK_STEPS
-    return Check(name, ok, f"largest {found:.3f} (stated {_steps(bound)}, tolerance {stated.tolerance:g}) steps")
-
-
-def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
-    """The numbers of every surfel that a bundle holds bit for bit."""
-    parts = [surfels["means"], surfels["log_scales"], surfels["opacity_logits"][:, None], surfels["beta_raw"][:, None]]
-    return [row.tobytes() for row in torch.cat(parts, dim=1).numpy()]
-
-
-def _steps(error: float | None) -> str:
+def steps_text(error: float | None) -> str:
     return "not as a number" if error is None else f"{error:.3f}"
 
 
@@ -277,7 +183,7 @@ def _statements(bundle: Bundle) -> Check:
     error = statistics.error
     detail = "agree with the files"
     if error is not None:
-        detail += f"; error of a tile at most {_steps(error.rms.p100)} steps, tolerance {error.tolerance:g}"
+        detail += f"; error of a tile at most {steps_text(error.rms.p100)} steps, tolerance {error.tolerance:g}"
     if lean is not None:
-        detail += f"; of a view colour at most {_steps(lean.error.p100)}, tolerance {lean.tolerance:g}"
+        detail += f"; of a view colour at most {steps_text(lean.error.p100)}, tolerance {lean.tolerance:g}"
     return Check("statistics", True, detail)

@@ -7,16 +7,14 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from bitymi_ns import __version__
-from bitymi_ns.bake.pipeline import Baked, Codes
 from bitymi_ns.bundle import compact, ktx2, ply
-from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,
@@ -34,7 +32,9 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
+from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
+from bitymi_ns.bundle.statistics import Statistics
 from bitymi_ns.bundle.surfel_table import (
     EXTENT_COLUMN,
     TERMS,
@@ -44,6 +44,7 @@ from bitymi_ns.bundle.surfel_table import (
 )
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
+from bitymi_ns.codec.texel_codes import SceneCodes
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
@@ -74,7 +75,7 @@ class World:
     metres_per_unit: float | None = None
 
     def described(self) -> dict[str, Any]:
-        """`manifest.Place`: up and length in the scene's own frame."""
+        """`manifest.WorldFrame`: up and length in the scene's own frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
         place: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:
@@ -84,6 +85,25 @@ class World:
             stretch = abs(float(np.linalg.det(transform[:, :3]))) ** (1 / 3) * float(self.scale)
             place["metres_per_unit"] = float(self.metres_per_unit) / stretch
         return place
+
+
+class Baked(Protocol):
+    """The part of `bake.Baked` that is written."""
+
+    scene: BakedScene
+    atlas: EncodedAtlas | None
+    codes: SceneCodes | None
+    statistics: Statistics
+
+    @property
+    def mean_residual(self) -> torch.Tensor:
+        """[N, 3] mean of every tile; the residual of a surfel without a tile."""
+
+    def encoded(self) -> Baked:
+        """Quantise and encode the texels, where that is not done."""
+
+    def stored(self) -> BakedScene:
+        """Scene with its texels as a bundle has them."""
 
 
 def export(
@@ -125,7 +145,7 @@ def write_bundle(
     folder: str | Path,
     scene: BakedScene,
     atlas: EncodedAtlas | None = None,
-    codes: Codes | None = None,
+    codes: SceneCodes | None = None,
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     world: World | None = None,
@@ -204,14 +224,14 @@ def write_surfels(path: Path, scene: BakedScene) -> None:
     ply.write_ply(path, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
 
 
-def _compact_parts(codes: Codes, info: dict[str, Any]) -> dict[str, bytes]:
+def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """The two files of a compact bundle; their description goes into `info`."""
-    of_surfels, surfels = compact.pack_surfels(codes.surfels, codes.residual, codes.residual_step)
+    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
     info["version"] = f"{VERSION[0]}.{VERSION[1]}"
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
-        of_texels, parts[TEXELS] = compact.pack_texels(codes.texels)
+        of_texels, parts[TEXELS] = compact.encode_texels(codes.texels)
         pages = {"page_width": codes.page_width, "page_rows": codes.page_rows}
         info["atlas"] |= {"file": TEXELS, "format": "dct", **pages, **of_texels}
         info["atlas"].pop("extent_column")

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
-from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import paged_texels, size_classes
+from bitymi_ns.codec.pages import size_classes
+from bitymi_ns.codec.surfel_codes import SurfelCodes
 
 BLOCK = 8
 """Tiles are transformed in blocks of at most so many texels along a side."""
@@ -132,7 +132,7 @@ class TexelCodes:
 
     def nbytes(self, level: int = streams.LEVEL) -> int:
         """Bytes of texels.bin."""
-        return sum(len(streams.pack(column, level).data) for column in self.columns.values())
+        return sum(len(streams.compress(column, level).data) for column in self.columns.values())
 
     @property
     def constants(self) -> Tensor:
@@ -164,6 +164,26 @@ def residual_codes(values: Tensor, step: float = RESIDUAL_STEP) -> npt.NDArray[n
     """[N, 3] integers of residuals."""
     r, g, b = np.rint(values.double().numpy() / step).astype(np.int64).T
     return np.stack([g, r - g, b - g], axis=1)
+
+
+@dataclass(frozen=True)
+class SceneCodes:
+    """Surfels and texels of a compact bundle as integers.
+
+    Attributes:
+        surfels: of N surfels.
+        texels: of their tiles; None without tiles, or before they are coded.
+        residual: [N, 3] int64 mean residuals: green, red - green, blue - green.
+        residual_step: of these, colour units.
+        page_width, page_rows: arguments of `packing.pack`.
+    """
+
+    surfels: SurfelCodes
+    texels: TexelCodes | None
+    residual: npt.NDArray[np.int64]
+    residual_step: float
+    page_width: int
+    page_rows: int
 
 
 class TexelCoder:
@@ -238,11 +258,6 @@ class TexelCoder:
             values = torch.sign(values) * (values.abs() - price).clamp(min=0)
             values[:, 0, 0] = mean
         return values
-
-
-def pages(codes: TexelCodes, packing: Packing) -> Tensor:
-    """[layers, height, width, 3] float32 residual colours where the tiles lie; 0 elsewhere."""
-    return paged_texels(codes.texels(), packing)
 
 
 def _steps(step: float, grades: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What each quality knob costs and saves: error against the exact setting, beside milliseconds and bytes."""
+"""Cost and saving of each quality knob: error against the exact setting, beside milliseconds and bytes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, baked_and_reduced, rich_progress
-from bitymi_ns.bake.options import STEPS
-from bitymi_ns.measure.bench.machine import commit, machine, versions
+from bitymi_ns.codec.quantise import STEPS
+from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.errors import fail, say
@@ -169,7 +169,7 @@ class Knobs:
         self.scene = model.scene
         self.background = model.background.cpu()
         self.options = replace(BakeOptions(), drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
-        cameras = pipeline.datamanager.undistorted_train_cameras()
+        cameras = pipeline.datamanager.train_dataset.cameras
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
         self.has_learned = isinstance(self.scene.field, TexelField)

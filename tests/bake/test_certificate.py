@@ -14,13 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn
-from bitymi_ns.bake.certificate import certified, marks, marks_of, marks_text, measured_rms, texel_rms
+from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.errors import listed_errors
-from bitymi_ns.bake.field.footprint import averaged, cells_per_pixel, closest_pixels
-from bitymi_ns.bake.field.plan import Shown
-from bitymi_ns.bake.statistics import MARKS, Certificate
-from bitymi_ns.bundle import check_field, check_files, export
+from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, closest_pixels, listed_errors
+from bitymi_ns.bake.tiles import Shown
+from bitymi_ns.bake.verify import check_field
+from bitymi_ns.bundle import check_files, export
+from bitymi_ns.bundle.sketch import SIZE, estimated_rms, sketch, sketches_of, sketches_text
+from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.scene.visibility import visibility
 from tests.bake.test_tune import BACKGROUND, photographs, waving
 from tests.bundle.damage import amend
@@ -115,21 +116,22 @@ def test_the_counts_are_true(seed: int, size: float) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 400), st.booleans())
-def test_marks_tell_how_far_texels_are(seed: int, count: int, few: bool) -> None:
+def test_sketches_estimate_the_distance_of_texels(seed: int, count: int, few: bool) -> None:
     generator = torch.Generator().manual_seed(seed)
     before = torch.randn(count, 3, generator=generator)
     change = torch.randn(count, 3, generator=generator)
     if few:  # one number alone
         change[1:] = 0.0
     stored = before + 0.02 * change
-    two = marks_of(marks_text(before, stored))
-    assert two.shape == (2, MARKS) and np.abs(two[1] - marks(stored)).max() < 1e-4
-    assert measured_rms(stored, two[0]) == pytest.approx(texel_rms(stored, before), rel=0.55, abs=1e-3)
+    two = sketches_of(sketches_text(before, stored))
+    assert two.shape == (2, SIZE) and np.abs(two[1] - sketch(stored)).max() < 1e-4
+    exact = 255 * float((stored - before).double().square().mean().sqrt())
+    assert estimated_rms(stored, two[0]) == pytest.approx(exact, rel=0.55, abs=1e-3)
 
 
-def test_marks_are_the_same_everywhere() -> None:
-    found = marks(torch.arange(300.0).view(100, 3))
-    assert found[:4].tolist() == EXPECTED and marks(torch.zeros(0, 3)).tolist() == [0.0] * MARKS
+def test_sketches_are_the_same_everywhere() -> None:
+    found = sketch(torch.arange(300.0).view(100, 3))
+    assert found[:4].tolist() == EXPECTED and sketch(torch.zeros(0, 3)).tolist() == [0.0] * SIZE
 
 
 EXPECTED = [-667.0, -141.0, -296.0, -144.0]

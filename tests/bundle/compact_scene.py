@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from bitymi_ns.bundle import write_bundle
-from bitymi_ns.codec.codes import Codes
 from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.codec.quantise import Range, encode
 from bitymi_ns.codec.surfel_codes import REFERENCE, code_surfels
-from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, pages
+from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodeOptions, TexelCoder
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
@@ -29,8 +29,8 @@ FINEST = {**REFERENCE, "place": 1e-9}
 
 def make_codes(
     kind: str = "sv", count: int = 12, textured: bool = True, steps: Mapping[str, float] = REFERENCE
-) -> Codes:
-    """Codes of random surfels, every fourth of which has no tile."""
+) -> SceneCodes:
+    """SceneCodes of random surfels, every fourth of which has no tile."""
     params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
     params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
     params |= lean_parameters(kind, count, torch.float32)
@@ -40,10 +40,10 @@ def make_codes(
     generator = torch.Generator().manual_seed(0)
     texels = torch.rand(int(sizes.clamp(min=1).prod(1).sum()), 3, generator=generator) - 0.5
     coded = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions()).code(texels)
-    return Codes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192)
+    return SceneCodes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192)
 
 
-def scene_of(codes: Codes) -> BakedScene:
+def scene_of(codes: SceneCodes) -> BakedScene:
     """The scene that the codes stand for, without its atlas."""
     packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
     assert EXTENTS[0] < 3.0 < EXTENTS[1]
@@ -56,10 +56,10 @@ def scene_of(codes: Codes) -> BakedScene:
     )
 
 
-def write_compact(folder: Path, codes: Codes, **options) -> Path:
+def write_compact(folder: Path, codes: SceneCodes, **options) -> Path:
     """Writes it as a bundle."""
     atlas = None
     if codes.texels is not None:
         packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
-        atlas = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
+        atlas = encode(paged_texels(codes.texels.texels(), packing).numpy(), packing, "uint8", RANGE)
     return write_bundle(folder, scene_of(codes), atlas, codes, **options)

@@ -17,9 +17,8 @@ from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.bundle.sizes import least_memory
 from bitymi_ns.cli import main
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import coverage
+from bitymi_ns.codec.pages import covered_blocks, paged_texels
 from bitymi_ns.codec.quantise import encode
-from bitymi_ns.codec.texel_codes import pages
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import FINEST, RANGE, make_codes, scene_of, write_compact
@@ -46,7 +45,7 @@ def test_a_compact_bundle_holds_what_its_codes_stand_for(tmp_path: Path, kind: s
     assert torch.equal(got.extent[tiled], want.extent[tiled])
     if textured:
         packing = pack(codes.surfels.sizes, 4096, 8192)
-        stored = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
+        stored = encode(paged_texels(codes.texels.texels(), packing).numpy(), packing, "uint8", RANGE)
         assert got.atlas.numpy().tobytes() == b"".join(stored.payload)
         torch.testing.assert_close(got.mean_residual, codes.texels.constants)
 
@@ -63,7 +62,7 @@ def test_places_may_need_every_bit_of_their_grid(tmp_path: Path, count: int) -> 
 def test_it_says_how_large_the_scene_was_photographed(tmp_path: Path) -> None:
     codes, points = make_codes(), torch.tensor([[0.0, 1.0, -2.5, 30.0]])
     packing = pack(codes.surfels.sizes, 4096, 8192)
-    atlas = encode(pages(codes.texels, packing).numpy(), packing, "uint8", RANGE)
+    atlas = encode(paged_texels(codes.texels.texels(), packing).numpy(), packing, "uint8", RANGE)
     write_bundle(tmp_path / "b", replace(scene_of(codes), photographed=points), atlas, codes)
     assert torch.equal(read_bundle(tmp_path / "b").scene.photographed, points)
 
@@ -99,7 +98,7 @@ def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path:
 def pixels_of(tiles: torch.Tensor, atlas: torch.Tensor) -> torch.Tensor:
     """Which texels of pages belong to a tile: [layers, height, width] bool."""
     layers, height, width = atlas.shape[:3]
-    owned = torch.from_numpy(coverage(tiles.numpy(), width, height, layers))
+    owned = torch.from_numpy(covered_blocks(tiles.numpy(), width, height, layers))
     return owned.repeat_interleave(4, 1).repeat_interleave(4, 2)
 
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bundle import check_field, check_files, check_view_color, export
+from bitymi_ns.bake.verify import check_field, check_view_color
+from bitymi_ns.bundle import check_files, export
 from bitymi_ns.cli import main
 from tests.bundle.damage import amend, change_columns
 

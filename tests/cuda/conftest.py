@@ -1,4 +1,4 @@
-"""Every test here runs on the CUDA kernels twice: thread by thread on the host, and on a card where there is one."""
+"""Run every test on the CUDA kernels: thread by thread on the host, and on a card where there is one."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import torch
 
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import emulated_cuda
-from tests.required import skip_without
+from tests.required import REQUIRED, skip_without
 
 
 def why_not_on_a_card() -> str | None:
-    """Why tests cannot run on a card here; None when they can."""
+    """Return why tests cannot run on a card here, None when they can."""
     if not torch.cuda.is_available():
         return "no CUDA device (or torch without CUDA)"
     try:
@@ -25,7 +25,7 @@ def why_not_on_a_card() -> str | None:
 
 
 def why_not_emulated() -> str | None:
-    """Why tests cannot run on the host's emulation; None when they can."""
+    """Return why tests cannot run on the host's emulation, None when they can."""
     try:
         from bitymi_ns import _emulated  # noqa: F401
     except ImportError:
@@ -33,9 +33,12 @@ def why_not_emulated() -> str | None:
     return None
 
 
-@pytest.fixture(params=["emulated", "card"])
+CARD = ["card"] if torch.cuda.is_available() or "card" in REQUIRED else []
+
+
+@pytest.fixture(params=["emulated", *CARD])
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
-    """A device whose tensors go to the CUDA kernels."""
+    """Yield a device whose tensors go to the CUDA kernels."""
     reason = why_not_emulated() if request.param == "emulated" else why_not_on_a_card()
     if reason:
         skip_without(request.param, reason)

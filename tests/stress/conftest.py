@@ -1,16 +1,19 @@
-"""Every test that takes `backend` runs on all of them; a new one is one entry of BACKENDS."""
+"""Run every test that takes `backend` on all backends, on a card where there is one; a new one is a BACKENDS entry."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
+import torch
 
-from bitymi_ns.measure.stability.backends import BACKENDS, Backend, missing
-from tests.required import skip_without
+from bitymi_ns.measure.stability.errors import BACKENDS, Backend, missing
+from tests.required import REQUIRED, skip_without
+
+NAMES = sorted(name for name in BACKENDS if name != "cuda" or torch.cuda.is_available() or "cuda" in REQUIRED)
 
 
-@pytest.fixture(params=sorted(BACKENDS))
+@pytest.fixture(params=NAMES)
 def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
     chosen = BACKENDS[request.param]
     if why := missing(chosen):

@@ -1,13 +1,16 @@
-"""A headless Chromium, for tests."""
+"""A headless Chromium, which the tests of a process share; each has a context of its own."""
 
 from __future__ import annotations
 
+import atexit
 import json
+import select
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -21,10 +24,33 @@ MODULES = HERE.parents[1] / "web" / "node_modules"
 
 @dataclass
 class Outcome:
-    """What the steps gave, and what the page complained of."""
+    """Results of the steps, and the errors on the page's console."""
 
     results: list[Any]
     problems: list[str]
+
+
+@lru_cache(maxsize=1)
+def driver() -> subprocess.Popen[str]:
+    """Start drive.mjs, which ends with this process; skip the test where there is no browser."""
+    node, chromium = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
+    if node is None or chromium is None:
+        skip_without("browser", "no node or no chromium: apt install nodejs chromium")
+    if not (MODULES / "playwright-core").is_dir():
+        skip_without("browser", "web/node_modules is missing: make web-test")
+    command = [node, str(HERE / "drive.mjs"), str(MODULES), chromium]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
+
+    def end() -> None:
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+    atexit.register(end)
+    return process
 
 
 def drive(
@@ -35,12 +61,9 @@ def drive(
     ratio: float = 1.0,
     patience: float = 90.0,
 ) -> Outcome:
-    """Runs steps of drive.mjs; skips the test where there is no browser."""
-    node, chromium = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
-    if node is None or chromium is None:
-        skip_without("browser", "no node or no chromium: apt install nodejs chromium")
-    if not (MODULES / "playwright-core").is_dir():
-        skip_without("browser", "web/node_modules is missing: make web-test")
+    """Run steps of drive.mjs in a new page; `patience`: seconds that one step may take."""
+    process = driver()
+    assert process.stdin is not None and process.stdout is not None
     job = {
         "steps": [[str(x) if isinstance(x, Path) else x for x in step] for step in steps],
         "viewport": {"width": viewport[0], "height": viewport[1]},
@@ -49,18 +72,21 @@ def drive(
         "ratio": ratio,
         "patience": patience,
     }
-    command = [node, str(HERE / "drive.mjs"), str(MODULES), chromium]
-    done = subprocess.run(
-        command, input=json.dumps(job), capture_output=True, text=True, timeout=max(400, 3 * patience), check=False
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    process.stdin.write(json.dumps(job) + "\n")
+    ready = select.select([process.stdout], [], [], max(400, 3 * patience))[0]
+    line = process.stdout.readline() if ready else ""
+    if not line:
+        process.kill()
+        driver.cache_clear()
+        raise AssertionError("the browser does not answer")
+    found = json.loads(line)
+    assert "error" not in found, found["error"]
     return Outcome(found["results"], found["problems"])
 
 
 @contextmanager
 def served(site: Site) -> Iterator[str]:
-    """The address of a server in a thread of this process."""
+    """Serve a site from a thread of this process; yields its address."""
     server = serve(site)
     thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
     thread.start()

@@ -1,26 +1,18 @@
-// Drives a headless Chromium through steps, given as JSON on standard input; the results go to standard output.
-import { readFileSync } from 'node:fs';
+// Drives one headless Chromium: each line of standard input is a job in JSON, its steps run in a page of a new context,
+// and one line of standard output answers it.
 import { createRequire } from 'node:module';
+import { createInterface } from 'node:readline';
 
 const [modules, chromium] = process.argv.slice(2);
 const playwright = createRequire(`${modules}/`)('playwright-core');
-const { steps, viewport, touch, scheme, ratio, patience } = JSON.parse(readFileSync(0, 'utf8'));
-const browser = await playwright.chromium.launch({
-  executablePath: chromium,
-  args: [
-    ...['--enable-unsafe-webgpu', '--no-sandbox', '--disable-quic', '--no-first-run', '--disable-gpu-watchdog'],
-    ...['--disable-background-networking', '--disable-component-update', '--disable-sync'],
-  ],
-});
-const context = await browser.newContext({
-  ...{ viewport, hasTouch: touch, isMobile: touch },
-  ...{ colorScheme: scheme, deviceScaleFactor: ratio },
-});
-context.setDefaultTimeout(1000 * patience);
-const page = await context.newPage();
-const problems = [];
-page.on('console', (message) => message.type() === 'error' && problems.push(message.text()));
-page.on('pageerror', (error) => problems.push(error.message));
+const launch = () =>
+  playwright.chromium.launch({
+    executablePath: chromium,
+    args: [
+      ...['--enable-unsafe-webgpu', '--no-sandbox', '--disable-quic', '--no-first-run', '--disable-gpu-watchdog'],
+      ...['--disable-background-networking', '--disable-component-update', '--disable-sync'],
+    ],
+  });
 
 // a function and no text, which the page's policy would not evaluate
 const settled = () => {
@@ -30,14 +22,14 @@ const settled = () => {
 
 const press = (selector) => document.querySelector(selector).click();
 
-// Keeps what is downloaded after something was done; its name.
-const saved = async (done, path) => {
+// Saves the download that an action starts; returns its name.
+const saved = async (page, done, path) => {
   const [download] = await Promise.all([page.waitForEvent('download'), done]);
   await download.saveAs(path);
   return download.suggestedFilename();
 };
 
-const actions = {
+const actionsOf = (context, page) => ({
   init: ([script]) => page.addInitScript(script),
   goto: async ([url]) => {
     await page.goto('about:blank');
@@ -77,16 +69,40 @@ const actions = {
     }
     await send('touchEnd', []);
   },
-  save: async ([selector, path]) => saved(page.evaluate(press, selector), path),
-  'save by key': async ([key, path]) => saved(page.keyboard.press(key), path),
+  save: async ([selector, path]) => saved(page, page.evaluate(press, selector), path),
+  'save by key': async ([key, path]) => saved(page, page.keyboard.press(key), path),
   shot: async ([path]) => void (await page.screenshot({ path })),
   ask: ([expression]) => page.evaluate(expression),
+});
+
+const run = async (browser, { steps, viewport, touch, scheme, ratio, patience }) => {
+  const context = await browser.newContext({
+    ...{ viewport, hasTouch: touch, isMobile: touch },
+    ...{ colorScheme: scheme, deviceScaleFactor: ratio },
+  });
+  context.setDefaultTimeout(1000 * patience);
+  const page = await context.newPage();
+  const [results, problems] = [[], []];
+  page.on('console', (message) => message.type() === 'error' && problems.push(message.text()));
+  page.on('pageerror', (error) => problems.push(error.message));
+  const actions = actionsOf(context, page);
+  for (const [action, ...args] of steps) results.push((await actions[action](args)) ?? null);
+  await context.close();
+  return { results, problems };
 };
 
-const results = [];
-try {
-  for (const [action, ...given] of steps) results.push((await actions[action](given)) ?? null);
-} finally {
-  await browser.close();
+let browser = null;
+for await (const line of createInterface({ input: process.stdin })) {
+  let answer;
+  try {
+    browser ??= await launch();
+    answer = await run(browser, JSON.parse(line));
+  } catch (error) {
+    // what a failed job leaves behind is not the next one's
+    await browser?.close();
+    browser = null;
+    answer = { error: String(error.stack ?? error) };
+  }
+  process.stdout.write(`${JSON.stringify(answer)}\n`);
 }
-process.stdout.write(JSON.stringify({ results, problems }));
+await browser?.close();

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.options import STEPS
-from bitymi_ns.bake.statistics import FieldLevels
+from bitymi_ns.bundle.statistics import FieldLevels
+from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field import field as evaluate
 from bitymi_ns.scene.field import HashField

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.options import BakeOptions
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.poster import most_bytes
 from bitymi_ns.plugin.errors import fail, say
 

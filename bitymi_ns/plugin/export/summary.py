@@ -9,8 +9,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from rich.table import Table
 
-from bitymi_ns.bake.statistics import FineTuning, Percentiles
 from bitymi_ns.bundle.manifest import Manifest
+from bitymi_ns.bundle.statistics import FineTuning, Percentiles
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.plugin.errors import say

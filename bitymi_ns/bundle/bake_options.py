@@ -1,0 +1,80 @@
+"""Options of the bake, which bundle.json states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bitymi_ns.codec.limits import EXTENTS
+from bitymi_ns.codec.packing import check_page
+from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, STEPS, Format, Profile, RangeRule, bc7_encoder
+from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.tile_sizes import check_sides
+
+
+@dataclass
+class BakeOptions:
+    """How the trained field becomes an atlas."""
+
+    format: Format = "bc7"
+    """Texel format: bc7 = 1 byte per texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
+    bc7_profile: Profile = "veryfast"
+    """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
+    r_min: int = 4
+    """Smallest tile side in texels, a power of two of at least 4."""
+    r_max: int = 64
+    """Largest tile side in texels, a power of two."""
+    extent: float = SUPPORT
+    """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
+    4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
+    tolerance: float = 0.75
+    """Largest error of the reduction, in 8-bit steps, weighted by what a fragment can contribute to a pixel. A tile
+    takes the smallest grid, or none, whose root mean square error over its visible part is within it. A view colour
+    keeps the fewest Spherical Voronoi sites, or one colour, whose largest error is within it, at the directions of the
+    training views that see the surfel and at others between and around them. (Other view colours keep all or one
+    colour.) 0: tile sizes by the Nyquist rule, and all of the view colours."""
+    local_voxel: bool = True
+    """Choose the size of a tile by the field's voxels where the surfel is; False: by the smallest voxel of the scene,
+    as in the paper (which also has an extent of 4)."""
+    cap_by_views: bool = True
+    """Give no tile more texels than pixels it covers in the training view that sees it largest."""
+    drop_unseen: bool = True
+    """Leave out surfels of which no training view blends a fragment (where views are given)."""
+    range: RangeRule = "sigma6"
+    """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
+    range_samples: int = 1 << 18
+    """Texels in the bootstrap sample that the range is chosen from."""
+    seed: int = 0
+    """Seed of that sample."""
+    page_width: int = 4096
+    """Width of an atlas page in texels, a power of two; small atlases get a narrower page."""
+    page_rows: int = 8192
+    """Largest height of an atlas page; phones and WebGPU stop at 8192."""
+    chunk: int = 1 << 18
+    """Texels evaluated at once."""
+
+    @property
+    def looks_at_views(self) -> bool:
+        """Whether what the training views see decides what is kept and how much an error counts."""
+        return self.drop_unseen or self.tolerance > 0
+
+    def check(self) -> None:
+        """Refuses values that the bake would stumble over later."""
+        if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
+            raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
+        if not 0 <= self.tolerance < STEPS:
+            raise ValueError(f"the tolerance must be from 0 to below {STEPS:g} steps, not {self.tolerance}")
+        for name in ("range_samples", "chunk"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.seed < 0:
+            raise ValueError(f"the seed must not be negative, it is {self.seed}")
+        check_sides(self.r_min, self.r_max)
+        check_page(self.page_width, self.page_rows)
+        if self.r_max > self.page_width or self.page_rows % self.r_max:
+            raise ValueError(
+                f"tiles of r_max = {self.r_max} texels do not fit pages of {self.page_width} x {self.page_rows} texels"
+            )
+        if self.format not in BYTES_PER_TEXEL:
+            raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {self.format!r}")
+        if self.format == "bc7":
+            bc7_encoder(self.bc7_profile)

@@ -1,0 +1,244 @@
+"""What the bake left out and what that cost: the one description, from the bake to bundle.json and back.
+
+Every part may lack what an earlier version did not state, and keeps keys that it does not know.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_serializer
+from torch import Tensor
+
+from bitymi_ns.bundle.bake_options import BakeOptions
+
+_LARGEST = 1e12
+_P = TypeVar("_P", bound="Part")
+
+
+class Part(BaseModel):
+    """An object of bundle.json. Keys that it does not know are kept and ignored; numbers are finite, and no bool or
+    text is taken for one. What was not given is not written."""
+
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+    @model_serializer(mode="wrap")
+    def _without_what_was_not_given(self, serialize: Any) -> dict[str, Any]:
+        given = self.model_fields_set
+        return {key: value for key, value in serialize(self).items() if value is not None or key in given}
+
+    def but(self: _P, **changes: Any) -> _P:
+        """The same with other values; None takes one out."""
+        return type(self)(**{name: value for name, value in {**dict(self), **changes}.items() if value is not None})
+
+
+def _number(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Whole = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Count = Annotated[int, Field(ge=0, le=2**60)]
+NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Decibels = Annotated[Annotated[float, Field(ge=-1e3, le=1e3)] | None, BeforeValidator(_number)]
+"""None = not a number: the pictures are equal, or no pixel counts."""
+
+
+class Percentiles(Part):
+    """Of an error over the surfels; p100 is the largest. None = not a number."""
+
+    p50: NotNegative | None = None
+    p90: NotNegative | None = None
+    p99: NotNegative | None = None
+    p100: NotNegative | None = None
+
+    @classmethod
+    def of(cls, values: Tensor) -> Percentiles:
+        """Those of [n] values, n at least 1, to four digits."""
+        ordered = values.double().sort().values
+        found = {p: round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)}
+        return cls(**{f"p{p}": value if value <= _LARGEST else None for p, value in found.items()})
+
+
+class TileError(Part):
+    """Error of the stored tiles against the field, 8-bit steps."""
+
+    tolerance: NotNegative
+    unit: str | None = None
+    rms: Percentiles
+    largest: Percentiles
+
+
+class Certificate(Part):
+    """Of how many surfels the stored residual is within the tolerance, as the closest training view sees it: weighted
+    by the blending weight, averaged over a pixel, root mean square over the tile."""
+
+    against: Literal["field", "texels"]
+    """What is stored is compared with: the field, or the texels as they learned, before they were stored."""
+    tolerance: NotNegative
+    within: Whole
+    beyond: Whole
+    worst: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """8-bit steps."""
+    texel_rms: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """Root mean square of the texels themselves, wherever they are seen, 8-bit steps."""
+    marks: Annotated[str, Field(min_length=1368, max_length=1368, pattern=r"^[A-Za-z0-9+/]{1366}==$")] | None = None
+    """Count sketches, 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
+
+    @classmethod
+    def of(cls, errors: Tensor, tolerance: float, against: Literal["field", "texels"]) -> Certificate:
+        """That of errors [n], 8-bit steps."""
+        within = int((errors <= tolerance).sum())
+        worst = float(errors.amax()) if len(errors) else 0.0
+        return cls(against=against, tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
+
+
+class LeftOut(Part):
+    """Numbers of surfels that were left out, by why; `unseen` where training views were looked at for that."""
+
+    not_finite: Whole | None = None
+    beyond_limits: Whole | None = None
+    transparent: Whole | None = None
+    unseen: Whole | None = None
+
+
+class KeptSurfels(Part):
+    """Numbers of surfels; `without_tile` of a scene with a field."""
+
+    trained: Whole | None = None
+    kept: Whole | None = None
+    left_out: LeftOut | None = None
+    without_tile: Whole | None = None
+
+
+class KeptTexels(Part):
+    """Numbers of texels: by the paper's rule, by every rule that takes some away, and what is stored."""
+
+    paper: Count | None = None
+    nyquist: Count | None = None
+    after_cap_by_views: Count | None = None
+    within_visible_part: Count | None = None
+    polished: Count | None = None
+    """Of the tiles that a polish started from."""
+    learned: Count | None = None
+    """Of the tiles that learned in training."""
+    kept: Count | None = None
+    not_finite: Count | None = None
+    """Points at which the field was not finite."""
+
+
+class FieldLevels(Part):
+    """Which levels of the field the bake evaluated, and how far a residual changes without each, 8-bit steps."""
+
+    unit: str | None = None
+    levels: Whole | None = None
+    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]
+    """The first one and how many."""
+    change_of_each: (
+        Annotated[list[Annotated[NotNegative | None, BeforeValidator(_number)]], Field(max_length=64)] | None
+    ) = None
+    change: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """Of all that are left out together."""
+    tolerance: NotNegative | None = None
+
+
+class AtlasCost(Part):
+    """What the atlas takes, and what the quantisation cost."""
+
+    bytes: Count | None = None
+    pages: tuple[Whole, Whole, Whole] | None = None
+    """Layers, height, width in texels."""
+    occupancy: Share | None = None
+    psnr: Decibels = None
+    clipped_fraction: Share | None = None
+
+
+class Kept(Part):
+    """Numbers of sites, coefficients or lobes, or bytes."""
+
+    before: Count | None = None
+    after: Count
+
+
+class ViewColorError(Part):
+    """What the view colours kept, and their error in 8-bit steps."""
+
+    kind: str | None = None
+    tolerance: NotNegative
+    unit: str | None = None
+    sites: Kept
+    one_color: Whole
+    bytes: Kept | None = None
+    error: Percentiles
+
+
+class Gain(Part):
+    """PSNR over some views, dB, with the texels as baked and as tuned."""
+
+    before: Decibels = None
+    after: Decibels = None
+
+
+class Rounding(Part):
+    """How the surfels of a compact bundle were rounded."""
+
+    mse: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    """Mean square error that it made in the training views before the texels were tuned, colours from 0 to 1."""
+    steps: dict[str, NotNegative] = {}
+    """By column, as in `surfel_codes.REFERENCE`."""
+
+
+class FineTuning(Part):
+    """What the fine-tuning or the polish did; no steps where there were too few views."""
+
+    views: Whole | None = None
+    held_in_views: Whole | None = None
+    """Training views that were set aside."""
+    steps: Whole | None = None
+    steps_asked: Whole | None = None
+    best_step: Whole | None = None
+    psnr_held_in: Gain | None = None
+    psnr_held_out: Gain | None = None
+    curve: Annotated[list[tuple[Whole, Decibels]], Field(max_length=1 << 16)] | None = None
+    """Steps and dB over the views that were set aside."""
+    seconds: NotNegative | None = None
+    cpu_seconds: NotNegative | None = None
+    error_before: TileError | None = None
+    """Of the texels as baked, which are what the field gives."""
+
+
+class HeldOut(Part):
+    """PSNR over the held-out views, dB: means, and the view in which the bundle is farthest from the trained scene."""
+
+    views: Whole | None = None
+    psnr_baked_against_neural: Decibels = None
+    psnr_neural_against_photos: Decibels = None
+    psnr_baked_against_photos: Decibels = None
+    cc_psnr_neural_against_photos: Decibels = None
+    """After the affine fit of each view's colours to its photograph."""
+    cc_psnr_baked_against_photos: Decibels = None
+    psnr_baked_against_neural_worst: Decibels = None
+
+
+class Statistics(Part):
+    """For people and reports, and for `bitymi verify` to measure again."""
+
+    surfels: KeptSurfels | None = None
+    texels: KeptTexels | None = None
+    error: TileError | None = None
+    """None: nothing was textured, or the texels were changed after the bake."""
+    certificate: Certificate | None = None
+    """None: nothing was textured, or there is no tolerance."""
+    view_color: ViewColorError | None = None
+    """None: all of the view colours is kept."""
+    field: FieldLevels | None = None
+    atlas: AtlasCost | None = None
+    polish: FineTuning | None = None
+    rounding: Rounding | None = None
+    finetune: FineTuning | None = None
+    seconds: NotNegative | None = None
+    """Of the bake, without the fine-tuning."""
+    options: BakeOptions | None = None
+    method: str | None = None
+    held_out: HeldOut | None = None

@@ -105,8 +105,8 @@ def main() -> int:
         surfels = coded.baked.codes.surfels
         shown, tuned = held_out(coded.shown, held, background), None
         if options.tune:
-            learned = found["trained"]
-            steps = (TuneOptions.of_learned if learned else TuneOptions)(steps=STEPS_AFTER_LEARNING)
+            make = TuneOptions.of_learned if found["trained"] else TuneOptions
+            steps = make(steps=STEPS_AFTER_LEARNING)
             tuned = held_out(
                 tune_atlas(coded.baked, views, background, steps, coding=coded.coding).stored(), held, background
             )

@@ -9,7 +9,7 @@ import open3d
 import pytest
 import trimesh
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.mesh import ExportMesh
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 

@@ -14,16 +14,16 @@ import tyro
 from torch import Tensor
 
 from bitymi_ns.bundle import BundleError, read_bundle
-from bitymi_ns.bundle.manifest import MANIFEST, Place
+from bitymi_ns.bundle.manifest import MANIFEST, WorldFrame
 from bitymi_ns.bundle.strict_json import plain
 from bitymi_ns.files import complete_folder, reason, reserved, size_text
 from bitymi_ns.interchange import Frame
 from bitymi_ns.interchange.bundle_cameras import named_cameras
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
+from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.errors import fail, say, warn
-from bitymi_ns.plugin.export.command import load_trained, world_of
+from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.camera import Camera
 
@@ -50,7 +50,7 @@ class Source:
     cameras: Sequence[Camera]
     near: float
     through_pixel: bool
-    world: Place
+    world: WorldFrame
 
 
 @dataclass(kw_only=True)
@@ -146,7 +146,7 @@ def from_run(load_config: Path) -> Source:
     """The scene of a training run's last checkpoint."""
     _, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
-    rows = datamanager.undistorted_train_cameras()
+    rows = datamanager.train_dataset.cameras
     cameras = [to_camera(rows[i : i + 1], model.device) for i in range(len(rows))]
     scene = model.scene
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
@@ -156,7 +156,7 @@ def from_run(load_config: Path) -> Source:
         cameras,
         scene.near,
         scene.config.through_pixel,
-        Place.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
+        WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
     )
 
 

@@ -10,7 +10,7 @@ import select
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -87,10 +87,9 @@ def drive(
 
 
 @contextmanager
-def served(site: Site) -> Iterator[str]:
-    """Serve a site from a thread of this process; yields its address."""
-    server = serve(site)
-    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+def running(server: Any) -> Iterator[str]:
+    """Run a server of the viewer in a thread of this process; yields its address."""
+    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     try:
         yield address_of(server)
@@ -98,6 +97,11 @@ def served(site: Site) -> Iterator[str]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+def served(site: Site, **options: Any) -> AbstractContextManager[str]:
+    """Serve a site from a thread of this process; yields its address."""
+    return running(serve(site, **options))
 
 
 @contextmanager

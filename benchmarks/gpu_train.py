@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Trains a capture on a CUDA card with the core packages alone (nerfstudio is not used), bakes it and draws the bundle:
+"""Train a capture on a CUDA card with the core packages alone (nerfstudio is not used), bake it and draw the bundle:
 held-out PSNR against seconds of training, peak memory, bytes of the atlas, frames a second of trained and baked scene.
 
 `--device cpu` runs the same on the CPU, to try the script: take few steps and a --downscale.
@@ -22,7 +22,7 @@ from typing import Any
 import torch
 import yaml
 from common import number, page, publish, say, table
-from gpu_common import Options, milliseconds
+from harness import Options, milliseconds
 from plain_capture import Capture, load_capture
 
 from bitymi_ns import bundle
@@ -54,43 +54,21 @@ class Stages:
 
 
 @dataclass
-class Point:
-    """The state of a run after `step` steps."""
-
-    step: int
-    seconds: float
-    surfels: int
-    psnr: float
-    cc_psnr: float
-
-
-@dataclass
 class Result:
-    """One run.
+    """A run.
 
     Attributes:
-        curve: held-out PSNR over the run.
-        peak: most bytes allocated on the card while training.
-        waits: how often the host waited for the card in a step, of the last steps; None on the CPU.
-        frame: median milliseconds of a held-out view of the trained scene.
-        baked_psnr, baked_frame: of the bundle.
-        atlas: bytes of the atlas.
-        bake_seconds: of the bake with encoding.
+        curve: step, seconds, surfels, held-out psnr, psnr after the affine fit; at points over the run.
+        figures: columns of the table beside those of the last point.
     """
 
     preset: str
-    curve: list[Point]
-    peak: int
-    waits: float | None
-    frame: float
-    baked_psnr: float
-    baked_frame: float
-    atlas: int
-    bake_seconds: float
+    curve: list[tuple[int, float, int, float, float]]
+    figures: list[str]
 
 
 def new_scene(capture: Capture, preset: Preset) -> Scene:
-    """Surfels at the points of the capture, as the preset wants them."""
+    """Surfels at the points of the capture, with the options of the preset."""
     centers = torch.stack([view.camera.center for view in capture.train])
     pixels = sum(view.camera.width * view.camera.height for view in capture.train)
     bounded = capture.train[0].image.shape[-1] == 4
@@ -107,8 +85,7 @@ def new_scene(capture: Capture, preset: Preset) -> Scene:
 
 
 def chosen(name: str, texture: str | None, options: Sequence[str]) -> tuple[str, Preset]:
-    """A preset with another texture and other options, each `group.name=value` of the preset's file; and what to call
-    it.
+    """A label, and a preset with another texture and other options, each `group.name=value` of the preset's file.
 
     Raises:
         PresetError: there is no such option.
@@ -127,7 +104,7 @@ def chosen(name: str, texture: str | None, options: Sequence[str]) -> tuple[str,
 
 
 def waits_of(trainer: Trainer, steps: int) -> float:
-    """Mean number of times that the host waits for the card in a step, over the next steps."""
+    """Mean number of waits of the host for the card in a step, over the next steps."""
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -149,7 +126,7 @@ def run(
     options: Options,
     keep: Path | None,
 ) -> Result:
-    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given."""
+    """Train, bake and draw; the bundle stays in the folder `keep` unless that is None."""
     scene = new_scene(capture, preset).to(device)
     trainer = Trainer(scene, capture.train, preset.train, steps)
     due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
@@ -170,7 +147,7 @@ def run(
         if trainer.step in due:
             trainer.training.watch.finish(scene)
             quality = evaluate(scene, capture.held_out, preset.train)
-            curve.append(Point(trainer.step, seconds, len(scene), quality.psnr, quality.cc_psnr))
+            curve.append((trainer.step, seconds, len(scene), quality.psnr, quality.cc_psnr))
             say(
                 f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {quality.psnr:.2f} dB "
                 f"({quality.cc_psnr:.2f} after the affine fit), {len(scene):,} surfels, "
@@ -195,9 +172,9 @@ def run(
         baked = baked.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)
     size = 0 if made.atlas is None else made.atlas.nbytes
-    return Result(
-        name, curve, peak, waits, frame, _psnr(baked, capture, preset, device), baked_frame, size, bake_seconds
-    )
+    figures = [number(peak / 1e6, 0), number(waits, 1), number(1e3 / frame, 0), number(bake_seconds, 1)]
+    figures += [number(size / 1e6, 2), number(_psnr(baked, capture, preset, device)), number(1e3 / baked_frame, 0)]
+    return Result(name, curve, figures)
 
 
 def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.device) -> float:
@@ -211,37 +188,19 @@ def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.dev
 
 def report(results: list[Result], capture: Capture) -> str:
     """Markdown."""
+
+    def cells(point: tuple) -> list[str]:
+        step, seconds, surfels, *quality = point
+        return [number(step, 0), number(seconds, 1), number(surfels, 0), *map(number, quality)]
+
     camera = capture.held_out[0].camera
-    rows = [
-        [
-            r.preset,
-            number(r.curve[-1].seconds, 1),
-            number(r.curve[-1].psnr, 2),
-            number(r.curve[-1].cc_psnr, 2),
-            number(r.curve[-1].surfels, 0),
-            number(r.peak / 1e6, 0),
-            number(r.waits, 1),
-            number(1e3 / r.frame, 0),
-            number(r.bake_seconds, 1),
-            number(r.atlas / 1e6, 2),
-            number(r.baked_psnr, 2),
-            number(1e3 / r.baked_frame, 0),
-        ]
-        for r in results
-    ]
-    header = ("preset", "training s", "PSNR dB", "after affine fit", "surfels", "peak MB", "waits a step", "frames/s")
-    header += ("bake s", "atlas MB", "baked PSNR dB", "baked frames/s")
-    text = (
-        f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n\n"
-    )
-    text += table(header, rows)
+    points = ("steps", "training s", "surfels", "PSNR dB", "after affine fit")
+    header = ("preset", *points, "peak MB", "waits a step", "frames/s", "bake s", "atlas MB", "baked PSNR dB")
+    text = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out."
+    rows = [[r.preset, *cells(r.curve[-1]), *r.figures] for r in results]
+    text += "\n\n" + table((*header, "baked frames/s"), rows)
     for r in results:
-        curve = [
-            [number(p.step, 0), number(p.seconds, 1), number(p.surfels, 0), number(p.psnr, 2), number(p.cc_psnr, 2)]
-            for p in r.curve
-        ]
-        header = ("step", "seconds", "surfels", "PSNR dB", "after affine fit")
-        text += f"\n\n#### {r.preset}\n\n" + table(header, curve)
+        text += f"\n\n#### {r.preset}\n\n" + table(points, [cells(point) for point in r.curve])
     return text
 
 
@@ -276,7 +235,7 @@ def main() -> int:
         capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
     except (OSError, KeyError, ValueError) as error:
         parser.error(f"the capture {arguments.data} cannot be read: {error}")
-    options = Options(device, (), (), arguments.warm_up, arguments.runs, 0.0)
+    options = Options(device, arguments.warm_up, arguments.runs)
     what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     notes = [f"Device: {what}.", f"Frames: median of about {arguments.runs} after {arguments.warm_up}."]
     results, failed = [], False

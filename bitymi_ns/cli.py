@@ -104,8 +104,6 @@ class Report:
     """Folder to write the page to."""
     title: str = "bitymi report"
     """Heading of the page."""
-    published: Flag = False
-    """Show the paper's tables with its published figures even when no scene of its data sets is in the input."""
 
     def run(self) -> None:
         from bitymi_ns.measure import report
@@ -113,7 +111,7 @@ class Report:
         if not self.inputs:
             raise ValueError("nothing to report: name at least one JSON file that ns-eval wrote")
         try:
-            page = report.build(list(self.inputs), self.output_dir, title=self.title, published=self.published)
+            page = report.build(list(self.inputs), self.output_dir, title=self.title)
         except report.ReportError as error:
             raise ValueError(str(error)) from error
         say(f"Wrote {page}")
@@ -130,7 +128,7 @@ class Stability:
 
     def run(self) -> None:
         from bitymi_ns.measure.stability import page
-        from bitymi_ns.measure.stability.backends import BACKENDS, missing
+        from bitymi_ns.measure.stability.errors import BACKENDS, missing
 
         if self.backend not in BACKENDS:
             raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")

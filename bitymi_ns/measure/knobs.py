@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, baked_and_reduced, rich_progress
 from bitymi_ns.codec.quantise import STEPS
-from bitymi_ns.measure.bench.machine import commit, machine, versions
+from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.errors import fail, say

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from bitymi_ns.files import reason
-from bitymi_ns.measure.report.views import ERROR_CAPTION, ERROR_SCALE, heat
+from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.ops import composite
 from bitymi_ns.plugin.errors import fail, say
 from bitymi_ns.plugin.export.command import load_trained, replace_file

@@ -1,4 +1,4 @@
-"""What a figure was made with: machine, versions, commit."""
+"""Describe what a figure was measured with: machine, versions, commit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def _output(command: list[str], where: Path | None = None) -> str:
-    """What a command prints, or nothing when it fails."""
+    """Standard output of a command; empty when it fails."""
     try:
         result = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False, timeout=30)
     except (OSError, subprocess.TimeoutExpired):
@@ -23,7 +23,7 @@ def _output(command: list[str], where: Path | None = None) -> str:
 @functools.cache
 def commit() -> str:
     """The checkout's commit, with `+` when the tree differs from it; empty outside a checkout of this project."""
-    where = Path(__file__).resolve().parents[3]
+    where = Path(__file__).resolve().parents[2]
     if not (where / ".git").exists():
         return ""
     return _output(["git", "describe", "--always", "--dirty=+", "--exclude=*"], where)
@@ -42,7 +42,7 @@ def gpus() -> list[str]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what decides a figure."""
+    """Versions of Python and of the packages that decide a figure."""
     found = {"python": platform.python_version()}
     for name in ("bitymi-ns", "torch", "nerfstudio"):
         try:

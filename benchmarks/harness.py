@@ -1,4 +1,4 @@
-"""What the sections of gpu.py share: timing on the device, the card's measured limits, scenes like trained ones."""
+"""Shared by the kernel benchmarks: timing on the device, the card's measured limits, scenes like trained ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
-from bitymi_ns.ops import backend
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
@@ -29,51 +28,40 @@ SITES = 7
 LOG2_TABLE = 17
 FAILURES: list[str] = []
 T = TypeVar("T")
+CROSSING = 0.016
+"""Share of the surfels that cross the camera's plane out of view."""
+PIXEL_SCALE = 0.9
+"""Median scale of a surfel over the side of its share of the image."""
 CLOCK = 2.0e9
 """Cycles per second, at most about what cards run at: how long `torch.cuda._sleep` spins."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a section is to be run.
+    """How a benchmark runs.
 
     Attributes:
-        device: that runs the kernels; the CPU = their emulation, to try the script without a card.
-        surfels: sizes of the scenes.
-        sizes: image sizes, width and height.
+        device: of the kernels; the CPU = their emulation, to try a script without a card.
         warm_up, runs: of every timing.
-        copy_bytes: measured bytes per second of a device-to-device copy, read and written bytes counted.
-        bundles: folders of real scenes for the baked renderer.
-        peers: whether gsplat is timed as well.
+        surfels: sizes of the synthetic scenes.
+        sizes: image sizes, width and height.
+        copy_bytes: bytes per second of a device-to-device copy, read and written bytes counted.
+        bundles: folders of baked scenes to draw as well.
+        peers: time gsplat, too.
     """
 
     device: torch.device
-    surfels: Sequence[int]
-    sizes: Sequence[tuple[int, int]]
     warm_up: int
     runs: int
-    copy_bytes: float
+    surfels: Sequence[int] = ()
+    sizes: Sequence[tuple[int, int]] = ()
+    copy_bytes: float = 0.0
     bundles: Sequence[Path] = ()
     peers: bool = True
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of the report.
-
-    Attributes:
-        name: on the command line.
-        needs: functions of the kernel module without which the section cannot run.
-        run: gives its Markdown, from a heading of level 3 on.
-    """
-
-    name: str
-    needs: tuple[str, ...]
-    run: Callable[[Options], str]
-
-
 def attempt(what: str, run: Callable[[], T]) -> T | None:
-    """What a part of a section gives; None where it failed, which is said and noted in FAILURES."""
+    """Run a part of a section; None where it failed, which is noted in FAILURES."""
     try:
         return run()
     except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
@@ -88,19 +76,9 @@ def failures() -> str:
     return "".join(f"\n\n- Failed: {text}" for text in FAILURES)
 
 
-def missing(needs: Sequence[str], device: torch.device) -> list[str]:
-    """Those functions that the kernel module of a device does not have."""
-    module = backend.module(device)
-    return [name for name in needs if not hasattr(module, name)]
-
-
 def milliseconds(run: Callable[[], object], options: Options) -> float:
-    """Median time of a call on the device alone, as far as the call does not wait for the device itself.
-
-    Several calls are queued behind a spin of the device that lasts longer than the host needs to queue them, so that
-    they run one after the other and launches are not what is measured. A call that waits for the device (training
-    waits twice per view) is timed with its waits.
-    """
+    """Median device time of a call: calls are queued behind a spin of the device that lasts longer than the host needs
+    to queue them, so that launches are not measured. A call that waits for the device is timed with its waits."""
     for _ in range(options.warm_up):
         run()
     if options.device.type != "cuda":
@@ -125,7 +103,7 @@ def milliseconds(run: Callable[[], object], options: Options) -> float:
 
 
 def with_launches(run: Callable[[], object], options: Options) -> float:
-    """Median milliseconds of a call as a program sees it that waits for each."""
+    """Median milliseconds of a call for a program that waits for each."""
     for _ in range(options.warm_up):
         run()
 
@@ -144,11 +122,11 @@ def _seconds(run: Callable[[], object]) -> float:
 
 
 def copy_bandwidth(device: torch.device) -> float:
-    """Bytes a second that a copy within the device reads and writes."""
+    """Bytes per second that a copy within the device reads and writes."""
     cuda = device.type == "cuda"
     a = torch.empty(1 << (30 if cuda else 24), dtype=torch.uint8, device=device)
     b = torch.empty_like(a)
-    ms = milliseconds(lambda: b.copy_(a), Options(device, (), (), 3, 20, 0.0))
+    ms = milliseconds(lambda: b.copy_(a), Options(device, 3, 20))
     return 2 * a.numel() / (1e-3 * ms)
 
 
@@ -175,7 +153,7 @@ def arithmetic_rate(options: Options) -> float:
     a, b = (torch.rand(n, n, device=options.device) for _ in range(2))
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = False
-    ms = milliseconds(lambda: a @ b, Options(options.device, (), (), 3, 10, 0.0))
+    ms = milliseconds(lambda: a @ b, Options(options.device, 3, 10))
     torch.backends.cuda.matmul.allow_tf32 = before
     return 2 * n**3 / (1e-3 * ms)
 
@@ -203,14 +181,9 @@ def deterministic(run: Callable[[], object], warn_only: bool = False) -> Callabl
     return call
 
 
-def photo_loss(photo: Tensor, with_ssim: bool = True) -> Callable[[Tensor], Tensor]:
-    """Of an image [height, width, 3]: 0.8 L1 + 0.2 (1 - SSIM), or L1 alone."""
-
-    def loss(rgb: Tensor) -> Tensor:
-        l1 = l1_loss(rgb, photo)
-        return 0.8 * l1 + 0.2 * (1 - ops.ssim(rgb, photo)) if with_ssim else l1
-
-    return loss
+def photo_loss(photo: Tensor) -> Callable[[Tensor], Tensor]:
+    """0.8 L1 + 0.2 (1 - SSIM) of an image [height, width, 3]."""
+    return lambda rgb: 0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))
 
 
 def training_step(
@@ -231,7 +204,7 @@ def training_step(
 def trained_like(
     n: int, width: int, height: int, device: torch.device, view_color: str = "sv", texture: bool = True
 ) -> tuple[Scene, Camera]:
-    """A scene with the statistics of trained ones and the camera that looks at it; the same every time.
+    """A scene with the statistics of trained ones and its camera; the same every time.
 
     Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
     deviation 0.85, the mean log scale in pixels 0.7, opacity and kernel exponent are logistic-normal (medians 0.45 and
@@ -263,7 +236,7 @@ def trained_like(
         "beta_raw": normal(n) + 0.45,
     }
     beside = n - round(CROSSING * n)
-    _put_beside_the_camera({name: value[beside:] for name, value in surfels.items()}, g)
+    _move_beside_the_camera({name: value[beside:] for name, value in surfels.items()}, g)
     if view_color == "sv":
         surfels |= {"sv_sites": normal(n, SITES, 3), "sv_log_tau": torch.zeros(n, SITES)}
         surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
@@ -280,8 +253,8 @@ def trained_like(
     return scene, Camera(torch.eye(4), K, width, height).to(device)
 
 
-def _put_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> None:
-    """Moves surfels to where they cross the camera's plane out of view, in place.
+def _move_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> None:
+    """Move surfels in place so that they cross the camera's plane out of view.
 
     As in a room of 12,900 surfels: median depth 0.09 where surfels have 1.0 (here 4), 12 depths off the axis, the
     larger scale 0.9 depths, three times the smaller.
@@ -309,9 +282,3 @@ def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[
     field.descent = ops.TexelDescent(field.share, 0.0)
     scene.field = field
     return scene, camera
-
-
-CROSSING = 0.016
-"""Share of the surfels that cross the camera's plane out of view."""
-PIXEL_SCALE = 0.9
-"""Median scale of a surfel over the side of its share of the image."""

@@ -3,7 +3,7 @@
 import jinja2
 import pytest
 
-from bitymi_ns.measure.templates import rendered
+from bitymi_ns.measure.markdown import rendered
 
 
 def test_a_value_that_is_missing_is_an_error() -> None:

@@ -1,4 +1,4 @@
-"""Bundles of a scene at several sizes: their quality against what is downloaded."""
+"""Pareto fronts, and the panel of bundles of several sizes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from bitymi_ns.measure.report.drawing import LIGHT
-from bitymi_ns.measure.report.plots import METRICS, _scatter_sheet, costs
+from bitymi_ns.measure.report.plots import costs, front, pareto_panel
 from bitymi_ns.measure.report.records import Evaluation
 
 
 def bundle(form: str, psnr: float, whole: float | None, atlas: float) -> Evaluation:
     results = {"psnr": psnr, "atlas_bytes": atlas, **({} if whole is None else {"bundle_bytes": whole})}
-    return Evaluation("fox", "bitymi", True, f"bitymi, {form}", results, "", Path(form), atlas_format=form)
+    return Evaluation("fox", "bitymi", True, f"bitymi, {form}", results, "", Path(form))
 
 
 ROWS = [
@@ -25,13 +24,12 @@ ROWS = [
 ]
 
 
-def test_sizes_are_of_what_is_downloaded_and_its_bundles_lie_along_a_curve() -> None:
+def test_sizes_are_of_the_download_and_the_bundles_of_a_method_lie_along_a_curve() -> None:
     size = costs(ROWS)[-1]
     assert size.label == "bundle MB" and [size.value(row) for row in ROWS] == pytest.approx([3.7, 1.07, 0.7])
-    sheet = _scatter_sheet(METRICS[0], size, ROWS, {"bitymi": 0})
-    assert sheet is not None and sheet.points == 3
-    axes = Figure().add_subplot()  # drawn as it is, without the rest of the page
-    sheet.draw(axes, "fox", LIGHT)
+    axes = Figure().add_subplot()
+    markers = dict.fromkeys(("bc7", "compact", "compact-small"), "s")
+    pareto_panel(axes, ROWS, "psnr", size, {"bitymi": "C0"}, markers)
     curves = [line for line in axes.lines if list(line.get_xdata()) == pytest.approx([0.7, 1.07, 3.7])]
     assert [list(line.get_ydata()) for line in curves] == [pytest.approx([31.7, 31.96, 31.95])]
 
@@ -39,3 +37,16 @@ def test_sizes_are_of_what_is_downloaded_and_its_bundles_lie_along_a_curve() -> 
 def test_sizes_are_of_atlases_where_a_bundle_does_not_state_its_own() -> None:
     rows = [*ROWS[:2], replace(ROWS[2], results={"psnr": 31.7, "atlas_bytes": 0.4e6})]
     assert costs(rows)[-1].label == "atlas MB"
+
+
+@pytest.mark.parametrize(
+    ("points", "up", "best"),
+    [
+        ([(1, 5), (2, 4), (3, 6), (3, 7), (1, 4)], True, [(1, 5), (3, 7)]),
+        ([(1, 5), (2, 4), (3, 6), (2, 3)], False, [(1, 5), (2, 3)]),
+        ([(2, 2), (2, 2)], True, [(2, 2)]),
+        ([], True, []),
+    ],
+)
+def test_fronts(points: list[tuple[float, float]], up: bool, best: list[tuple[float, float]]) -> None:
+    assert front(points, up) == best

@@ -67,7 +67,6 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         steps: of the runs of `train`; None = the preset's.
     """
     length = [] if steps is None else ["--steps", str(steps)]
-    bitymi = ("--presets", "bitymi")
     pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short"]
     bundles = results / "bundles"
     baked = ("--surfels", "150000", "--runs", "100", "--sections", "baked")
@@ -97,7 +96,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "fox": [
             Step(
                 "fox",
-                [page("fox.md", "gpu_train.py", data / "fox", *bitymi, "--steps", "3000", "--keep", bundles)],
+                [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)],
                 200,
             ),
             Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
@@ -112,7 +111,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "train": of_each(
             "",
             600,
-            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, *bitymi, "--keep", bundles / name, *length)],
+            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)],
         ),
         "gaussians": of_each(
             "Gaussians of ",

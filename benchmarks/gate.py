@@ -45,7 +45,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Limit:
-    """How much worse a figure may be than the baseline.
+    """Tolerance of a figure against the baseline.
 
     Attributes:
         better: whether "more" or "less" of it is better.
@@ -130,8 +130,7 @@ class Calibration:
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """What `work` returns, and its CPU seconds in units of the calibrations that it did on its way, or of one after
-        it."""
+        """Run `work`; returns its result, and its CPU seconds over those of the calibrations in it, or of one after."""
         self.seconds.clear()
         start = time.process_time()
         result = work()

@@ -48,27 +48,12 @@ from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
 TIMED = ("list", "draw", "frame", "graph", "packed", "alone", "early")
-"""What `measured` times, in the order of the columns from "list ms" on."""
+"""Timings of `measured`, in the order of the columns from "list ms" on."""
 HEADER = (
-    "scene",
-    "size",
-    "million pairs",
-    "pairs/tile",
-    "of discs across the camera's plane",
-    "fragments/pixel",
-    "list ms",
-    "draw ms",
-    "frame ms",
-    "graph ms",
-    "packed, graph ms",
-    "packed, waited for ms",
-    "ends at 1/512, graph ms",
-    "differs, 8-bit steps",
-    "frames/s",
-    "G fragments/s",
-    "draw: of fp32",
-    "draw: of copy",
-)
+    "scene", "size", "million pairs", "pairs/tile", "of discs across the camera's plane", "fragments/pixel",
+    "list ms", "draw ms", "frame ms", "graph ms", "packed, graph ms", "packed, waited for ms",
+    "ends at 1/512, graph ms", "differs, 8-bit steps", "frames/s", "G fragments/s", "draw: of fp32", "draw: of copy",
+)  # fmt: skip
 
 
 def frames(options: Options) -> str:
@@ -212,7 +197,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
 
 
 def around(bundle, width: int, height: int) -> list[Camera]:
-    """Three cameras around the middle of a bundle, which training places in the ball of the cameras, of radius 1."""
+    """Three cameras around the middle of a bundle; training scales the cameras of a capture to the unit ball."""
     middle = bundle.scene.surfels["means"].median(dim=0).values
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     cameras = []

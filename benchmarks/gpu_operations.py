@@ -153,7 +153,7 @@ def field_cases(n: int, width: int, height: int, device: torch.device) -> list[C
         return ops.shade(fragments, leaf, projection.frames, field.geometry if textured else None, weights, bound)
 
     learning = backward(shade(learn=True), (leaf, *field.weights))
-    gathers, learned = 128.0 * LEVELS, 28 * f + 52 * t + 12 * n
+    gathers, streamed = 128.0 * LEVELS, 28 * f + 52 * t + 12 * n
     a, b = (torch.rand(height, width, 3, device=device) for _ in range(2))
     a.requires_grad_()
     x = a.numel()
@@ -173,9 +173,9 @@ def field_cases(n: int, width: int, height: int, device: torch.device) -> list[C
         Case("shade, no field", f, "fragments", 32 * f, 6 * f, without_graph(lambda: shade(textured=False))),
         Case("shade", f, "fragments", 32 * f + 12 * t, 6 * f + LOOK_UP * t, without_graph(shade), gathers * t),
         Case("shade, backward, frozen", f, "fragments", 28 * f + 12 * n, 9 * f, backward(shade(), (leaf,))),
-        Case("shade, backward, learning", f, "fragments", learned + tables, shaded, learning, 2 * gathers * t),
+        Case("shade, backward, learning", f, "fragments", streamed + tables, shaded, learning, 2 * gathers * t),
         Case(
-            "... deterministic", f, "fragments", learned + 4 * tables, shaded, deterministic(learning), 3 * gathers * t
+            "... deterministic", f, "fragments", streamed + 4 * tables, shaded, deterministic(learning), 3 * gathers * t
         ),
         Case("SSIM, both passes", x, "values", 60 * x, 411 * x, lambda: ops.ssim(a, b)),
         Case("Adam", numbers, "numbers", 28 * numbers, 14 * numbers, lambda: [o.step() for o in adam.values()]),

@@ -38,7 +38,7 @@ CLOCK = 2.0e9
 
 @dataclass(frozen=True)
 class Options:
-    """How a benchmark runs.
+    """Settings of a benchmark.
 
     Attributes:
         device: of the kernels; the CPU = their emulation, to try a script without a card.

@@ -44,7 +44,7 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
     """The reduced bake of a run, its training views, its held-out views, and the background."""
     _, pipeline = load_trained(load_config)
     model, data = pipeline.model, pipeline.datamanager
-    cameras = data.undistorted_train_cameras()
+    cameras = data.train_dataset.cameras
     views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
     background, trained = model.background.cpu(), isinstance(model.scene.field, TexelField)
@@ -105,8 +105,8 @@ def main() -> int:
         surfels = coded.baked.codes.surfels
         shown, tuned = held_out(coded.shown, held, background), None
         if options.tune:
-            learned = found["trained"]
-            steps = (TuneOptions.of_learned if learned else TuneOptions)(steps=STEPS_AFTER_LEARNING)
+            make = TuneOptions.of_learned if found["trained"] else TuneOptions
+            steps = make(steps=STEPS_AFTER_LEARNING)
             tuned = held_out(
                 tune_atlas(coded.baked, views, background, steps, coding=coded.coding).stored(), held, background
             )

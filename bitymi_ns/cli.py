@@ -206,7 +206,7 @@ class Bench:
 
 @dataclass
 class Verify:
-    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is given."""
+    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is found."""
 
     bundle: tyro.conf.Positional[Path]
     """Folder of the bundle, or its one file (bitymi pack)."""
@@ -298,25 +298,25 @@ class Extras:
         from bitymi_ns.bundle import read_bundle
         from bitymi_ns.progress import rich_progress
 
-        output = self.output or interchange.place_of(self.bundle)
+        output = self.output or interchange.extras_folder(self.bundle)
         interchange.check_extras(self.kinds, output, self.overwrite)
         bundle = read_bundle(self.bundle)
-        given = interchange.given_with(self.bundle, bundle.info)
+        found = interchange.read_cameras(self.bundle, bundle.info)
         with rich_progress() as progress:
             written = interchange.write_extras(
                 bundle,
                 output,
                 self.kinds,
                 frame=self.frame,
-                cameras=given.train,
-                held_out=given.held_out,
+                cameras=found.train,
+                held_out=found.held_out,
                 overwrite=self.overwrite,
                 progress=progress,
             )
         say(f"Wrote {output}")
         for each in written.values():
-            say(interchange.described(each))
-        if not given.train:
+            say(interchange.summary_line(each))
+        if not found.train:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
         return 0
 

@@ -138,5 +138,6 @@ def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[st
     records = Records()
     read_cells(list(enumerate(found, 1)), cells.path, records)
     failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
-    body = "\n\n".join(markdown_tables(quality_tables(records.evaluations)))
-    return markdown.page(title, body, [NOTES, *failed], [cell["made"]["commit"] for cell in found])
+    body = "\n\n".join(markdown_tables(quality_tables(records.evaluations, training=True)))
+    training = "Training s, CPU s: of the steps alone; peak: of ns-train as a whole."
+    return markdown.page(title, body, [NOTES, training, *failed], [cell["made"]["commit"] for cell in found])

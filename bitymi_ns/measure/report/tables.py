@@ -101,25 +101,29 @@ COLUMNS = (
     Column("FPS", _fps, significant, "up"),
     Column("Atlas MB", _atlas_mb, significant, "down"),
     Column("Bundle MB", _key("bundle_bytes", 1e-6), significant, "down"),
+)
+TRAINING = (
     Column("Training s", _trained("train_seconds"), count),
     Column("Training CPU s", _trained("train_cpu_seconds"), count),
     Column("Training peak MB", _trained("train_peak_bytes", 1e-6), count),
 )
+"""Of the training steps alone; the peak is that of ns-train as a whole."""
 
 STAGES = {False: "Trained scene", True: "Baked bundle"}
 
 NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
     "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
-    "Training s, CPU s: of the steps alone; peak: of ns-train as a whole. ccPSNR: after an affine fit of each view's "
-    "colours to its photograph, so that exposure and white balance do not count. Bold: best of its scene."
+    "ccPSNR: after an affine fit of each view's colours to its photograph, so that exposure and white balance do not "
+    "count. Bold: best of its scene."
 )
 
 
-def _numbers(evaluations: list[Evaluation], everyone: list[Evaluation]) -> list[Column]:
+def _numbers(evaluations: list[Evaluation], training: bool) -> list[Column]:
     """The columns that at least one row fills."""
-    delta = Column("ΔPSNR", lambda row: psnr_delta(row, everyone), signed)
-    return [c for c in (*COLUMNS, delta) if any(c.value(row) is not None for row in evaluations)]
+    delta = Column("ΔPSNR", lambda row: psnr_delta(row, evaluations), signed)
+    wanted = (*COLUMNS, *(TRAINING if training else ()), delta)
+    return [c for c in wanted if any(c.value(row) is not None for row in evaluations)]
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
@@ -200,9 +204,9 @@ def training_table(curves: list[Curve]) -> Table | None:
     return Table("Training", ("Run", *(c[0] for c in columns)), tuple(rows))
 
 
-def quality_tables(evaluations: list[Evaluation]) -> list[Table]:
-    """One table per scene, and their means when there are several scenes."""
-    columns = _numbers(evaluations, evaluations)
+def quality_tables(evaluations: list[Evaluation], training: bool = False) -> list[Table]:
+    """One table per scene, and their means when there are several scenes; with the cost of training if `training`."""
+    columns = _numbers(evaluations, training)
     scenes = sorted({row.scene for row in evaluations})
     tables = [scene_table(scene, [e for e in evaluations if e.scene == scene], columns) for scene in scenes]
     mean = mean_table(evaluations, columns)

@@ -102,7 +102,7 @@ class Errors:
     flipped: float
     """Share of the pixels that are not compared."""
     input_forward: float
-    """How much the reference's images change when each input is moved by up to half a unit in its last place."""
+    """Change of the reference's images when each input is moved by up to half a unit in its last place."""
     input_gradient: float
     """The same of its gradients."""
     drawn: int

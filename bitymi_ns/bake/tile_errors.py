@@ -1,4 +1,4 @@
-"""What a pixel of the closest training view covers of a tile, and the mean of values over it."""
+"""Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels."""
 
 from __future__ import annotations
 
@@ -7,9 +7,58 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.tiles import Shown, weights
+from bitymi_ns.codec.pages import size_classes
+from bitymi_ns.codec.quantise import STEPS
+from bitymi_ns.ops import TexelTiles
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import max_projected_extent
 from bitymi_ns.train.rotations import tangents
+
+_CONSTANT = (8, 8)
+"""Points at which the weight of a surfel without a tile is looked at."""
+
+
+def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
+    """Root mean square of difference [n, 3, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n]."""
+    count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
+    square = (difference.square().sum(1) * weight.square()).flatten(1).sum(1)
+    return STEPS * (square / count).sqrt()
+
+
+def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
+    """`weighted_rms` of what a view can see: difference times weight is averaged over its pixels first, of `cells`
+    [n, 2]."""
+    return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
+
+
+@torch.no_grad()
+def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
+    """What differences of texels are as the closest training view sees them.
+
+    Args:
+        difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
+        sizes: [N, 2] sides of the tiles; (0, 0) = none.
+        shown: how much of the tiles is seen, N rows.
+        chunk: texels taken at once (a tile is never split).
+
+    Returns:
+        [N] root mean squares in 8-bit steps, each times the largest blending weight that a fragment has there; and [N]
+        bool, whether any fragment of the surfel gets a residual.
+    """
+    errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
+    first = TexelTiles.of_sizes(sizes.clamp(min=1), shown.extent).first
+    bare = torch.nonzero(sizes[:, 0] == 0).squeeze(1)
+    classes = size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1))
+    for r_u, r_v, members in [*classes, (*_CONSTANT, bare)]:
+        for rows in members.split(max(1, chunk // (r_u * r_v))):
+            inside = torch.arange(r_u * r_v) if members is not bare else torch.zeros(r_u * r_v, dtype=torch.long)
+            values = difference[first[rows, None] + inside].view(-1, r_v, r_u, 3).permute(0, 3, 1, 2)
+            weight, extent = weights(shown, rows, (r_u, r_v)), shown.extent[rows]
+            pixels = None if shown.pixels is None else shown.pixels[rows]
+            errors[rows] = seen_rms(values, weight, cells_per_pixel(pixels, extent, (r_u, r_v)))
+            seen[rows] = (weight > 0).flatten(1).any(1)
+    return errors, seen
 
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:

@@ -1,16 +1,15 @@
-"""Whether the poses of a capture are poses: rotations (or mirrored ones) at places that belong together. And the turn
-that brings a capture to its place."""
+"""Checks of a capture's poses: rotations (or mirrored ones), positions that belong together, and points in their unit;
+and the rotation and translation that orient a capture."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras import camera_utils
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 
 from bitymi_ns.plugin.errors import fail, listed, warn
 
@@ -19,20 +18,19 @@ EXACT = 1e-3
 ROUNDED = 2e-2
 """Matrices this close to a rotation, up to a common factor, are meant to be one: two written digits."""
 FAR = 100.0
-"""So many times as far out as all the others: a camera that may be misplaced."""
+"""Distance relative to all the others from which a camera may be misplaced."""
 TOO_FAR = 1000.0
-"""So many times as far out, the others shrink to one place beside it."""
-
-FAR_OFF = 100.0
-"""Where cameras are so many times as far from the origin as from their middle, float32 blurs what lies between them."""
+"""Relative distance beside which the other cameras shrink to one point."""
+FAR_FROM_ORIGIN = 100.0
+"""Distance from the origin relative to that from their middle at which float32 blurs cameras."""
 OTHER_UNIT = 150.0
-"""Points so many times as far away as the cameras lie apart, or so small a part of a picture: another unit."""
+"""Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
 
 
 def rotations(
-    matrices: npt.NDArray[np.float64], names: Sequence[object], where: str, announce: bool = True
+    matrices: npt.NDArray[np.float64], names: Sequence[object], source: str, verbose: bool = True
 ) -> npt.NDArray[np.float64]:
-    """The rotations that the 3 x 3 parts of poses stand for.
+    """Recover rotations from the 3 x 3 parts of poses.
 
     A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
     (determinant -1) stay mirrored: captures may be mirrored as a whole.
@@ -40,11 +38,11 @@ def rotations(
     Args:
         matrices: [N, 3, 3], camera to world.
         names: of the N frames, for messages.
-        where: the file or capture, for messages.
-        announce: say what was changed.
+        source: file or capture, for messages.
+        verbose: report what was changed.
 
     Returns:
-        [N, 3, 3]; the rows that need no change are equal to the given ones.
+        [N, 3, 3]; rows that need no change are equal to the input.
 
     Raises:
         InputError: a matrix is not finite, zero or sheared.
@@ -62,7 +60,7 @@ def rotations(
     ):
         if wrong.any():
             fail(
-                f"{where}: the 3 x 3 part of the pose of {listed([names[i] for i in wrong.nonzero()[0]])} is no "
+                f"{source}: the 3 x 3 part of the pose of {listed([names[i] for i in wrong.nonzero()[0]])} is no "
                 f"rotation, it {what}. Correct the pose or remove the frame."
             )
     scaled = np.abs(scale - 1.0) > EXACT
@@ -70,29 +68,24 @@ def rotations(
     rounded = error > EXACT
     u, _, v = np.linalg.svd(unit[rounded])
     result[rounded] = u @ v
-    if announce and scaled.any():
+    if verbose and scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
         warn(
-            f"{where}: rotations are scaled by {factor} in the poses of "
+            f"{source}: rotations are scaled by {factor} in the poses of "
             f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
         )
     only_rounded = rounded & ~scaled
-    if announce and only_rounded.any():
+    if verbose and only_rounded.any():
         warn(
-            f"{where}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
+            f"{source}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
             f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
         )
     return result
 
 
 def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Name frames that are mirrored where others are not. A capture may be mirrored as a whole.
-
-    Args:
-        rotations: [N, 3, 3], mirrored or not.
-        names: of the N frames.
-    """
+    """Warn of frames that are mirrored where the others are not; rotations [N, 3, 3], names for messages."""
     mirrored = np.linalg.det(rotations) < 0.0
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
@@ -102,19 +95,16 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
         )
 
 
-def check_spread(places: npt.NDArray[np.float64], where: str) -> None:
-    """Stop where all cameras [N, 3] are at one place; `where` they are from is for the message."""
-    if not np.ptp(places, axis=0).any():
-        fail(f"{where}: all cameras are at one place. Depth cannot be learned: take photographs from different places.")
+def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
+    """Fail where all cameras [N, 3] are at one place."""
+    if not np.ptp(centers, axis=0).any():
+        fail(
+            f"{source}: all cameras are at one place. Depth cannot be learned: take photographs from different places."
+        )
 
 
-def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Stop, or warn, at single cameras that are far from all the others.
-
-    Args:
-        centers: [N, 3] camera positions, finite.
-        names: of the N frames, for messages.
-    """
+def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
+    """Fail or warn at single cameras that are far from all the others; centers [N, 3] finite, names for messages."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     order = np.argsort(distances)
     sorted_distances = distances[order]
@@ -134,29 +124,20 @@ def check_places(centers: npt.NDArray[np.float64], names: Sequence[object]) -> N
         return
 
 
-def is_far_off(centers: npt.NDArray[np.float64]) -> bool:
-    """Whether cameras [N, 3] are so far from the origin that float32 cannot tell their positions."""
+def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
+    """Test if cameras [N, 3] are so far from the origin that float32 cannot tell their positions."""
     middle = centers.mean(0)
     spread = np.linalg.norm(centers - middle, axis=1).max()
-    return bool(0.0 < FAR_OFF * spread < np.linalg.norm(middle))
+    return bool(0.0 < FAR_FROM_ORIGIN * spread < np.linalg.norm(middle))
 
 
-def warn_of_far_off(path: object, centers: npt.NDArray[np.float64]) -> None:
-    """Say that nerfstudio's own readers cannot tell the positions of such cameras [N, 3]."""
-    if is_far_off(centers):
-        warn(
-            f"{path}: the cameras lie so far from the origin that nerfstudio's reader, which has seven digits, blurs "
-            "their positions. Read it with `bitymi-data`, the default, which centres the capture first."
-        )
-
-
-def check_cloud(
+def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
     """Warn where the points seem to be in another unit than the poses.
 
-    Far more than what the cameras' places span, or all in a spot of the picture: both leave training next to nothing
-    to start from. Medians and percentiles, because clouds and captures have outliers.
+    They are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to start
+    from. Medians and percentiles are used because clouds and captures have outliers.
 
     Args:
         points: [N, 3] of the cloud.
@@ -171,17 +152,17 @@ def check_cloud(
     apart = np.percentile(np.linalg.norm(centers - middle, axis=1), 90)  # a median may be that of a group on a tripod
     away = np.median(np.linalg.norm(points - middle, axis=1))
     spread = np.median(np.linalg.norm(points - cloud_middle, axis=1))
-    picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # its width, where the cloud is
-    remedy = "Give the points in the unit of the poses, or remove the cloud to start from random points."
+    picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # picture width at the cloud
+    hint = "Give the points in the unit of the poses, or remove the cloud to start from random points."
     if apart > 0.0 and away > OTHER_UNIT * apart:
         warn(
             "The point cloud seems to be in another unit than the poses: half of its points are more than "
-            f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {remedy}"
+            f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {hint}"
         )
     elif 0.0 < spread < picture / OTHER_UNIT:
         warn(
             "The point cloud seems to be in another unit than the poses: half of its points lie in a spot that is "
-            f"1/{_rounded(picture / spread)} of a picture's width. {remedy}"
+            f"1/{_rounded(picture / spread)} of a picture's width. {hint}"
         )
 
 
@@ -189,36 +170,10 @@ def _rounded(ratio: float) -> str:
     return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"
 
 
-_nerfstudios = camera_utils.auto_orient_and_center_poses
+def orient(poses: torch.Tensor, method: Any, center_method: Any) -> torch.Tensor:
+    """Compute the transform [3, 4] by which nerfstudio orients and centers poses [N, 4, 4].
 
-
-def oriented(
-    poses: torch.Tensor, method: Any = "up", center_method: Any = "poses"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """nerfstudio's orienting and centring of a capture, with all cameras turned alike.
-
-    With `pca`, nerfstudio 1.1.5 turns a capture that comes out upside down by half a turn, but of its cameras the
-    second and the third alone, which it mirrors as well. The transform is right, and the cameras are made of it; where
-    nothing is upside down that is the same product.
-
-    Args:
-        poses: [N, 4, 4] camera to world.
-        method: pca, up, vertical or none.
-        center_method: poses, focus or none.
-
-    Returns:
-        poses [N, 3 or 4, 4] and transform [3, 4].
+    Its poses are not used: for `pca`, nerfstudio 1.1.5 turns a capture that comes out upside down, but of its cameras
+    the second and the third alone. The transform is right.
     """
-    found, transform = _nerfstudios(poses, method, center_method)
-    return (transform @ poses if method == "pca" else found), transform
-
-
-@contextmanager
-def orienting_all() -> Iterator[None]:
-    """While it lasts, nerfstudio's readers orient captures by `oriented`."""
-    before = camera_utils.auto_orient_and_center_poses
-    camera_utils.auto_orient_and_center_poses = oriented
-    try:
-        yield
-    finally:
-        camera_utils.auto_orient_and_center_poses = before
+    return auto_orient_and_center_poses(poses, method, center_method)[1]

@@ -1,4 +1,4 @@
-"""What other programs are shown of a surfel's colour: harmonics over directions, one colour, one residual."""
+"""Surfel colours for other programs: spherical harmonics, one mean colour, one mean residual."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.directions import view_directions
-from bitymi_ns.bake.field.texels import texel_centres
 from bitymi_ns.bake.lean_color import shown_at
+from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
@@ -23,7 +23,7 @@ OUTSIDE, OUTSIDE_WEIGHT = 32, 0.1
 
 
 @dataclass(frozen=True)
-class Looks:
+class SurfelColors:
     """Colours of N surfels.
 
     Attributes:
@@ -42,8 +42,8 @@ def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def fit_looks(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers: Tensor) -> Looks:
-    """The harmonics that are nearest to the colours of surfels, by least squares over directions.
+def fit_colors(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers: Tensor) -> SurfelColors:
+    """Fit spherical harmonics to the colours of surfels, by least squares over directions.
 
     The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions`: of all
     training views that see the surfel and 32 between and around these, which count 1 together; and OUTSIDE over the
@@ -58,7 +58,7 @@ def fit_looks(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers:
     """
     surfels = scene.surfels
     means = surfels["means"]
-    found = Looks(means.new_zeros(len(means), harmonics.TERMS, 3), means.new_zeros(len(means), 3))
+    found = SurfelColors(means.new_zeros(len(means), harmonics.TERMS, 3), means.new_zeros(len(means), 3))
     outside = fibonacci_sphere(OUTSIDE)
     for at in view_directions(means, seen, centers):
         for part in torch.arange(len(at.rows)).split(1 << 12):
@@ -84,7 +84,7 @@ def weighted_fit(directions: Tensor, values: Tensor, weight: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def shown_residual(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
+def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
     """[N, 3] mean residual of each surfel, over its texels with the weight of the kernel there; of a surfel without a
     tile its constant. None = the scene has no residual."""
     if scene.mean_residual is None and scene.atlas is None:
@@ -99,7 +99,7 @@ def shown_residual(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
     flat = scene.residuals().reshape(-1, 3)
     for r_u, r_v, rows in size_classes(scene.tiles):
         for part in rows.split(max(1, chunk // (r_u * r_v))):
-            u, v = (texel_centres(r, extent[part, None]) for r in (r_u, r_v))
+            u, v = (texel_centers(r, extent[part, None]) for r in (r_u, r_v))
             rest = (1 - (u[:, None, :].square() + v[:, :, None].square()) / SUPPORT**2).clamp(min=0)
             weight = (rest ** beta[part, None, None]).where(rest > 0, 0.0) + 1e-6
             texels = flat[texel_index(scene.tiles[part], (r_u, r_v), width, height)]

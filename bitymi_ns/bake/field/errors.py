@@ -1,4 +1,4 @@
-"""How far stored tiles are from the field, or from what they held before."""
+"""Errors of stored tiles against the field."""
 
 from __future__ import annotations
 
@@ -8,60 +8,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.field.footprint import averaged, cells_per_pixel
-from bitymi_ns.bake.field.plan import Field, Plan, Shown
-from bitymi_ns.bake.field.reference import references, weights
-from bitymi_ns.bake.resample import read_at
+from bitymi_ns.bake.field.plan import Field, Plan
+from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.reduce import read_at
+from bitymi_ns.bake.tile_errors import cells_per_pixel, seen_rms, weighted_rms
 from bitymi_ns.bundle.statistics import Certificate, Percentiles, TileError
 from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.codec.quantise import STEPS
-from bitymi_ns.ops import TexelTiles
 from bitymi_ns.progress import Progress, no_progress
-
-_CONSTANT = (8, 8)
-"""Points at which the weight of a surfel without a tile is looked at."""
-
-
-def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
-    """Root mean square of difference [n, 3, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n]."""
-    count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
-    square = (difference.square().sum(1) * weight.square()).flatten(1).sum(1)
-    return STEPS * (square / count).sqrt()
-
-
-def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
-    """`weighted_rms` of what a view can see: difference times weight is averaged over its pixels first, of `cells`
-    [n, 2]."""
-    return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
-
-
-@torch.no_grad()
-def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
-    """What differences of texels are as the closest training view sees them.
-
-    Args:
-        difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
-        sizes: [N, 2] sides of the tiles; (0, 0) = none.
-        shown: how much of the tiles is seen, N rows.
-        chunk: texels taken at once (a tile is never split).
-
-    Returns:
-        [N] root mean squares in 8-bit steps, each times the largest blending weight that a fragment has there; and [N]
-        bool, whether any fragment of the surfel gets a residual.
-    """
-    errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
-    first = TexelTiles.of_sizes(sizes.clamp(min=1), shown.extent).first
-    bare = torch.nonzero(sizes[:, 0] == 0).squeeze(1)
-    classes = size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1))
-    for r_u, r_v, members in [*classes, (*_CONSTANT, bare)]:
-        for rows in members.split(max(1, chunk // (r_u * r_v))):
-            inside = torch.arange(r_u * r_v) if members is not bare else torch.zeros(r_u * r_v, dtype=torch.long)
-            values = difference[first[rows, None] + inside].view(-1, r_v, r_u, 3).permute(0, 3, 1, 2)
-            weight, extent = weights(shown, rows, (r_u, r_v)), shown.extent[rows]
-            pixels = None if shown.pixels is None else shown.pixels[rows]
-            errors[rows] = seen_rms(values, weight, cells_per_pixel(pixels, extent, (r_u, r_v)))
-            seen[rows] = (weight > 0).flatten(1).any(1)
-    return errors, seen
 
 
 @dataclass
@@ -116,15 +70,15 @@ def tile_errors(
         progress: called with the number of tiles done.
     """
     rms, largest, seen = (torch.zeros(len(plan)) for _ in range(3))
-    places = torch.as_tensor(tiles)
+    rectangles = torch.as_tensor(tiles)
     flat = None if residuals is None else torch.as_tensor(residuals).reshape(-1, 3)
     done = 0
     for part in references(field, plan, chunk):
         rows = part.rows.cpu()
         rebuilt = mean_residual[rows][:, :, None, None].expand(part.values.shape).clone()
         if flat is not None:
-            for r_u, r_v, at in size_classes(places[rows]):
-                index = texel_index(places[rows[at]], (r_u, r_v), residuals.shape[2], residuals.shape[1])
+            for r_u, r_v, at in size_classes(rectangles[rows]):
+                index = texel_index(rectangles[rows[at]], (r_u, r_v), residuals.shape[2], residuals.shape[1])
                 stored = flat[index].permute(0, 3, 1, 2).contiguous()
                 rebuilt[at] = read_at(stored, part.size)
         difference = rebuilt.to(part.values) - part.values

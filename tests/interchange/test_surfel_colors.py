@@ -1,10 +1,10 @@
-"""What other programs are shown of a colour: the fit against a float64 reference, the residual against its mean."""
+"""Surfel colours for other programs: the fit against a float64 reference, the residual against its mean."""
 
 import pytest
 import torch
 
 from bitymi_ns.bundle import Bundle
-from bitymi_ns.interchange.looks import fit_looks, rows_of, shown_residual, weighted_fit
+from bitymi_ns.interchange.surfel_colors import fit_colors, rows_of, weighted_fit, weighted_residuals
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.reference.view_color import sh_basis
 from bitymi_ns.scene.baked import BakedScene
@@ -33,7 +33,7 @@ def test_the_fit_is_that_of_weighted_least_squares() -> None:
 def test_harmonics_that_stay_positive_are_found_again(surfels) -> None:
     params = surfels(40, "sh")
     params["sh_dc"], params["sh_rest"] = params["sh_dc"].abs() + 2.0, 0.1 * params["sh_rest"]
-    found = fit_looks(baked(params, "sh"), None, *NOBODY).harmonics
+    found = fit_colors(baked(params, "sh"), None, *NOBODY).harmonics
     assert torch.allclose(found[:, 0], params["sh_dc"], atol=1e-5)
     assert torch.allclose(found[:, 1:], params["sh_rest"], atol=1e-5)
 
@@ -47,20 +47,20 @@ def test_the_fit_follows_the_colour_where_cameras_look_from(surfels, residual: f
     )
     seen = torch.ones(6, 40, dtype=torch.bool)
     added = None if residual is None else torch.full((40, 3), residual)
-    looks = fit_looks(baked(params, "sv"), added, seen, centers.double())
+    fitted = fit_colors(baked(params, "sv"), added, seen, centers.double())
     for center in centers:
         d = torch.nn.functional.normalize(params["means"].double() - center, dim=1)
         sites = [params[name].double() for name in ("sv_sites", "sv_log_tau", "sv_rgb")]
         target = torch.relu(reference.sv(*sites, d) + 0.5)
         target = target if residual is None else torch.relu(target + residual)
-        found = torch.relu((sh_basis(3, d)[..., None] * looks.harmonics.double()).sum(1) + 0.5)
+        found = torch.relu((sh_basis(3, d)[..., None] * fitted.harmonics.double()).sum(1) + 0.5)
         assert float((found - target).abs().mean()) < 0.01
-    assert looks.color.shape == (40, 3) and bool((looks.color >= 0).all())
+    assert fitted.color.shape == (40, 3) and bool((fitted.color >= 0).all())
 
 
 def test_the_residual_is_the_mean_over_the_disc(bundle: Bundle) -> None:
     scene = bundle.scene
-    found = shown_residual(scene)
+    found = weighted_residuals(scene)
     atlas, beta = scene.residuals().double(), kernel_parameters(scene.surfels)[1].double()
     for i, (x, y, layer, r_u, r_v) in enumerate(scene.tiles.tolist()):
         u, v = ((torch.arange(r) + 0.5) / r * 2 * scene.extent[i] - scene.extent[i] for r in (r_u, r_v))
@@ -69,9 +69,9 @@ def test_the_residual_is_the_mean_over_the_disc(bundle: Bundle) -> None:
         tile = atlas[layer, y : y + r_v, x : x + r_u]
         assert torch.allclose(found[i].double(), (tile * weight[..., None]).sum((0, 1)) / weight.sum(), atol=1e-5)
     scene.atlas = None
-    assert torch.equal(shown_residual(scene), scene.mean_residual)
+    assert torch.equal(weighted_residuals(scene), scene.mean_residual)
     scene.mean_residual = None
-    assert shown_residual(scene) is None
+    assert weighted_residuals(scene) is None
 
 
 def test_rows_of_lean_colours_keep_their_terms() -> None:

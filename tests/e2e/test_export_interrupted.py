@@ -10,7 +10,7 @@ import pytest
 from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bake import tune
 from bitymi_ns.bundle import check_files
-from bitymi_ns.plugin.export import command as host_export
+from bitymi_ns.plugin.export import command
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, run_export
 
@@ -25,7 +25,7 @@ def interrupted(*args: Any, **kwargs: Any) -> None:
         (tune, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
         (bake_learn, "learned", {}, False, "was not written"),
         (bake_learn, "learned", {"overwrite": True}, True, "is the earlier one"),
-        (host_export, "read_bundle", {"finetune_steps": 0}, False, "is complete"),
+        (command, "read_bundle", {"finetune_steps": 0}, False, "is complete"),
     ],
     ids=["fine-tuning", "bake", "bake of a replacement", "comparison"],
 )

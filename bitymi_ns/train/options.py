@@ -47,6 +47,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "guard.min_window": (1, MOST),
     "texels.start": (0, MOST),
     "texels.rate": (0, MOST),
+    "texels.travel": (0, MOST),
     "texels.prior": (TINY, MOST),
     "texels.surfel_rates": (0, MOST),
     "texels.pixels_per_texel": (TINY, MOST),

@@ -61,9 +61,11 @@ class LearningTexels:
         """
         self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
         self._rate: RemovableHandle | None = None
+        self._views = 1
 
     def begin(self, step: int, views: ReducedViews) -> bool:
         """Gives the surfels their tiles where this step is the first that needs them; whether it was."""
+        self._views = len(views)
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
         looked = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
@@ -92,7 +94,7 @@ class LearningTexels:
         field = self.scene.field
         if isinstance(field, TexelField):
             # the loss is a mean, the step wants a sum
-            rate = factor * self.schedule.texel_rate(step) * numbers(view.image, view.mask)
+            rate = factor * self.schedule.texel_rate(step, self._views) * numbers(view.image, view.mask)
             if self.processes.views == 1:
                 field.descent = TexelDescent(field.share, rate)
                 return

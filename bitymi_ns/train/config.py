@@ -161,7 +161,7 @@ class TexelConfig(TexelSteps):
     start: int = 18_000
     """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
     as the training views see it; 30,000 or more = there is no such part."""
-    travel: float = 0.5
+    travel: float = 0.3
     """How far a texel can move in all of that part, colour units: where it passes over the views few times, `rate` is
     raised so that texels get there, up to this."""
     surfel_rates: float = 0.4

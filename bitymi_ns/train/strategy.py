@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 DrawViews = Callable[[int, torch.Generator], list[View]]
 """(k, CPU generator) -> k different training views, or all when there are fewer."""
 
-SPLIT_LONG, SPLIT_WIDE = 0.6, 0.85
+SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
 """Scales of the halves of a split surfel, along its long axis and across it, as a share of the surfel's."""
 SPLIT_APART = 0.7
 """Distance of the halves' centres from the surfel's, in scales of its long axis."""
-SPLIT_OPACITY = 0.8
+SPLIT_OPACITY = 0.9
 """Opacity of the halves as a share of the surfel's: they overlap where it is most opaque."""
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 

@@ -151,9 +151,9 @@ def test_halves_lie_side_by_side_along_the_long_axis(bench):
         torch.testing.assert_close(offset[row], torch.stack([expected, -expected]))
         scales = halves["log_scales"].exp()[2 * row : 2 * row + 2]
         assert scales[:, long].tolist() == pytest.approx([0.12] * 2) and scales[:, wide].tolist() == pytest.approx(
-            [0.0425] * 2
+            [0.035] * 2
         )
-    opacity = 0.8 * parents["opacity_logits"].sigmoid().repeat_interleave(2)
+    opacity = 0.9 * parents["opacity_logits"].sigmoid().repeat_interleave(2)
     torch.testing.assert_close(halves["opacity_logits"].sigmoid(), opacity)
     for name in set(parents) - {"means", "log_scales", "opacity_logits"}:
         torch.testing.assert_close(halves[name], parents[name].repeat_interleave(2, 0))

@@ -1,11 +1,11 @@
 #!/usr/bin/env python
-"""Brings the package to a bare machine with a card, and runs what is to be known there in an order that loses nothing.
+"""Bring the package to a bare machine with a card, and run tests and benchmarks there.
 
 `card.py stage FOLDER --python python3.12` compiles the wheel here, for that Python and that card, and fetches the
 wheels of what the core packages need beside torch and numpy; nothing is compiled or fetched there. On the machine,
 `card.py run ORDER... --stage FOLDER --output RESULTS` unpacks them beside a copy of this checkout and runs the orders:
 each step is a process with a limit of its own, its output is appended to RESULTS/log.txt, and a step that fails is a
-line of the summary. Orders that are joined by a plus sign (check+variants) run at the same time: for what is not timed.
+line of the summary. Orders joined by a plus sign (check+gaussians) run at the same time: for what is not timed.
 """
 
 from __future__ import annotations
@@ -56,21 +56,20 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """What can be run: name -> steps. `fox` and `textures` need that capture in `data`; `train`, `variants`,
-    `gaussians` and `peers` take every other one. `peers`, `kernels` and `webgpu` draw the bundles that orders before
-    them left, `peers` the Gaussians of `gaussians`, too.
+    """Steps of every order, by name. `fox` needs that capture in `data`; `train`, `gaussians` and `peers` take every
+    other one. `peers`, `kernels` and `webgpu` draw the bundles that orders before them left, `peers` the Gaussians of
+    `gaussians`, too.
 
     Args:
         results: folder of the tables.
         data: folder of captures.
         surfels: sizes of the scenes in the tables.
-        steps: of the runs of `train` and `variants`; None = the preset's.
+        steps: of the runs of `train`; None = the preset's.
     """
     length = [] if steps is None else ["--steps", str(steps)]
-    bitymi = ("--presets", "bitymi")
     pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short"]
     bundles = results / "bundles"
-    baked = ("--surfels", "150000", "--runs", "100", "--no-check", "--sections", "baked")
+    baked = ("--surfels", "150000", "--runs", "100", "--sections", "baked")
     ncu = ["ncu", "--profile-from-start", "off", "--set", "detailed", "--clock-control", "none", "--page", "details"]
     large = ("--surfels", "150000", "--size", "1297x840")
     kept = sorted(file.parent for file in bundles.glob("**/bundle.json"))
@@ -91,25 +90,16 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             Step("sanitizers", [sanitizer(tool, *PROFILED) for tool in SANITIZERS], 150),
         ],
         "tables": [
-            Step("tables", [page("gpu.md", "gpu.py", "--runs", "100", "--no-check", "--surfels", *surfels)], 240),
+            Step(name, [page(f"{name}.md", "gpu.py", "--runs", "100", "--sections", name, "--surfels", *surfels)], 120)
+            for name in ("baked", "operations", "steps")
         ],
         "fox": [
             Step(
                 "fox",
-                [page("fox.md", "gpu_train.py", data / "fox", *bitymi, "--steps", "3000", "--keep", bundles)],
+                [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)],
                 200,
             ),
             Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
-        ],
-        "textures": [
-            Step(
-                "textures",
-                [
-                    page("textures.md", "gpu_train.py", data / "fox", *bitymi, "--textures", "hash", "texels")
-                    + ["--keep", str(bundles), "--steps", "3000"]
-                ],
-                200,
-            ),
         ],
         "profile": [
             Step(
@@ -121,22 +111,13 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "train": of_each(
             "",
             600,
-            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, *bitymi, "--keep", bundles / name, *length)],
-        ),
-        "variants": of_each(
-            "variants of ",
-            450,
-            lambda name: [
-                page(f"{name}-{i}.md", "gpu_train.py", data / name, *bitymi, "--textures", texture, "--downscale", "2")
-                + [*options, *length]
-                for i, (texture, options) in enumerate(VARIANTS)
-            ],
+            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)],
         ),
         "gaussians": of_each(
             "Gaussians of ",
             300,
             lambda name: [
-                python("gpu_peers.py", str(data / name), "--counts", str(count), "--save", str(results / name))
+                python("gpu_peers.py", str(data / name), "--train", str(count), "--gaussians", str(results / name))
                 for count in GAUSSIANS
             ],
         ),
@@ -145,7 +126,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             120,
             lambda name: [
                 page(f"{name}-peers.md", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
-                + ["--gaussians", *(str(results / name / f"{count}.pt") for count in GAUSSIANS)]
+                + ["--gaussians", str(results / name)]
             ],
         ),
         "kernels": [
@@ -161,17 +142,6 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             Step("webgpu", [page("webgpu.md", "gpu_webgpu.py", *sorted(bundles.glob("bitymi*")))], 90),
         ],
     }
-
-
-VARIANTS = (
-    ("hash", ()),
-    ("texels", ()),
-    ("hash", ("--options", "train.exposure=auto")),
-    ("texels", ("--options", "train.exposure=auto")),
-    ("none", ("--options", "train.exposure=auto")),
-    ("texels", ("--options", "train.exposure=auto", "train.loss.falloff_weight=0")),
-)
-"""Textures and options that are compared on a capture at half its size."""
 
 
 GAUSSIANS = (300_000, 1_000_000)
@@ -195,7 +165,7 @@ SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 
 def stage(arguments: argparse.Namespace) -> int:
-    """Makes the folder that travels."""
+    """Make the folder of wheels."""
     folder = arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
@@ -224,7 +194,7 @@ def stage(arguments: argparse.Namespace) -> int:
 
 
 def unpack(wheels: Path, work: Path) -> dict[str, str]:
-    """Installs the wheels aside, copies the checkout with their compiled modules, and gives the environment for it."""
+    """Install the wheels into a folder, copy the checkout with their compiled modules; returns the environment."""
     site = work / "site"
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
     subprocess.run([*command, str(site), *map(str, sorted(wheels.glob("*.whl")))], check=True)
@@ -241,7 +211,7 @@ def unpack(wheels: Path, work: Path) -> dict[str, str]:
 
 
 def run_step(step: Step, tree: Path, environment: dict[str, str], log: Path, deadline: float) -> str:
-    """Runs a step and gives its line of the summary."""
+    """Run a step; returns its line of the summary."""
     start = time.perf_counter()
     limit = min(step.limit, deadline - time.monotonic())
     if limit < 5:

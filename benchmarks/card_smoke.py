@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Each CUDA kernel once on a scene of a given size: what sanitizers and profilers are pointed at.
+"""Run each CUDA kernel once on a scene of a size of choice, for sanitizers and profilers.
 
 `--sections baked training` chooses; `--profile` marks one warm run of them for a profiler that waits for the mark (ncu
 --profile-from-start off), `--times` prints the device's time by kernel over a number of runs.
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 from gpu_baked import around, textured
-from gpu_common import deterministic, photo_loss, trained_like, training_step, with_texels
+from harness import deterministic, photo_loss, trained_like, training_step, with_texels
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle

@@ -1,38 +1,17 @@
-"""What the scripts of this folder share with `bitymi bench`: pages of Markdown."""
+"""Shared by the scripts of this folder: Markdown pages and progress, as `bitymi bench` writes them."""
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
-if importlib.util.find_spec("bitymi_ns") is None:  # not installed, or not yet: gpu.py builds it
-    sys.path.append(str(Path(__file__).resolve().parent.parent))
+from bitymi_ns.measure.bench.process import say
+from bitymi_ns.measure.markdown import number, page, table
 
-from bitymi_ns.measure.bench.commands import read_curve
-from bitymi_ns.measure.bench.process import CommandFailed, say
-from bitymi_ns.measure.bench.tables import difference, number, page
-from bitymi_ns.measure.markdown import table
-
-T = TypeVar("T")
-__all__ = ["CommandFailed", "cpu_milliseconds", "difference", "number", "page", "publish", "read_curve", "say", "table"]
-
-
-def cpu_milliseconds(run: Callable[[], T], repeats: int) -> tuple[T, float]:
-    """What a call returns, and the least milliseconds of the thread over some calls; one before them makes room."""
-    times, result = [], run()
-    for _ in range(repeats):
-        start = time.thread_time()
-        result = run()
-        times.append(1e3 * (time.thread_time() - start))
-    return result, min(times)
+__all__ = ["number", "page", "publish", "say", "table"]
 
 
 def publish(text: str, output: Path | None, silent: bool = False) -> None:
-    """Print a page (unless `silent`), and write it where asked."""
+    """Print a page (unless `silent`), and write it to `output` if that is a path."""
     if not silent:
         print(text)
     if output is not None:

@@ -1,12 +1,12 @@
 #!/usr/bin/env python
-"""A fixed small job, compared with the committed baseline: quality, bytes, memory and time may not get worse unnoticed.
+"""Compare a fixed small job with the committed baseline: quality, bytes, memory and time.
 
 Each scene is trained, baked, tuned, written and drawn in a process of its own, with one thread. Training is chaotic: a
-change of rounding alone moves one seed's PSNR over the few held-out views by up to 0.13 dB. So the PSNR that is judged
-is over all photographs, and the mean of several seeds. The same code on the same kind of processor gives the same. CPU
-seconds are divided by those of a calibration that has nothing of this package in it and runs before, between and after
-the parts, so that a busy machine, or a slower one of the same kind, gives the same figures. With `--accept` the figures
-become the new baseline, benchmarks/gate.json; the commit then shows what changed.
+change of rounding alone moves one seed's PSNR over the few held-out views by up to 0.13 dB. So the PSNR that is
+compared is over all photographs, and the mean of several seeds. The same code on the same kind of processor gives the
+same. CPU seconds are divided by those of a calibration that has nothing of this package in it and runs before, between
+and after the parts, so that a busy machine, or a slower one of the same kind, gives the same figures. With `--accept`
+the figures become the new baseline, benchmarks/gate.json; the commit then shows what changed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Limit:
-    """How much worse a figure may be than the baseline.
+    """Tolerance of a figure against the baseline.
 
     Attributes:
         better: whether "more" or "less" of it is better.
@@ -62,7 +62,7 @@ class Limit:
     timed: bool = False
 
     def worse(self, value: float, baseline: float, slack: float = 1.0) -> bool:
-        """Whether the figure is worse than the baseline by more than `slack` times what it may be."""
+        """True if the figure is worse than the baseline by more than `slack` times its limit."""
         loss = baseline - value if self.better == "more" else value - baseline
         return loss > slack * (self.by * abs(baseline) if self.relative else self.by)
 
@@ -130,8 +130,7 @@ class Calibration:
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """What `work` returns, and its CPU seconds in units of the calibrations that it did on its way, or of one after
-        it."""
+        """Run `work`; returns its result, and its CPU seconds over those of the calibrations in it, or of one after."""
         self.seconds.clear()
         start = time.process_time()
         result = work()
@@ -304,7 +303,7 @@ def main() -> None:
     from common import say, table
 
     from bitymi_ns.files import write_file
-    from bitymi_ns.measure.bench.machine import processor
+    from bitymi_ns.measure.machine import processor
 
     settings = Settings(options.steps, options.tuning, options.seeds)
     empty = {"settings": asdict(settings), "processor": processor(), "scenes": {}}

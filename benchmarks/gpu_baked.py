@@ -1,7 +1,7 @@
-"""Section of gpu.py: frames of the baked renderer, stage by stage, beside gsplat's; frames.py counts more of a bundle.
+"""Section of gpu.py: frames of the baked renderer, stage by stage, beside gsplat's.
 
-The scene of `gpu_common.trained_like` with BC7 tiles of random texels, as large as the surfels are on screen, and the
-weight bound of the presets; or bundles (--bundles), seen from three places around their middle. What a stage cannot do
+The scene of `harness.trained_like` with BC7 tiles of random texels, as large as the surfels are on screen, and the
+weight bound of the presets; or bundles (--bundles), seen by three cameras around their middle. What a stage cannot do
 without, with n surfels of which v are visible, b pairs of surfel and tile, f fragments, p pixels, K sites:
 
   prepare   56 n + (28 K + 132) v bytes: parameters, then rows of 96 bytes
@@ -26,10 +26,8 @@ from pathlib import Path
 import gpu_gsplat
 import torch
 from common import number, say, table
-from frames import pair_counts
-from gpu_common import (
+from harness import (
     Options,
-    Section,
     arithmetic_rate,
     attempt,
     failures,
@@ -37,37 +35,25 @@ from gpu_common import (
     trained_like,
     with_launches,
 )
+from torch import Tensor
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.ops.baked_cuda import Stage, Workspace, listed_pairs
+from bitymi_ns.ops.constants import ALPHA_MIN, BETA_MAX, SUPPORT
+from bitymi_ns.ops.reference.project import rotation
 from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
 LARGE = (3840, 2160)
 TIMED = ("list", "draw", "frame", "graph", "packed", "alone", "early")
-"""What `measured` times, in the order of the columns from "list ms" on."""
+"""Timings of `measured`, in the order of the columns from "list ms" on."""
 HEADER = (
-    "scene",
-    "size",
-    "million pairs",
-    "pairs/tile",
-    "of discs across the camera's plane",
-    "fragments/pixel",
-    "list ms",
-    "draw ms",
-    "frame ms",
-    "graph ms",
-    "packed, graph ms",
-    "packed, waited for ms",
-    "ends at 1/512, graph ms",
-    "differs, 8-bit steps",
-    "frames/s",
-    "G fragments/s",
-    "draw: of fp32",
-    "draw: of copy",
-)
+    "scene", "size", "million pairs", "pairs/tile", "of discs across the camera's plane", "fragments/pixel",
+    "list ms", "draw ms", "frame ms", "graph ms", "packed, graph ms", "packed, waited for ms",
+    "ends at 1/512, graph ms", "differs, 8-bit steps", "frames/s", "G fragments/s", "draw: of fp32", "draw: of copy",
+)  # fmt: skip
 
 
 def frames(options: Options) -> str:
@@ -129,6 +115,29 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
     return baked.to(device), camera
 
 
+def crossing(scene: BakedScene, camera: Camera) -> Tensor:
+    """Discs that cross the camera's plane, [N] bool: they have no bounding box in the image.
+
+    From the level sets sigma = 1/255 of the parameters in float64, not from a kernel's rows.
+    """
+    p = {name: value.detach().double().cpu() for name, value in scene.surfels.items()}
+    viewmat = camera.viewmat.double().cpu()
+    times = torch.sigmoid(p["opacity_logits"]) / ALPHA_MIN
+    exponent = -1 / (BETA_MAX * torch.sigmoid(p["beta_raw"]))
+    radius = SUPPORT * (1 - times.clamp(min=1) ** exponent).sqrt()
+    depth = p["means"] @ viewmat[2, :3] + viewmat[2, 3]
+    # half axes of the level set, camera z
+    axes = (viewmat[2, :3] @ rotation(p["quats"])[:, :, :2]) * p["log_scales"].exp() * radius[:, None]
+    return (depth > scene.near) & (times > 1) & (depth < axes.norm(dim=1))
+
+
+def pairs_per_tile(workspace: Workspace, scene: BakedScene, camera: Camera) -> tuple[float, float]:
+    """Pairs per screen tile of the latest frame, and those of discs across the camera's plane."""
+    lists = listed_pairs(workspace, len(scene), 1, camera.width, camera.height)
+    tiles, pairs = len(lists.ranges), lists.pairs[: workspace.pairs]
+    return len(pairs) / tiles, int(crossing(scene, camera).to(pairs.device)[pairs >> 8].sum()) / tiles
+
+
 def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
     """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of each column of the
     table from `list` to `packed, waited for` ("alone") and of the frame whose pixels end early ("early"); and by how
@@ -146,9 +155,9 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
         for renderer in (frame, recorded, packed, early):
             renderer.draw([camera])
         sums["pairs"] += frame.workspace.pairs
-        counts = pair_counts(frame.workspace, scene, camera)
-        sums["per_tile"] += counts.per_tile
-        sums["across"] += counts.across
+        per_tile, across = pairs_per_tile(frame.workspace, scene, camera)
+        sums["per_tile"] += per_tile
+        sums["across"] += across
         cases: list[tuple[str, Callable[[], object]]] = [
             ("list", lambda frame=frame: frame.run(Stage.LIST)),
             ("draw", lambda frame=frame: frame.run(Stage.DRAW)),
@@ -188,7 +197,7 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
 
 
 def around(bundle, width: int, height: int) -> list[Camera]:
-    """Three cameras around the middle of a bundle, which training places in the ball of the cameras, of radius 1."""
+    """Three cameras around the middle of a bundle; training scales the cameras of a capture to the unit ball."""
     middle = bundle.scene.surfels["means"].median(dim=0).values
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     cameras = []
@@ -201,6 +210,3 @@ def around(bundle, width: int, height: int) -> list[Camera]:
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
         cameras.append(Camera(viewmat, K, width, height))
     return cameras
-
-
-SECTIONS = (Section("baked", ("baked_frame",), frames),)

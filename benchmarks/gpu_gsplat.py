@@ -1,5 +1,5 @@
-"""gsplat on the scenes of `gpu_common.trained_like`, for the sections that it stands beside. Optional: where it cannot
-be imported, that is said.
+"""gsplat for the sections of gpu.py and for gpu_peers.py, on the scenes of `harness.trained_like`. Optional: a note
+says where it cannot be imported.
 
 It gets the same centres, orientations and opacities, SH of degree 3, and the scales at which its Gaussians have the
 curvature of the Beta kernels at their centres. Where the version has an inference renderer
@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from common import number, say, table
-from gpu_common import Options, attempt, milliseconds, trained_like
+from harness import Options, attempt, milliseconds, trained_like
 from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
@@ -27,7 +27,7 @@ NOTE = (
 
 
 def load() -> tuple[Any, str]:
-    """The module and, where it is missing, why."""
+    """Import gsplat: the module and, where it is missing, the reason."""
     try:
         import gsplat
         import gsplat.cuda._backend  # compiles the kernels where that was not done
@@ -89,7 +89,7 @@ def frames(options: Options, ours: dict[tuple[int, int, int], float]) -> str:
 
 
 Frames = Callable[[Camera], Callable[[], Tensor]]
-"""Gives for a camera what draws its view: [H, W, 3]."""
+"""Makes for a camera a function that draws its view, [H, W, 3]."""
 
 
 def rasterized(kind: str) -> Callable[[Any, dict[str, Tensor]], Frames]:

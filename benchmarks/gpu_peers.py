@@ -1,11 +1,11 @@
 #!/usr/bin/env python
-"""Equal quality on a card: gsplat's Gaussians are trained on the photographs that our bundles were trained on, by its
-MCMC strategy with several numbers of Gaussians, and both are drawn at the held-out cameras: PSNR beside ms per frame.
+"""Compare with gsplat at equal quality on a card: train its Gaussians on the photographs of our bundles by its MCMC
+strategy, with several numbers of Gaussians, and draw both at the held-out cameras: PSNR beside ms per frame.
 
-Our bundles are those that `gpu_train.py --keep` left. The Gaussians get the rates of gsplat's own example (positions
-1.6e-4 times the extent of the cameras, falling to a hundredth; scales 5e-3, opacities 5e-2, rotations 1e-3, colours
-2.5e-3 and a twentieth of it), the same points to start from, and losses of 0.8 L1 + 0.2 (1 - SSIM) with the weights
-of 0.01 on opacities and scales that the strategy asks for.
+Our bundles are those that `gpu_train.py --keep` left; `--train` trains the Gaussians first. They get the rates of
+gsplat's own example (positions 1.6e-4 times the extent of the cameras, falling to a hundredth; scales 5e-3, opacities
+5e-2, rotations 1e-3, colours 2.5e-3 and a twentieth of it), the same points to start from, and losses of 0.8 L1 + 0.2
+(1 - SSIM) with the weights of 0.01 on opacities and scales that the strategy asks for.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from typing import Any
 import torch
 from common import number, page, publish, say, table
 from gpu_baked import measured
-from gpu_common import Options, attempt, milliseconds
 from gpu_gsplat import RENDERERS, Frames, load
+from harness import Options, attempt, milliseconds
 from plain_capture import Capture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -44,20 +44,13 @@ RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0
 
 @dataclass
 class Row:
-    """One way to draw one scene.
-
-    Attributes:
-        name: of the renderer.
-        count: primitives.
-        seconds: of training; None = not trained here.
-        quality: psnr, psnr after the affine fit of each view, ssim; means over the held-out views.
-        frames: factor of the photographs' size -> mean ms per frame over some held-out cameras.
-    """
+    """A way to draw a scene: renderer, primitives, seconds of training (None = not trained here), means over the
+    held-out views of psnr, psnr after the affine fit and ssim, and factor of the size -> mean ms per frame."""
 
     name: str
     count: int
     seconds: float | None
-    quality: tuple[float, float, float]
+    quality: tuple[float, ...]
     frames: dict[int, float]
 
 
@@ -71,7 +64,7 @@ def quality(draw: Callable[[Camera], Tensor], views: Sequence[View], device: tor
 
 
 def timed(make: Callable[[Camera], Callable[[], object]], cameras: Sequence[Camera], options: Options) -> float:
-    """Mean over the cameras of the median milliseconds of what `make` gives for one."""
+    """Mean over the cameras of the median milliseconds of a frame."""
     return fmean(milliseconds(make(camera), options) for camera in cameras)
 
 
@@ -180,7 +173,7 @@ def row(
     times: Sequence[int],
     options: Options,
 ) -> Row:
-    """Measures one way to draw."""
+    """Measure one renderer."""
     good = quality(lambda camera: make(camera)(), capture.held_out, options.device)
     frames = {k: timed(make, [camera.scaled(k) for camera in cameras], options) for k in times}
     say(f"{name}, {count:,}: {good[0]:.2f} dB, " + ", ".join(f"{ms:.3f} ms at {k} x" for k, ms in frames.items()))
@@ -193,7 +186,7 @@ def packed_picture(scene: BakedScene, camera: Camera) -> Tensor:
     return drawn.view(torch.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
 
 
-def report(rows: Sequence[Row], capture: Capture, times: Sequence[int], baked: int) -> str:
+def report(rows: Sequence[Row], capture: Capture, times: Sequence[int]) -> str:
     """Markdown."""
     camera = capture.held_out[0].camera
     header = ("what draws", "primitives", "training s", "PSNR dB", "after affine fit", "SSIM")
@@ -204,7 +197,6 @@ def report(rows: Sequence[Row], capture: Capture, times: Sequence[int], baked: i
         for r in rows
     ]
     text = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n"
-    text += f"The first {baked} rows are our bundles.\n" if baked else ""
     return text + "\n" + table(header, cells)
 
 
@@ -214,70 +206,54 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
-    parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes of the same capture")
-    parser.add_argument("--counts", nargs="+", type=int, default=[300_000, 1_000_000])
+    parser.add_argument("--train", nargs="+", type=int, metavar="COUNT", help="train so many Gaussians, draw nothing")
     parser.add_argument("--steps", type=int, default=20_000, help="of training Gaussians (%(default)s)")
+    parser.add_argument("--gaussians", type=Path, required=True, help="folder of the trained Gaussians")
+    parser.add_argument("--bundles", nargs="*", type=Path, default=[], help="baked scenes of the same capture")
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
-    parser.add_argument("--downscale", type=int, default=1, help="whole factor by which photographs are reduced")
     parser.add_argument("--cameras", type=int, default=6, help="held-out cameras that are timed (%(default)s)")
     parser.add_argument("--runs", type=int, default=50, help="frames per camera (%(default)s)")
-    parser.add_argument("--save", type=Path, help="train into files of this folder, and draw nothing")
-    parser.add_argument("--gaussians", nargs="+", type=Path, help="draw these files, and train nothing")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew after each row")
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
-        parser.error("no CUDA device is to be seen (or torch is a CPU build)")
-    device = torch.device("cuda")
-    capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
-    every = max(1, len(capture.held_out) // arguments.cameras)
-    cameras = [view.camera.to(device) for view in capture.held_out[::every][: arguments.cameras]]
-    options = Options(device, (), (), 5, arguments.runs, 0.0)
-    if arguments.save:
-        arguments.save.mkdir(parents=True, exist_ok=True)
-        for most in arguments.counts:
-            trained = Gaussians(load()[0], capture, most, arguments.steps, device)
-            torch.save((trained.finished(), trained.seconds), arguments.save / f"{most}.pt")
+        parser.error("no CUDA device was found (or torch is a CPU build)")
+    device, times = torch.device("cuda"), arguments.times
+    capture = load_capture(arguments.data.expanduser())
+    gsplat, why = load()
+    if arguments.train:
+        arguments.gaussians.mkdir(parents=True, exist_ok=True)
+        for most in arguments.train:
+            trained = Gaussians(gsplat, capture, most, arguments.steps, device)
+            torch.save((trained.finished(), trained.seconds), arguments.gaussians / f"{most}.pt")
             say(f"{most:,} Gaussians, {arguments.steps:,} steps: {trained.seconds:.0f} s")
         return 0
+    every = max(1, len(capture.held_out) // arguments.cameras)
+    cameras = [view.camera.to(device) for view in capture.held_out[::every][: arguments.cameras]]
+    options = Options(device, 5, arguments.runs)
     rows: list[Row] = []
-    notes = [f"Device: {torch.cuda.get_device_name(device)}."]
-    baked = 0
+    notes = [f"Device: {torch.cuda.get_device_name(device)}.", *filter(None, [why])]
 
     def write(silent: bool = True) -> None:
-        text = page(f"Equal quality: {arguments.data.name}", report(rows, capture, arguments.times, baked), notes)
+        text = page(f"Equal quality: {arguments.data.name}", report(rows, capture, times), notes)
         publish(text, arguments.output, silent=silent)
 
     for folder in arguments.bundles:
         bundle = read_bundle(folder, decode=False)
         scene = bundle.scene.to(device)
         good = quality(lambda camera, scene=scene: packed_picture(scene, camera), capture.held_out, device)
-        frames = {}
-        for k in arguments.times:
-            means = measured(scene, [camera.scaled(k) for camera in cameras], options)
-            frames[k] = means["packed"]
-            say(f"{folder.name} at {k} x: " + ", ".join(f"{name} {value:,.3f}" for name, value in means.items()))
-        say(f"{folder.name}: {good[0]:.2f} dB")
+        frames = {k: measured(scene, [camera.scaled(k) for camera in cameras], options)["packed"] for k in times}
+        say(f"{folder.name}: {good[0]:.2f} dB, {frames}")
         rows.append(Row(folder.name, len(bundle), None, good, frames))
-        baked += 1
         write()
-    gsplat, why = load()
-    if gsplat is None:
-        notes.append(why)
-    for what in (arguments.gaussians or arguments.counts) if gsplat is not None else []:
-        if isinstance(what, Path):
-            g, seconds = torch.load(what, map_location=device, weights_only=True)
-        else:
-            trained = Gaussians(gsplat, capture, what, arguments.steps, device)
-            g, seconds = trained.finished(), trained.seconds
-            del trained
-        n = len(g["means"])
+    for file in sorted(arguments.gaussians.glob("*.pt")) if gsplat is not None else []:
+        g, seconds = torch.load(file, map_location=device, weights_only=True)
         for name in ("rasterization", "inference renderer"):
 
             def drawn(name: str = name, g: dict = g, s: float = seconds) -> Row:
                 made = RENDERERS[name](gsplat, g)
-                return row(f"gsplat {name}", len(g["means"]), s, made, capture, cameras, arguments.times, options)
+                return row(f"gsplat {name}", len(g["means"]), s, made, capture, cameras, times, options)
 
-            if found := attempt(f"{name}, {n:,}", drawn):
+            if found := attempt(f"{name}, {file.stem}", drawn):
                 rows.append(found)
             write()
     write(silent=False)

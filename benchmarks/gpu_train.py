@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Trains a capture on a CUDA card with the core packages alone (nerfstudio is not used), bakes it and draws the bundle:
+"""Train a capture on a CUDA card with the core packages alone (nerfstudio is not used), bake it and draw the bundle:
 held-out PSNR against seconds of training, peak memory, bytes of the atlas, frames a second of trained and baked scene.
 
 `--device cpu` runs the same on the CPU, to try the script: take few steps and a --downscale.
@@ -12,122 +12,50 @@ import math
 import sys
 import tempfile
 import time
-import traceback
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
 from common import number, page, publish, say, table
-from gpu_common import Options, milliseconds
+from harness import Options, milliseconds
 from plain_capture import Capture, load_capture
 
 from bitymi_ns import bundle
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
-from bitymi_ns.plugin.run.preset import Preset, PresetError, load_preset
+from bitymi_ns.plugin.run.preset import Preset, load_preset
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.views import judging_background
 
-
-class Stages:
-    """Progress that adds up the seconds before each report, by what was reported."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def __call__(self, step: str, done: int, total: int) -> None:
-        now = time.perf_counter()
-        self._seconds[step] = self._seconds.get(step, 0.0) + now - self._last
-        self._last = now
-
-    def __str__(self) -> str:
-        return ", ".join(f"{step} {seconds:.1f}" for step, seconds in self._seconds.items())
+CURVE = ("steps", "training s", "surfels", "PSNR dB", "after affine fit")
+FIGURES = ("peak MB", "waits a step", "frames/s", "bake s", "atlas MB", "baked PSNR dB", "baked frames/s")
 
 
-@dataclass
-class Point:
-    """The state of a run after `step` steps."""
-
-    step: int
-    seconds: float
-    surfels: int
-    psnr: float
-    cc_psnr: float
-
-
-@dataclass
-class Result:
-    """One run.
-
-    Attributes:
-        curve: held-out PSNR over the run.
-        peak: most bytes allocated on the card while training.
-        waits: how often the host waited for the card in a step, of the last steps; None on the CPU.
-        frame: median milliseconds of a held-out view of the trained scene.
-        baked_psnr, baked_frame: of the bundle.
-        atlas: bytes of the atlas.
-        bake_seconds: of the bake with encoding.
-    """
-
-    preset: str
-    curve: list[Point]
-    peak: int
-    waits: float | None
-    frame: float
-    baked_psnr: float
-    baked_frame: float
-    atlas: int
-    bake_seconds: float
-
-
-def new_scene(capture: Capture, preset: Preset) -> Scene:
-    """Surfels at the points of the capture, as the preset wants them."""
-    centers = torch.stack([view.camera.center for view in capture.train])
-    pixels = sum(view.camera.width * view.camera.height for view in capture.train)
-    bounded = capture.train[0].image.shape[-1] == 4
-    scene, _ = build_scene(
-        capture.points,
-        capture.colours,
-        centers,
-        preset.scene,
-        preset.train,
-        bounded,
-        image_pixels=pixels,
-    )
-    return scene
-
-
-def chosen(name: str, texture: str | None, options: Sequence[str]) -> tuple[str, Preset]:
-    """A preset with another texture and other options, each `group.name=value` of the preset's file; and what to call
-    it.
+def preset_of(name: str, options: Sequence[str]) -> Preset:
+    """A preset with other options, each `group.name=value` of the preset's file.
 
     Raises:
         PresetError: there is no such option.
     """
-    changes = [*options, *([] if texture is None else [f"scene.texture={texture}"])]
     values: dict[str, Any] = {}
-    for change in changes:
+    for change in options:
         keys, _, value = change.partition("=")
         group = values
         *above, last = keys.split(".")
         for key in above:
             group = group.setdefault(key, {})
         group[last] = yaml.safe_load(value)
-    label = "-".join([name, *(change.rpartition(".")[2].replace("=", "-") for change in changes)])
-    return label, load_preset(name, changes=values)
+    return load_preset(name, changes=values)
 
 
 def waits_of(trainer: Trainer, steps: int) -> float:
-    """Mean number of times that the host waits for the card in a step, over the next steps."""
+    """Mean number of waits of the host for the card in a step, over the next steps."""
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -140,21 +68,17 @@ def waits_of(trainer: Trainer, steps: int) -> float:
 
 
 def run(
-    name: str,
-    preset: Preset,
-    capture: Capture,
-    steps: int,
-    points: int,
-    device: torch.device,
-    options: Options,
-    keep: Path | None,
-) -> Result:
-    """Trains, bakes and draws; the bundle stays in the folder `keep`, where one is given."""
-    scene = new_scene(capture, preset).to(device)
+    preset: Preset, capture: Capture, steps: int, points: int, options: Options, target: Path
+) -> tuple[list[list[str]], list[str]]:
+    """Train, bake into the folder `target` and draw; returns the rows of the curve, and FIGURES."""
+    device, cuda = options.device, options.device.type == "cuda"
+    centers = torch.stack([view.camera.center for view in capture.train])
+    pixels = sum(view.camera.width * view.camera.height for view in capture.train)
+    bounded = capture.train[0].image.shape[-1] == 4
+    start_of = (capture.points, capture.colours, centers, preset.scene, preset.train, bounded)
+    scene = build_scene(*start_of, image_pixels=pixels)[0].to(device)
     trainer = Trainer(scene, capture.train, preset.train, steps)
     due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
-    cuda = device.type == "cuda"
-    pixels = capture.held_out[0].camera.width * capture.held_out[0].camera.height
     if cuda:
         torch.cuda.reset_peak_memory_stats(device)
     curve, seconds, waits = [], 0.0, None
@@ -170,12 +94,9 @@ def run(
         if trainer.step in due:
             trainer.training.watch.finish(scene)
             quality = evaluate(scene, capture.held_out, preset.train)
-            curve.append(Point(trainer.step, seconds, len(scene), quality.psnr, quality.cc_psnr))
-            say(
-                f"{name}: step {trainer.step:,} of {steps:,}, {seconds:.1f} s, {quality.psnr:.2f} dB "
-                f"({quality.cc_psnr:.2f} after the affine fit), {len(scene):,} surfels, "
-                f"{quality.fragments / pixels:.1f} fragments per pixel"
-            )
+            row = [number(trainer.step, 0), number(seconds, 1), number(len(scene), 0)]
+            curve.append([*row, number(quality.psnr), number(quality.cc_psnr)])
+            say(", ".join(f"{value} {name}" for name, value in zip(CURVE, curve[-1], strict=True)))
     peak = torch.cuda.max_memory_allocated(device) if cuda else 0
     camera = capture.held_out[0].camera.to(device)
     with torch.no_grad():
@@ -183,21 +104,15 @@ def run(
     start = time.perf_counter()
     background = judging_background(preset.train, torch.device("cpu"))
     cameras = [view.camera.to(device) for view in capture.train]
-    stages = Stages()
-    made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning(), stages)  # nothing learns
+    made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning())  # without fine-tuning
     bake_seconds = time.perf_counter() - start
-    say(f"{name}: bake, seconds by what was reported at the end of them: {stages}")
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder if keep is None else keep) / f"{name}-{steps}"
-        bundle.export(made, target)
-        baked = bundle.read_bundle(target).scene
-    if cuda:
-        baked = baked.to(device)
+    bundle.export(made, target)
+    baked = bundle.read_bundle(target).scene.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)
     size = 0 if made.atlas is None else made.atlas.nbytes
-    return Result(
-        name, curve, peak, waits, frame, _psnr(baked, capture, preset, device), baked_frame, size, bake_seconds
-    )
+    figures = [number(peak / 1e6, 0), number(waits, 1), number(1e3 / frame, 0), number(bake_seconds, 1)]
+    figures += [number(size / 1e6), number(_psnr(baked, capture, preset, device)), number(1e3 / baked_frame, 0)]
+    return curve, figures
 
 
 def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.device) -> float:
@@ -209,56 +124,15 @@ def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.dev
     return mean_psnr(values)
 
 
-def report(results: list[Result], capture: Capture) -> str:
-    """Markdown."""
-    camera = capture.held_out[0].camera
-    rows = [
-        [
-            r.preset,
-            number(r.curve[-1].seconds, 1),
-            number(r.curve[-1].psnr, 2),
-            number(r.curve[-1].cc_psnr, 2),
-            number(r.curve[-1].surfels, 0),
-            number(r.peak / 1e6, 0),
-            number(r.waits, 1),
-            number(1e3 / r.frame, 0),
-            number(r.bake_seconds, 1),
-            number(r.atlas / 1e6, 2),
-            number(r.baked_psnr, 2),
-            number(1e3 / r.baked_frame, 0),
-        ]
-        for r in results
-    ]
-    header = ("preset", "training s", "PSNR dB", "after affine fit", "surfels", "peak MB", "waits a step", "frames/s")
-    header += ("bake s", "atlas MB", "baked PSNR dB", "baked frames/s")
-    text = (
-        f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n\n"
-    )
-    text += table(header, rows)
-    for r in results:
-        curve = [
-            [number(p.step, 0), number(p.seconds, 1), number(p.surfels, 0), number(p.psnr, 2), number(p.cc_psnr, 2)]
-            for p in r.curve
-        ]
-        header = ("step", "seconds", "surfels", "PSNR dB", "after affine fit")
-        text += f"\n\n#### {r.preset}\n\n" + table(header, curve)
-    return text
-
-
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
+    parser.add_argument("--preset", default="bitymi", help="of method_configs (%(default)s)")
     parser.add_argument(
-        "--presets", nargs="+", default=["bitymi", "bitymi-quality"], help="method_configs (%(default)s)"
-    )
-    parser.add_argument(
-        "--textures", nargs="+", choices=("hash", "texels", "none"), help="each of them in place of a preset's own"
-    )
-    parser.add_argument(
-        "--options", nargs="+", default=[], metavar="KEY=VALUE", help="of the presets' files: train.exposure=auto"
+        "--options", nargs="+", default=[], metavar="KEY=VALUE", help="of the preset's file: scene.texture=hash"
     )
     parser.add_argument("--steps", type=int, help="length of a run; default: the preset's on a GPU")
     parser.add_argument("--points", type=int, default=10, help="evaluations over a run (%(default)s)")
@@ -266,38 +140,30 @@ def main() -> int:
     parser.add_argument("--device", default="cuda", help="cuda or cpu (%(default)s)")
     parser.add_argument("--warm-up", type=int, default=10, help="frames before those that are timed (%(default)s)")
     parser.add_argument("--runs", type=int, default=200, help="frames that are timed (%(default)s)")
-    parser.add_argument("--keep", type=Path, help="folder in which the bundles stay")
+    parser.add_argument("--keep", type=Path, help="folder in which the bundle stays")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
     if device.type == "cuda" and not torch.cuda.is_available():
-        parser.error("no CUDA device is to be seen (or torch is a CPU build); --device cpu tries the script without")
-    try:
-        capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
-    except (OSError, KeyError, ValueError) as error:
-        parser.error(f"the capture {arguments.data} cannot be read: {error}")
-    options = Options(device, (), (), arguments.warm_up, arguments.runs, 0.0)
-    what: Any = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    notes = [f"Device: {what}.", f"Frames: median of about {arguments.runs} after {arguments.warm_up}."]
-    results, failed = [], False
-    textures = arguments.textures or (None,)
-    try:
-        runs = [chosen(name, texture, arguments.options) for name in arguments.presets for texture in textures]
-    except PresetError as error:
-        parser.error(str(error))
-    for name, preset in runs:
-        steps = arguments.steps or preset.trainer.iterations
-        points = min(arguments.points, steps)
-        try:
-            results.append(run(name, preset, capture, steps, points, device, options, arguments.keep))
-        except (RuntimeError, ValueError, OSError) as error:
-            traceback.print_exc()
-            notes.append(f"{name} failed: {' '.join(str(error).split())[:400]}")
-            failed = True
-        last = name == runs[-1][0]
-        text = page(f"Training on a card: {arguments.data.name}", report(results, capture), notes)
-        publish(text, arguments.output, silent=not last)
-    return int(failed)
+        parser.error("no CUDA device was found (or torch is a CPU build); --device cpu tries the script without")
+    capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
+    preset = preset_of(arguments.preset, arguments.options)
+    options = Options(device, arguments.warm_up, arguments.runs)
+    steps = arguments.steps or preset.trainer.iterations
+    name = "-".join([arguments.preset, *(o.rpartition(".")[2].replace("=", "-") for o in arguments.options)])
+    with tempfile.TemporaryDirectory() as folder:
+        target = (arguments.keep or Path(folder)) / f"{name}-{steps}"
+        curve, figures = run(preset, capture, steps, min(arguments.points, steps), options, target)
+    camera = capture.held_out[0].camera
+    held_out = f"{len(capture.held_out)} held out"
+    text = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {held_out}.\n\n"
+    text += table(("preset", *CURVE, *FIGURES), [[name, *curve[-1], *figures]]) + "\n\n" + table(CURVE, curve)
+    notes = [
+        f"Device: {torch.cuda.get_device_name(device) if device.type == 'cuda' else 'CPU'}.",
+        f"Frames: median of about {arguments.runs} after {arguments.warm_up}.",
+    ]
+    publish(page(f"Training: {arguments.data.name}", text, notes), arguments.output)
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 #!/usr/bin/env python
-"""Bundles drawn through WebGPU on the graphics device of this machine, beside the CUDA renderer where there is one:
-median ms per frame, and how far the pictures differ.
+"""Draw bundles through WebGPU on the graphics device of this machine, beside the CUDA renderer where there is one:
+median ms per frame, and differences of the pictures.
 
 A frame through WebGPU is queued many times without reading it back, so that neither the copy to the host nor its
 waiting is measured; its sums have the precision that the device blends in. The CUDA frame is a recorded graph with
@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from common import number, page, publish, say, table
 from gpu_baked import around, measured
-from gpu_common import Options
+from harness import Options
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops import webgpu
@@ -72,7 +72,7 @@ def main() -> int:
             cuda = None
             pictures = []
             if card:
-                scene, options = plain.to("cuda"), Options(torch.device("cuda"), (), (), 5, arguments.runs, 0.0)
+                scene, options = plain.to("cuda"), Options(torch.device("cuda"), 5, arguments.runs)
                 cuda = measured(scene, cameras, options)["packed"]
                 pictures = [scene.render(camera).rgb.cpu() for camera in cameras]
             for layers in arguments.layers:

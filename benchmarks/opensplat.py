@@ -1,25 +1,27 @@
 #!/usr/bin/env python
-"""CPU seconds to each PSNR on the `fox` capture: our training curves against OpenSplat's.
+"""Compare CPU seconds to each PSNR on the `fox` capture: our training curves against OpenSplat's.
 
 OpenSplat 1.2.0 is a multi-threaded CPU trainer of 3D Gaussians in C++. Its curve below was measured once: built with
 -march=native, 2 cores (AMD Zen 5), fox at 270x480, views 0, 8, 16, ... held out, 3,000 steps, densification from step
 200 every 200 until 2,400; PSNR is the mean over the 7 held-out views, CPU seconds are the process's over all threads.
-The same split and size is what `ns-train bitymi --data fox` uses.
+`ns-train bitymi --data fox` uses the same split and size.
 
 For each PSNR that OpenSplat reaches, the table has the CPU seconds at which our run first reached it, by linear
-interpolation between the points of its training_curve.jsonl. A run that has it at its first point reached it at or
-before that point: the table then says "<=".
+interpolation between the points of its training_curve.jsonl; "<=" where its first point has it already.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import CommandFailed, number, page, publish, read_curve, say, table
+from common import number, page, publish, table
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from bitymi_ns.measure.bench.engine import read_curve
 
 OPENSPLAT: tuple[tuple[int, float, int, float], ...] = (
     (200, 45, 12_359, 19.66),
@@ -32,125 +34,68 @@ OPENSPLAT: tuple[tuple[int, float, int, float], ...] = (
     (3_000, 1_154, 62_066, 27.74),
 )
 """Step, CPU seconds, Gaussians, PSNR in dB."""
+Points = list[dict[str, Any]]
+NOTES = (
+    "OpenSplat's curve was measured on 2 cores (AMD Zen 5); the line above names the machine that made this table, not "
+    "necessarily the one that trained.",
+    "Our CPU seconds are those of the training steps alone: no loading, evaluation or saving. Points of our curve but "
+    "the last are means over a sample of the held-out views where there are more than `curve_views`.",
+)
 
 
-@dataclass(frozen=True)
-class Run:
-    """One of our runs."""
-
-    name: str
-    points: list[dict[str, Any]]
-    """Of its curve, by step; those with a PSNR."""
-
-
-@dataclass(frozen=True)
-class Reached:
-    """When a run first had a PSNR."""
-
-    cpu_seconds: float
-    surfels: float
-    exact: bool
-    """False: it had it at its first point already, so this is an upper bound."""
-
-
-def first_reached(points: list[dict[str, Any]], level: float) -> Reached | None:
-    """Where a curve first reaches `level`, interpolated linearly; None when it never does."""
+def first_reached(points: Points, level: float) -> tuple[str, float, float] | None:
+    """Mark ("" or "<= "), CPU seconds and surfels where a curve first reaches a PSNR; None if it never does."""
     for i, point in enumerate(points):
         if point["psnr"] < level:
             continue
         if i == 0:
-            return Reached(point["cpu_seconds"], point["surfels"], point["psnr"] == level)
+            return "" if point["psnr"] == level else "<= ", point["cpu_seconds"], point["surfels"]
         before = points[i - 1]
         share = (level - before["psnr"]) / (point["psnr"] - before["psnr"])
         cpu, surfels = (before[k] + share * (point[k] - before[k]) for k in ("cpu_seconds", "surfels"))
-        return Reached(cpu, surfels, True)
+        return "", cpu, surfels
     return None
 
 
-def load(path: Path) -> Run:
-    """A run from its training_curve.jsonl, or from the folder that holds it.
-
-    Raises:
-        CommandFailed: it holds no point with a PSNR.
-    """
-    file = path / "training_curve.jsonl" if path.is_dir() else path
-    points = [p for p in read_curve(file) if isinstance(p.get("psnr"), (int, float))]
-    if not points:
-        raise CommandFailed(f"no point of {file} has a PSNR: train with held-out views")
-    return Run(f"{points[-1].get('method_name', file.stem)}, {points[-1]['step']:,} steps", points)
-
-
-def named_apart(runs: list[Run]) -> list[Run]:
-    """The same runs with different names."""
-    names = [run.name for run in runs]
-    return [
-        Run(f"{run.name} ({names[: i + 1].count(run.name)})" if names.count(run.name) > 1 else run.name, run.points)
-        for i, run in enumerate(runs)
-    ]
-
-
-def levels_table(runs: list[Run]) -> str:
-    """A line a PSNR level of OpenSplat's curve."""
+def report(runs: dict[str, Points]) -> str:
+    """A table by PSNR of OpenSplat's curve, and one of the ends of all curves."""
     header = ["PSNR", "OpenSplat CPU s", "Gaussians"]
-    for run in runs:
-        header += [f"{run.name}: CPU s", "ratio", "surfels"]
+    for name in runs:
+        header += [f"{name}: CPU s", "ratio", "surfels"]
     rows = []
     for _, cpu, gaussians, psnr in OPENSPLAT:
         row = [number(psnr), number(cpu, 0), number(gaussians, 0)]
-        for run in runs:
-            reached = first_reached(run.points, psnr)
-            if reached is None:
+        for points in runs.values():
+            if reached := first_reached(points, psnr):
+                mark, seconds, surfels = reached
+                row += [mark + number(seconds, 1), mark + number(seconds / cpu, 3), number(surfels, 0)]
+            else:
                 row += ["not reached", "", ""]
-                continue
-            mark = "" if reached.exact else "<= "
-            row += [
-                mark + number(reached.cpu_seconds, 1),
-                mark + number(reached.cpu_seconds / cpu, 3),
-                number(reached.surfels, 0),
-            ]
         rows.append(row)
-    return table(header, rows, ())
-
-
-def final_table(runs: list[Run]) -> str:
-    """Where everyone ends."""
     steps, cpu, gaussians, psnr = OPENSPLAT[-1]
-    rows = [[f"OpenSplat 1.2.0, {steps:,} steps", number(psnr), number(cpu, 0), "1.00", number(gaussians, 0), "1.00"]]
-    for run in runs:
-        last = run.points[-1]
-        rows.append(
-            [
-                run.name,
-                number(last["psnr"]),
-                number(last["cpu_seconds"], 0),
-                number(last["cpu_seconds"] / cpu),
-                number(last["surfels"], 0),
-                number(last["surfels"] / gaussians),
-            ]
-        )
-    return table(("at the end", "PSNR", "CPU s", "of OpenSplat's", "primitives", "of OpenSplat's"), rows)
+    ends = [(f"OpenSplat 1.2.0, {steps:,} steps", psnr, cpu, gaussians)]
+    ends += [
+        (name, points[-1]["psnr"], points[-1]["cpu_seconds"], points[-1]["surfels"]) for name, points in runs.items()
+    ]
+    last = [
+        [name, number(p), number(seconds, 0), number(seconds / cpu), number(count, 0), number(count / gaussians)]
+        for name, p, seconds, count in ends
+    ]
+    ends_header = ("at the end", "PSNR", "CPU s", "of OpenSplat's", "primitives", "of OpenSplat's")
+    return table(header, rows, ()) + "\n\n" + table(ends_header, last)
 
 
-def plot(runs: list[Run], path: Path) -> None:
+def plot(runs: dict[str, Points], path: Path) -> None:
     """PSNR against CPU seconds."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7.0, 4.2), dpi=150, layout="constrained")
+    figure = Figure(figsize=(7.0, 4.2), dpi=150, layout="constrained")
+    axes = figure.add_subplot()
     axes.plot([p[1] for p in OPENSPLAT], [p[3] for p in OPENSPLAT], "s--", color="0.45", label="OpenSplat 1.2.0")
-    for run in runs:
-        axes.plot([p["cpu_seconds"] for p in run.points], [p["psnr"] for p in run.points], "o-", ms=3.5, label=run.name)
-    axes.set_xscale("log")
-    axes.set_xlabel("CPU seconds (all threads, logarithmic)")
-    axes.set_ylabel("PSNR of held-out views, dB")
+    for name, points in runs.items():
+        axes.plot([p["cpu_seconds"] for p in points], [p["psnr"] for p in points], "o-", ms=3.5, label=name)
+    axes.set(xscale="log", xlabel="CPU seconds (all threads, logarithmic)", ylabel="PSNR of held-out views, dB")
     axes.grid(True, which="both", alpha=0.25)
     axes.legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    pyplot.close(figure)
-    say(f"wrote {path}")
+    FigureCanvasAgg(figure).print_figure(str(path))
 
 
 def main() -> int:
@@ -158,27 +103,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument(
-        "--curve",
-        type=Path,
-        action="append",
-        required=True,
-        help="training_curve.jsonl of a run on fox, or its folder; repeat for more runs",
-    )
+    parser.add_argument("curves", nargs="+", type=Path, help="training_curve.jsonl of runs on fox")
     parser.add_argument("--output", type=Path, help="PNG of PSNR against CPU seconds; the tables go beside it (.md)")
     options = parser.parse_args()
-    try:
-        runs = named_apart([load(path) for path in options.curve])
-    except CommandFailed as error:
-        say(str(error))
-        return 1
-    notes = [
-        "OpenSplat's curve was measured on 2 cores (AMD Zen 5); the line above names the machine that made this table, "
-        "not necessarily the one that trained.",
-        "Our CPU seconds are those of the training steps alone: no loading, evaluation or saving. Points of our curve "
-        "but the last are means over a sample of the held-out views where there are more than `curve_views`.",
-    ]
-    text = page("CPU seconds against OpenSplat on fox", levels_table(runs) + "\n\n" + final_table(runs), notes)
+    runs: dict[str, Points] = {}
+    for path in options.curves:
+        points = [p for p in read_curve(path) if isinstance(p.get("psnr"), (int, float))]
+        if not points:
+            parser.error(f"no point of {path} has a PSNR: train with held-out views")
+        name = f"{points[-1].get('method_name', path.stem)}, {points[-1]['step']:,} steps"
+        runs[name if name not in runs else f"{name}, {path}"] = points
+    text = page("CPU seconds against OpenSplat on fox", report(runs), NOTES)
     publish(text, None if options.output is None else options.output.with_suffix(".md"))
     if options.output is not None:
         plot(runs, options.output.with_suffix(".png"))

@@ -19,7 +19,7 @@ from bitymi_ns.train.views import View
 
 @dataclass
 class Capture:
-    """What training needs.
+    """A capture for training.
 
     Attributes:
         train, held_out: views; every `interval`-th photograph is held out, the first one too.
@@ -42,7 +42,7 @@ class Capture:
 
 
 def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture:
-    """Reads an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and
+    """Read an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and
     their largest coordinate 1. The orientation stays.
 
     Args:

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""What a compact bundle shows for its bytes: held-out PSNR at several prices of a bit, as a table and a plot.
+"""Measure the rate-distortion curve of a compact bundle: held-out PSNR against bytes, as a table and a plot.
 
-A run is baked, polished where its texels have not learned in training, and reduced once, as `ns-export bitymi-atlas
---format compact` does; `--keep` keeps that in a file, from which the command goes on the next time. For every price:
-  price       squared error, in 8-bit steps, summed over pixels, channels and training views, that a bit is worth
+A run is baked, polished where its texels were not trained, and reduced once, as `ns-export bitymi-atlas --format
+compact` does; `--keep` stores that in a file, from which the command continues the next time. For every lambda:
+  lambda      squared error, in 8-bit steps, summed over pixels, channels and training views, that one bit may cost
   surfels     bytes of surfels.bin; per surfel
   texels      bytes of texels.bin
   MB          of both
@@ -37,21 +37,21 @@ from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View
 
-COLUMNS = ("price", "surfels", "per surfel", "terms", "texels", "MB", "training", "held-out", "tuned")
+COLUMNS = ("lambda", "surfels", "per surfel", "terms", "texels", "MB", "training", "held-out", "tuned")
 
 
 def polished(load_config: Path, steps: int) -> dict[str, Any]:
     """The reduced bake of a run, its training views, its held-out views, and the background."""
     _, pipeline = load_trained(load_config)
     model, data = pipeline.model, pipeline.datamanager
-    cameras = data.undistorted_train_cameras()
+    cameras = data.train_dataset.cameras
     views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
-    background, has_learned = model.background.cpu(), isinstance(model.scene.field, TexelField)
-    learning = Learning(None if has_learned else PolishOptions(steps=steps), train=model.train_config)
+    background, trained = model.background.cpu(), isinstance(model.scene.field, TexelField)
+    learning = Learning(None if trained else PolishOptions(steps=steps), train=model.train_config)
     baked = baked_and_reduced(model.scene, views, photographs, background, BakeOptions(), learning)
     found = {"baked": baked, "views": photographs, "held": list(data.eval_views), "background": background}
-    return {**found, "learned": has_learned}
+    return {**found, "trained": trained}
 
 
 def held_out(scene: BakedScene, views: list[View], background: torch.Tensor) -> float:
@@ -81,9 +81,9 @@ def main() -> int:
     )
     parser.add_argument("--load-config", type=Path, help="config.yml of a run")
     parser.add_argument("--keep", type=Path, help="file of the polished bake; read where it is there, else written")
-    parser.add_argument("--prices", nargs="+", type=float, default=[2.0, 6.0, 18.0, 54.0], help="(%(default)s)")
+    parser.add_argument("--lambdas", nargs="+", type=float, default=[2.0, 6.0, 18.0, 54.0], help="(%(default)s)")
     parser.add_argument("--polish-steps", type=int, default=PolishOptions.steps, help="(%(default)s)")
-    parser.add_argument("--tune", action="store_true", help="tune the texels, too; a minute for each price")
+    parser.add_argument("--tune", action="store_true", help="tune the texels, too; a minute for each lambda")
     parser.add_argument("--plot", type=Path, default=Path("rate.png"), help="picture to write (%(default)s)")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
     options = parser.parse_args()
@@ -100,21 +100,21 @@ def main() -> int:
     say(f"{len(baked.rows):,} surfels, {baked.packing.texels:,} texels")
     whole = held_out(baked.unquantised(), held, background)
     coder, rows, points = Coder(baked, views, background, Compact()), [], []
-    for price in options.prices:
-        priced = coder.at(price / 255**2)
-        surfels = priced.baked.codes.surfels
-        shown, tuned = held_out(priced.shown, held, background), None
+    for value in options.lambdas:
+        coded = coder.at(value / 255**2)
+        surfels = coded.baked.codes.surfels
+        shown, tuned = held_out(coded.shown, held, background), None
         if options.tune:
-            learned = found.get("learned", False)
-            steps = (TuneOptions.of_learned if learned else TuneOptions)(steps=STEPS_AFTER_LEARNING)
+            make = TuneOptions.of_learned if found["trained"] else TuneOptions
+            steps = make(steps=STEPS_AFTER_LEARNING)
             tuned = held_out(
-                tune_atlas(priced.baked, views, background, steps, coding=priced.coding).stored(), held, background
+                tune_atlas(coded.baked, views, background, steps, coding=coded.coding).stored(), held, background
             )
         size, terms = surfels.nbytes(), len(surfels.codes["term_color"])
-        row = [number(price), f"{size:,}", number(size / len(surfels), 1), f"{terms:,}", f"{priced.bytes - size:,}"]
-        row += [number(priced.bytes / 1e6, 2), number(priced.psnr, 2), number(shown, 2)]
+        row = [number(value), f"{size:,}", number(size / len(surfels), 1), f"{terms:,}", f"{coded.bytes - size:,}"]
+        row += [number(coded.bytes / 1e6, 2), number(coded.psnr, 2), number(shown, 2)]
         rows.append([*row, "" if tuned is None else number(tuned, 2)])
-        points.append((priced.bytes / 1e6, shown if tuned is None else tuned))
+        points.append((coded.bytes / 1e6, shown if tuned is None else tuned))
         say(" ".join(rows[-1]))
     name = options.load_config.parent.name if options.load_config is not None else options.keep.stem
     plot(points, f"{name}: {whole:.2f} dB before it is made compact", options.plot)

@@ -104,8 +104,6 @@ class Report:
     """Folder to write the page to."""
     title: str = "bitymi report"
     """Heading of the page."""
-    published: Flag = False
-    """Show the paper's tables with its published figures even when no scene of its data sets is in the input."""
 
     def run(self) -> None:
         from bitymi_ns.measure import report
@@ -113,7 +111,7 @@ class Report:
         if not self.inputs:
             raise ValueError("nothing to report: name at least one JSON file that ns-eval wrote")
         try:
-            page = report.build(list(self.inputs), self.output_dir, title=self.title, published=self.published)
+            page = report.build(list(self.inputs), self.output_dir, title=self.title)
         except report.ReportError as error:
             raise ValueError(str(error)) from error
         say(f"Wrote {page}")
@@ -130,7 +128,7 @@ class Stability:
 
     def run(self) -> None:
         from bitymi_ns.measure.stability import page
-        from bitymi_ns.measure.stability.backends import BACKENDS, missing
+        from bitymi_ns.measure.stability.errors import BACKENDS, missing
 
         if self.backend not in BACKENDS:
             raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")
@@ -208,7 +206,7 @@ class Bench:
 
 @dataclass
 class Verify:
-    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is given."""
+    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is found."""
 
     bundle: tyro.conf.Positional[Path]
     """Folder of the bundle, or its one file (bitymi pack)."""
@@ -300,25 +298,25 @@ class Extras:
         from bitymi_ns.bundle import read_bundle
         from bitymi_ns.progress import rich_progress
 
-        output = self.output or interchange.place_of(self.bundle)
+        output = self.output or interchange.extras_folder(self.bundle)
         interchange.check_extras(self.kinds, output, self.overwrite)
         bundle = read_bundle(self.bundle)
-        given = interchange.given_with(self.bundle, bundle.info)
+        found = interchange.read_cameras(self.bundle, bundle.info)
         with rich_progress() as progress:
             written = interchange.write_extras(
                 bundle,
                 output,
                 self.kinds,
                 frame=self.frame,
-                cameras=given.train,
-                held_out=given.held_out,
+                cameras=found.train,
+                held_out=found.held_out,
                 overwrite=self.overwrite,
                 progress=progress,
             )
         say(f"Wrote {output}")
         for each in written.values():
-            say(interchange.described(each))
-        if not given.train:
+            say(interchange.summary_line(each))
+        if not found.train:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
         return 0
 

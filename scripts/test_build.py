@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Runs tests with a build of the CPU kernels other than the installed one: scripts/test_build.py BUILD_FOLDER TEST...
+"""Run tests with a build of the CPU kernels other than the installed one: scripts/test_build.py BUILD_FOLDER TEST...
 
 The build may be by another compiler, for another CPU, or with the sanitizers (`--sanitizers`), whose libraries have to
 be in the process before Python is: then this starts itself again with them.

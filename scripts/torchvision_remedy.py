@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Make a CUDA build of torchvision importable beside a CPU build of torch, in this virtual environment.
 
-`pip install torchvision` brings a build whose compiled operators need CUDA libraries. Beside a CPU torch they are left
-out without a word, and `import torchvision` then fails with "operator torchvision::nms does not exist", taking all of
-nerfstudio with it. The better cure is the matching CPU wheel from https://download.pytorch.org/whl/cpu; where it cannot
+`pip install torchvision` brings a build whose compiled operators need CUDA libraries. Beside a CPU torch they are
+silently left out, and `import torchvision` fails with "operator torchvision::nms does not exist", and nerfstudio with
+it. The better cure is the matching CPU wheel from https://download.pytorch.org/whl/cpu; where it cannot
 be had, this script declares the two missing operators (declares only: calling them stays an error).
 
 It does nothing unless the import fails with just that message. Otherwise it writes a module and a .pth file into
@@ -28,7 +28,7 @@ import sys
 
 
 def _mismatch(spec):
-    """Whether torchvision is a CUDA build and torch is not."""
+    """True if torchvision is a CUDA build and torch is not."""
     import os
 
     try:
@@ -72,7 +72,7 @@ def shim_files() -> tuple[Path, Path]:
 
 
 def import_error() -> str:
-    """What `import torchvision` prints to stderr when it fails in a fresh interpreter; empty when it works."""
+    """Error output of `import torchvision` in a fresh interpreter; empty when it works."""
     code = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; import torchvision"  # not from here
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return result.stderr if result.returncode else ""

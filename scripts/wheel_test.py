@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Builds the wheel as `pip install .` does, looks into it, installs it on its own and runs tests against it.
+"""Build the wheel as `pip install .` does, check its contents, install it on its own and run tests against it.
 
 The build starts from an empty folder and sees none of the environment's variables but PATH and HOME; only the CUDA
 kernels are left out, which take minutes. The wheel goes into a new virtual environment that finds the dependencies
@@ -52,7 +52,7 @@ sys.exit(pytest.main(sys.argv[1:]))
 
 
 def run(*command: str | Path, cwd: Path = ROOT) -> None:
-    """Runs a command without the environment's variables; ends this script where it fails."""
+    """Run a command without the environment's variables; exit if it fails."""
     variables = {name: os.environ[name] for name in ("HOME", "TMPDIR") if name in os.environ}
     variables["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     if code := subprocess.run([str(word) for word in command], cwd=cwd, env=variables, check=False).returncode:

@@ -67,13 +67,13 @@ def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     seen = {}
 
-    def build(inputs: list[Path], output_dir: Path, title: str = "", published: bool = False) -> Path:
-        seen.update(inputs=inputs, output_dir=output_dir, title=title, published=published)
+    def build(inputs: list[Path], output_dir: Path, title: str = "") -> Path:
+        seen.update(inputs=inputs, output_dir=output_dir, title=title)
         return output_dir / "index.html"
 
     monkeypatch.setattr(bitymi_ns.measure.report, "build", build, raising=False)
     assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
-    expected = {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two", "published": False}
+    expected = {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two"}
     assert seen == expected
 
 

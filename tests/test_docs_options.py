@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.train.config import TrainConfig
 
@@ -16,8 +15,6 @@ ROOT = Path(__file__).resolve().parents[1]
 ROOTS: dict[str, Any] = {
     "--pipeline.model.scene.": load_preset("bitymi").scene,
     "--pipeline.model.train.": TrainConfig(),
-    "... bitymi-data --sfm.": SfmOptions(),
-    "--sfm.": SfmOptions(),
     "ns-export ... --": BakeOptions(),
 }
 ELSEWHERE = {
@@ -25,11 +22,9 @@ ELSEWHERE = {
     "--max-num-iterations",
     "--pipeline.model.train.first-surfels",
     "ns-export ... --exact",
-    "ns-export ... --extras",
     "ns-export ... --finetune-steps",
     "ns-export ... --format",
     "ns-export ... --photographs",
-    "ns-export ... --interchange",
     "ns-export ... --polish-steps",
     "ns-export ... --compact-error",
     "ns-export ... --target-mb",
@@ -37,10 +32,8 @@ ELSEWHERE = {
 """Options that are declared with the commands, which need nerfstudio."""
 
 
-def value_of(option: str, before: str) -> Any:
-    """Default of an option as the README writes it; `before` is the option that its row begins with."""
-    if option.startswith("--") and before.startswith("ns-export"):
-        option = "ns-export ... " + option
+def value_of(option: str) -> Any:
+    """Look up the default of an option as the README writes it."""
     prefix = max((root for root in ROOTS if option.startswith(root)), key=len)
     value = ROOTS[prefix]
     for name in option.removeprefix(prefix).replace("-", "_").split("."):
@@ -54,15 +47,10 @@ def test_options_have_the_defaults_that_the_readme_states() -> None:
     rows = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("| `")]
     checked = 0
     for names, stated, _ in rows:
-        options = re.findall(r"`([^`]+)`", names)
-        if options[0] in ELSEWHERE:
+        option = re.findall(r"`([^`]+)`", names)[0]
+        if option in ELSEWHERE:
             continue
-        values = [value_of(option, options[0]) for option in options]
-        words = [word for word in re.split(r", | \(none\)| of the cameras' extent", stated.strip()) if word]
-        if len(words) == 1:
-            words *= len(values)
-        for option, value, word in zip(options, values, words, strict=bool(words)):
-            if value is not None:
-                assert word == (f"{value:g}" if isinstance(value, float) else str(value)), f"{option} is {value}"
-                checked += 1
+        value, word = value_of(option), stated.strip().removesuffix(" (none)")
+        assert word == (f"{value:g}" if isinstance(value, float) else str(value)), f"{option} is {value}"
+        checked += 1
     assert checked > 8

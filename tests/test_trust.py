@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 
 from bitymi_ns import files
 from bitymi_ns.capture import CaptureError
-from bitymi_ns.capture.cache import content_key, home, read_from, user_cache, work_folder
+from bitymi_ns.capture.cache import content_key, home, keep_work_folder, user_cache, work_folder
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.types import Poses
 from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.cells import Cells
+from bitymi_ns.measure.bench.matrix import read_plan
 from bitymi_ns.measure.bench.process import BenchError, run_measured
-from bitymi_ns.measure.bench.suites import read_plan
 from bitymi_ns.plugin.run.curve import TrainingCurve
 from bitymi_ns.plugin.run.run_folder import keep_poses_report
 from bitymi_ns.trust import Refused, inside, is_own, json_of, keep, no_links, own_folder, printable
@@ -210,7 +210,7 @@ def test_others_may_not_write_into_what_is_made(photographs: Path) -> None:
     try:
         (photographs / ".bitymi").mkdir()
         with work_folder(photographs, "0", print) as work:
-            read_from(work)
+            keep_work_folder(work)
             assert [path.stat().st_mode & 0o022 for path in (work.parent, work)] == [0, 0]
     finally:
         os.umask(before)

@@ -1,8 +1,10 @@
-"""Trained field to texture atlas: resolution, plan, evaluation, reduction, packing, quantisation, fine-tuning."""
+"""Trained scene to bundle contents: tiles, view colours, fine-tuning, coding; the paper's bake is in `field`."""
 
+from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.learn import Learning, bake_and_learn, baked_and_reduced
-from bitymi_ns.bake.pipeline import Baked, bake, reduced
+from bitymi_ns.bake.pipeline import reduced
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.progress import Progress, rich_progress

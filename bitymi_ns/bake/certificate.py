@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
-from bitymi_ns.bake.errors import listed_errors
-from bitymi_ns.bake.field.footprint import closest_pixels
-from bitymi_ns.bake.field.plan import Shown
-from bitymi_ns.bake.pipeline import Baked
+from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.tile_errors import closest_pixels, listed_errors
+from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bundle.sketch import sketches_text
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.codec.pages import listed_texels

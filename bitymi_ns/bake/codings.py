@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.pipeline import Baked, encoded_pages
+from bitymi_ns.bake.baked import Baked, encoded_pages
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, set_aside
-from bitymi_ns.bake.methods import Tiles
-from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.texel_scene import TexelScene
+from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec.packing import pack

@@ -1,4 +1,4 @@
-"""What is baked: the surfels that can be drawn, and from where they are seen."""
+"""Inputs of the bake: the drawable surfels, the training cameras, and what these see."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import Visibility, visibility
 
+POINTS = 256
+"""Of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame."""
+
 
 @dataclass(frozen=True)
 class BakeInput:
@@ -26,7 +29,7 @@ class BakeInput:
         surfels: per-surfel parameters by name, N rows, float32.
         cameras: training views; there may be none.
         near, weight_bound, through_pixel: as the scene is drawn.
-        views: what the cameras see of the surfels; None = not looked at.
+        views: visibility in the cameras; None = not computed.
     """
 
     surfels: Mapping[str, Tensor]
@@ -38,12 +41,12 @@ class BakeInput:
 
     @property
     def transmittance(self) -> Tensor | None:
-        """[N] what is in front of a surfel where it is seen best; None = nothing is in front of any."""
+        """[N] largest transmittance in front of each surfel; None = 1."""
         return None if self.views is None else self.views.in_front
 
     @property
     def seen(self) -> Tensor:
-        """[V, N] bool, the views that see each surfel; V = 0 where they were not looked at."""
+        """[V, N] bool, the views that see each surfel; V = 0 without visibility."""
         means = self.surfels["means"]
         nothing = torch.zeros(0, len(means), dtype=torch.bool, device=means.device)
         return nothing if self.views is None else self.views.seen
@@ -53,8 +56,8 @@ class BakeInput:
         surfels = {name: value[rows] for name, value in self.surfels.items()}
         return replace(self, surfels=surfels, views=None if self.views is None else self.views.of(rows))
 
-    def looked_at(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
-        """With what the cameras see, where there are any and the options need it."""
+    def with_visibility(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
+        """Add the visibility, where there are cameras and the options need it."""
         if not self.cameras or not options.looks_at_views:
             return self
         return replace(
@@ -64,12 +67,12 @@ class BakeInput:
 
 
 def device_of(cameras: Sequence[Camera]) -> torch.device:
-    """The device of views, which looks through them; the CPU where there are none."""
+    """Device of the cameras; the CPU without any."""
     return cameras[0].viewmat.device if cameras else torch.device("cpu")
 
 
 def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
-    """Rows that can be drawn and that a bundle can hold, [N] int64, and how many were left out for which reason."""
+    """Rows [N] int64 that can be drawn and stored, and the counts of those left out, by reason."""
     finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
     scales = surfels["log_scales"].exp()
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
@@ -88,3 +91,49 @@ def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
 def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
     """Every parameter with at least two dimensions."""
     return [value.detach() if value.dim() > 1 else value.detach()[:, None] for value in surfels.values()]
+
+
+def photo_resolution(inputs: BakeInput) -> Tensor | None:
+    """Resolution of the photographs at points of the scene (`scene/sampling.py`).
+
+    Returns:
+        [P, 4] float32 on the CPU: positions of surfels, evenly chosen from those that views show, and the geometric
+        mean over these views of focal length / depth, pixels per unit; None without views.
+
+    Without visibility, a view shows the surfels whose centres project into its image.
+    """
+    if not inputs.cameras:
+        return None
+    means = inputs.surfels["means"].double().cpu()
+    logs, views = torch.zeros(len(means), dtype=torch.float64), torch.zeros(len(means), dtype=torch.float64)
+    for i, camera in enumerate(inputs.cameras):
+        viewmat, K = camera.viewmat.double().cpu(), camera.K.double().cpu()
+        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
+        shown = z > inputs.near
+        if inputs.views is not None:
+            shown &= inputs.views.seen[i].cpu()
+        else:
+            depth = z.clamp(min=inputs.near)
+            column, row = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
+            shown &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        rate = torch.sqrt(K[0, 0] * K[1, 1]) / z.clamp(min=inputs.near)
+        logs += torch.where(shown, rate.log(), 0.0)
+        views += shown
+    rows = views.nonzero().flatten()
+    if not len(rows):
+        return None
+    count = min(POINTS, len(rows))
+    rows = rows[(torch.arange(count) * len(rows)) // count]
+    return torch.cat([means[rows], (logs[rows] / views[rows]).exp()[:, None]], 1).float()
+
+
+def visible(
+    inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
+) -> tuple[BakeInput, Tensor | None]:
+    """The inputs with their visibility, without the surfels that no view blends where the options drop them; and the
+    mask [N] bool of those that stay, None = all."""
+    inputs = inputs.with_visibility(options, progress)
+    if inputs.views is None or not options.drop_unseen:
+        return inputs, None
+    seen = inputs.views.transmittance > 0
+    return inputs.of(seen), seen

@@ -11,7 +11,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
+from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.codec.limits import beyond
 from bitymi_ns.codec.quantise import STEPS
@@ -19,8 +21,9 @@ from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.shade import view_base
 from bitymi_ns.ops.sphere import fibonacci_sphere
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 FIT_STEPS = 6
 FIT_VIEWS = 16
@@ -212,3 +215,19 @@ def describe(
         bytes=Kept(before=4 * before * len(lean.base), after=after),
         error=Percentiles.of(error),
     )
+
+
+def kept_view_colors(
+    inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
+) -> tuple[dict[str, Tensor], ViewColorError | None]:
+    """Surfels with the view colours that the tolerance keeps, and their error; all of them without a tolerance."""
+    surfels = inputs.surfels
+    if options.tolerance == 0:
+        return dict(surfels), None
+    kind, means = kind_of(surfels), surfels["means"]
+    opacity, _ = kernel_parameters(surfels, inputs.transmittance)
+    at = (inputs.seen, centers_of(inputs.cameras, means), opacity)
+    lean = reduce_view_color(surfels, kind, *at, options.tolerance, progress)
+    error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
+    kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind].names}
+    return kept | lean.parameters(), describe(kind, surfels, lean, error, options.tolerance)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
+from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.pipeline import BakeableScene, Baked, bake, reduced
-from bitymi_ns.bake.trained_texels import learned
+from bitymi_ns.bake.pipeline import BakeableScene, reduced, trained_texels
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.texel_codes import TexelCodeOptions
@@ -55,7 +56,7 @@ def baked_and_reduced(
     polish = learning.polish
     has_learned = isinstance(scene.field, TexelField)
     if has_learned:
-        baked = learned(scene, options)
+        baked = trained_texels(scene, options)
     else:
         baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
     if polish is not None and baked.texels is not None:

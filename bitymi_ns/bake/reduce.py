@@ -1,22 +1,63 @@
-"""The error-bounded atlas: every tile takes the smallest grid that reproduces the field within a tolerance."""
+"""Smallest grids of tiles within a tolerance, and resampling of tiles as matrices along their axes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.errors import weighted_rms
-from bitymi_ns.bake.field.plan import Shown
-from bitymi_ns.bake.field.reference import Reference
-from bitymi_ns.bake.resample import fit, fitted, interpolation, read_at
-from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import texel_index
+from bitymi_ns.bake.inputs import BakeInput
+from bitymi_ns.bake.tile_errors import weighted_rms
+from bitymi_ns.bake.tiles import Shown, Tiles, TileValues, tile_values
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.codec.packing import Packing, pack
+from bitymi_ns.codec.pages import texel_index, tile_means
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 _FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a grid may be for it to be tried
+
+
+@lru_cache(maxsize=64)
+def interpolation(probes: int, texels: int) -> Tensor:
+    """Values at evenly spaced probes (cell centres) from a tile's texels along one axis: [probes, texels] float32.
+
+    Linear between texel centres and constant beyond the outer ones, as the renderers fetch them.
+    """
+    x = ((torch.arange(probes, dtype=torch.float64) + 0.5) * texels / probes - 0.5).clamp(0, texels - 1)
+    low = x.floor().long().clamp(max=max(texels - 2, 0))
+    matrix = torch.zeros(probes, texels, dtype=torch.float64)
+    rows = torch.arange(probes)
+    matrix[rows, low] = 1 - (x - low)
+    matrix[rows, (low + 1).clamp(max=texels - 1)] += x - low
+    return matrix.float()
+
+
+@lru_cache(maxsize=64)
+def fit(probes: int, texels: int) -> Tensor:
+    """[texels, probes] float32: the texels whose interpolation is nearest to values at the probes, least squares."""
+    return torch.linalg.pinv(interpolation(probes, texels).double()).float()
+
+
+def along_axes(x: Tensor, along_u: Tensor, along_v: Tensor) -> Tensor:
+    """along_v x along_u^T of every channel: [n, 3, V, U] with [u, U], [v, V] -> [n, 3, v, u]."""
+    y = (x @ along_u.T).transpose(2, 3)  # one product of matrices each
+    return (y.contiguous() @ along_v.T).transpose(2, 3).contiguous()
+
+
+def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Tiles [n, 3, v, u] on another grid (u, v), by least squares."""
+    u, v = values.shape[3], values.shape[2]
+    return along_axes(values, fit(u, size[0]).to(values), fit(v, size[1]).to(values))
+
+
+def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
+    """What tiles [n, 3, v, u] show on a finer grid (u, v)."""
+    u, v = texels.shape[3], texels.shape[2]
+    return along_axes(texels, interpolation(size[0], u).to(texels), interpolation(size[1], v).to(texels))
 
 
 @dataclass
@@ -48,7 +89,7 @@ class Reduced:
 
 @torch.no_grad()
 def reduce_tiles(
-    wanted: Iterable[Reference],
+    wanted: Iterable[TileValues],
     shown: Shown,
     tolerance: float,
     r_min: int = 4,
@@ -87,14 +128,14 @@ def reduce_tiles(
     return reduced
 
 
-def _constant(part: Reference, tolerance: float) -> tuple[Tensor, Tensor]:
+def _constant(part: TileValues, tolerance: float) -> tuple[Tensor, Tensor]:
     """The colour nearest to the tile, [n, 3], and whether it is near enough, [n] bool."""
     square = part.weight.square()[:, None]
     constant = (part.values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)
     return constant, weighted_rms(part.values - constant[:, :, None, None], part.weight) <= tolerance
 
 
-def _grids(part: Reference, rows: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
+def _grids(part: TileValues, rows: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
     """The smallest grid of each of `rows` (of `part`): pairs of size and rows.
 
     The errors of coarsening along u alone and along v alone, added in squares, predict that of both. Only grids that
@@ -124,3 +165,29 @@ def _grids(part: Reference, rows: Tensor, tolerance: float, r_min: int) -> list[
             open_[at] = False
             found.append((size, rows[at]))
     return found
+
+
+def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progress: Progress) -> Tiles:
+    """Resample every tile to the smallest grid within the tolerance; no tile where one colour is.
+
+    Args:
+        tiles: of N surfels, with texels.
+        inputs: the surfels, and what the views see of them; their device does the work.
+    """
+    assert tiles.texels is not None
+    opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
+    shown = Shown(opacity, beta, tiles.extent.to(opacity.device), inputs.weight_bound)
+    parts = tile_values(tiles.texels.to(opacity.device), tiles.packing, shown, options.chunk)
+    smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress)
+    bare = torch.from_numpy(tiles.packing.tiles)[:, 3] == 0
+    smaller.constant[bare] = tiles.mean_residual[bare]
+    return packed_tiles(smaller, shown, options)
+
+
+def packed_tiles(reduced: Reduced, shown: Shown, options: BakeOptions) -> Tiles:
+    """Pack the chosen tiles into pages."""
+    packing = pack(reduced.sizes, options.page_width, options.page_rows)
+    texels = reduced.pages(packing)
+    extent = torch.where(shown.extent > 0, shown.extent, options.extent).cpu()
+    means = tile_means(texels, packing, reduced.constant)
+    return Tiles(packing, texels if packing.texels else None, extent, means, reduced.nonfinite)

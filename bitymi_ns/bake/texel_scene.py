@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import look
-from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.ops import (
     Fragments,

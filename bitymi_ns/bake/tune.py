@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.codings import C, Coding, Cosines, CosineTexels, Pages, PageTexels
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, Looks, gain, set_aside
-from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.errors import tile_errors
+from bitymi_ns.bake.field.bake import plan_of
+from bitymi_ns.bake.field.errors import tile_errors
 from bitymi_ns.bake.field.plan import Field
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
-from bitymi_ns.bake.methods import bake_method
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text
@@ -44,7 +44,7 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
         field = field.only(first, count)
     options = statistics.options or BakeOptions()
     inputs = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
-    plan = bake_method(options).plan(field, inputs.looked_at(options))
+    plan = plan_of(field, inputs.with_visibility(options), options)
     tiled = bundle.scene.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
     residuals = None if bundle.scene.atlas is None else bundle.scene.residuals().numpy()

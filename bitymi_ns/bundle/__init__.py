@@ -1,9 +1,9 @@
 """Bundles: the folder a baked scene is written to, with its surfels, atlas and description; reading and checking it."""
 
-from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import BundleError
-from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle, verify_bundle
-from bitymi_ns.bundle.verify import Check, check_files, check_place
+from bitymi_ns.bundle.parts import check_target
+from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle
+from bitymi_ns.bundle.verify import Check, check_files, check_world
 from bitymi_ns.bundle.write import World, export, write_bundle
 
 __all__ = [
@@ -13,10 +13,9 @@ __all__ = [
     "Check",
     "World",
     "check_files",
-    "check_place",
+    "check_world",
     "check_target",
     "export",
     "read_bundle",
-    "verify_bundle",
     "write_bundle",
 ]

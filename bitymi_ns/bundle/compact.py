@@ -13,32 +13,21 @@ from bitymi_ns.bundle.manifest import COMPACT_SURFELS, Atlas, Column, Surfels
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.streams import StreamError
-from bitymi_ns.codec.surfel_codes import PLACE_BITS, REFERENCE, Codes, Frame, SurfelCodes, term_numbers
+from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, Codes, PositionGrid, SurfelCodes, term_numbers
 from bitymi_ns.codec.texel_codes import GRADES, TexelCodes, blocks_of
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
-__all__ = [
-    "check_surfels_size",
-    "check_texels_size",
-    "pack_surfels",
-    "pack_texels",
-    "packing_of",
-    "unpack_surfels",
-    "unpack_texels",
-]
-
 SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
-"""A file is refused that is said to hold more than so many for each of its bytes, and `SPARE` of them: columns of one
-number take no bytes, and what they hold takes memory. A trained scene has a surfel for 12 bytes and more, a term for
-more, at most 5 texels for a byte. A tile that is flat takes no bytes but those of its surfel, so both files count for
-texels."""
+"""Files that claim more than these, plus `SPARE_*`, are refused: constant columns take no bytes, but memory.
+Trained scenes have a surfel per 12 bytes or more and at most 5 texels per byte. Flat tiles take bytes of their surfel
+alone, so both files count for texels."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
 MOST_EXPONENT = 12  # of two, in the side of a tile
 _COEFFICIENT_PLANES = 3
 
 
-def pack_surfels(codes: SurfelCodes, residual: Codes, residual_step: float) -> tuple[dict[str, Any], bytes]:
-    """What bundle.json says of surfels.bin, and the file.
+def encode_surfels(codes: SurfelCodes, residual: Codes, residual_step: float) -> tuple[dict[str, Any], bytes]:
+    """Entries of bundle.json for surfels.bin, and the file.
 
     Args:
         codes: of N surfels.
@@ -49,15 +38,15 @@ def pack_surfels(codes: SurfelCodes, residual: Codes, residual_step: float) -> t
     steps = {**codes.steps, "residual": residual_step}
     described, data = [], []
     for name in _surfel_columns(codes.kind)[0]:
-        packed = streams.pack(columns[name])
-        described.append({"name": name, "step": steps.get(name), "low": packed.low, "planes": packed.planes})
-        data.append(packed.data)
+        compressed = streams.compress(columns[name])
+        described.append({"name": name, "step": steps.get(name), "low": compressed.low, "planes": compressed.planes})
+        data.append(compressed.data)
     frame = {"center": codes.frame.center, "scale": codes.frame.scale, "low": codes.frame.low}
     return {"frame": frame, "columns": described}, b"".join(data)
 
 
-def unpack_surfels(info: Surfels, data: memoryview) -> tuple[SurfelCodes, Codes, float]:
-    """The codes, the residuals [N, 3] and their step, of what `pack_surfels` made.
+def decode_surfels(info: Surfels, data: memoryview) -> tuple[SurfelCodes, Codes, float]:
+    """Decode surfels.bin: the codes, the residuals [N, 3] and their step.
 
     Raises:
         StreamError: the file is damaged, contradicts bundle.json, or holds a number that no surfel can have.
@@ -70,28 +59,28 @@ def unpack_surfels(info: Surfels, data: memoryview) -> tuple[SurfelCodes, Codes,
     for column, part in zip(info.columns, _parts(data, info.columns), strict=True):
         if column.name == "extent":
             rows["extent"] = int((codes["size"] > 0).sum())
-        codes[column.name] = streams.unpack(part, rows[column.name], column.low, column.planes)
+        codes[column.name] = streams.decompress(part, rows[column.name], column.low, column.planes)
         _check_codes(column.name, codes[column.name], info)
     codes["place"] = np.cumsum(codes["place"], axis=0)
     f, residual = info.frame, codes.pop("residual")
-    frame = Frame(f.center, f.scale, f.low)
+    frame = PositionGrid(f.center, f.scale, f.low)
     residual_step = steps.pop("residual")
     return SurfelCodes(info.view_color, frame, steps, codes), residual, residual_step
 
 
-def pack_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
-    """What bundle.json says of texels.bin, and the file."""
+def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
+    """Entries of bundle.json for texels.bin, and the file."""
     described, data = [], []
     for name, values in codes.columns.items():
-        packed = streams.pack(values)
-        described.append({"name": name, "low": packed.low, "planes": packed.planes})
-        data.append(packed.data)
+        compressed = streams.compress(values)
+        described.append({"name": name, "low": compressed.low, "planes": compressed.planes})
+        data.append(compressed.data)
     count = int(codes.sizes.clamp(min=1).prod(dim=1)[codes.sizes[:, 0] > 0].sum())
     return {"texels": count, "step": codes.step, "columns": described}, b"".join(data)
 
 
-def unpack_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview) -> TexelCodes:
-    """The codes of what `pack_texels` made.
+def decode_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview) -> TexelCodes:
+    """Decode texels.bin.
 
     Args:
         info: of bundle.json.
@@ -111,20 +100,20 @@ def unpack_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: fl
     _check_columns(info.columns, names, {name: 1 if name == "grade" else 3 for name in names}, ())
     parts = _parts(data, info.columns)
     column, tiles = info.columns[0], int((sizes[:, 0] > 0).sum())
-    grades = streams.unpack(next(parts), tiles, column.low, column.planes)[:, 0]
+    grades = streams.decompress(next(parts), tiles, column.low, column.planes)[:, 0]
     if tiles and not (GRADES[0] <= grades.min() and grades.max() <= GRADES[1]):
         raise StreamError(f"a grade is not from {GRADES[0]} to {GRADES[1]}")
     coefficients = []
     for each, column, part in zip(blocks, info.columns[1:], parts, strict=True):
         if any(len(planes) > _COEFFICIENT_PLANES for planes in column.planes):
             raise StreamError(f"the coefficients {column.name} have more than {_COEFFICIENT_PLANES} bytes")
-        values = streams.unpack(part, each.texels.numel(), column.low, column.planes, np.int32)
+        values = streams.decompress(part, each.texels.numel(), column.low, column.planes, np.int32)
         coefficients.append(torch.from_numpy(values).view(-1, len(each.texels), 3))
     return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), coefficients)
 
 
 def packing_of(info: Atlas, sizes: Tensor) -> Packing:
-    """Where the tiles lie, which follows from their sizes.
+    """Packing of the tiles, which follows from their sizes.
 
     Raises:
         StreamError: they do not lie in pages of the size that bundle.json states.
@@ -140,7 +129,7 @@ def packing_of(info: Atlas, sizes: Tensor) -> Packing:
 
 
 def check_surfels_size(info: Surfels, size: int) -> None:
-    """Refuses a surfels.bin of this many bytes that is not as bundle.json describes it, before it is read.
+    """Refuse a surfels.bin whose size contradicts bundle.json, before it is read.
 
     Raises:
         StreamError: says why.
@@ -151,7 +140,7 @@ def check_surfels_size(info: Surfels, size: int) -> None:
 
 
 def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
-    """The same of texels.bin, beside a surfels.bin of `surfels` bytes.
+    """Refuse a texels.bin whose size contradicts bundle.json, beside a surfels.bin of `surfels` bytes.
 
     Raises:
         StreamError: says why.
@@ -165,7 +154,7 @@ def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
 
 
 def _surfel_columns(kind: str) -> tuple[list[str], dict[str, int]]:
-    """Names of the columns of surfels.bin in their order, and how many numbers each has."""
+    """Columns of surfels.bin in their order, and how many numbers each has."""
     colors, shapes = term_numbers(kind)
     numbers = {"place": 1, "largest": 1, "rotation": 3, "log_scales": 2, "opacity": 1, "beta": 1, "size": 1}
     numbers |= {"residual": 3, "view_base": 3, "extent": 1, "view_count": 1}
@@ -191,12 +180,12 @@ def _check_columns(
 
 
 def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
-    """Refuses numbers that no surfel can have; those that are only too large are brought to their limits."""
+    """Refuse numbers that no surfel can have; those that are only too large are clipped by the decoder."""
     if codes.size == 0:
         return
     low, high = int(codes.min()), int(codes.max())
-    if name == "place" and (low < 0 or float(codes.astype(np.float64).sum()) >= 2.0 ** (3 * PLACE_BITS)):
-        raise StreamError("the places are not in ascending order, or beyond their grid")
+    if name == "place" and (low < 0 or float(codes.astype(np.float64).sum()) >= 2.0 ** (3 * POSITION_BITS)):
+        raise StreamError("the positions are not in ascending order, or beyond their grid")
     if name == "largest" and (low < 0 or high > 3):
         raise StreamError("a rotation's largest number is not one of four")
     if name == "size":

@@ -55,14 +55,12 @@ class Ktx2Image:
         payload: one bytes-like object a layer.
         format: one of bc7, uint8, fp16.
         width, height: size in texels.
-        metadata: the key/value pairs, values as text (values that are not text are left out).
     """
 
     payload: list[memoryview]
     format: Format
     width: int
     height: int
-    metadata: dict[str, str]
 
 
 def layer_bytes(format: Format, width: int, height: int) -> int:
@@ -91,7 +89,6 @@ def write_ktx2(
     width: int,
     height: int,
     writer: str,
-    metadata: Mapping[str, str] | None = None,
 ) -> None:
     """Writes a 2D array texture with one level, not supercompressed.
 
@@ -101,7 +98,6 @@ def write_ktx2(
         format: bc7, uint8 (RGBA) or fp16 (RGBA).
         width, height: size in texels; multiples of 4 for bc7.
         writer: name and version of the program (KTXwriter).
-        metadata: further key/value pairs.
     """
     layout = _LAYOUTS[format]
     expected = layer_bytes(format, width, height)
@@ -109,7 +105,7 @@ def write_ktx2(
         sizes = sorted({len(layer) for layer in payload})
         raise Ktx2Error(f"{format} layers of {width} x {height} texels have {expected} bytes each, not {sizes}")
     dfd = descriptor(format)
-    kvd = _pack_metadata({**(metadata or {}), "KTXorientation": "rd", "KTXwriter": writer})
+    kvd = _key_values({"KTXorientation": "rd", "KTXwriter": writer})
     start = _HEADER.size + len(dfd) + len(kvd)
     alignment = max(layout.block_bytes, 4)
     padding = -start % alignment
@@ -134,7 +130,6 @@ class Header:
         format: one of bc7, uint8, fp16.
         width, height: size in texels.
         layers: number of layers.
-        metadata_at, metadata_size: where the key/value pairs lie, bytes.
         data_at: where the texels begin, bytes; they end with the file.
         nbytes: size of the whole file.
     """
@@ -143,8 +138,6 @@ class Header:
     width: int
     height: int
     layers: int
-    metadata_at: int
-    metadata_size: int
     data_at: int
     nbytes: int
 
@@ -186,7 +179,7 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Header:
         raise Ktx2Error(f"the level index does not match {layers} layers of {width} x {height} texels")
     if data_at < kvd_at + kvd_size or data_at < dfd_at + dfd_size or data_at + data_size != size:
         raise Ktx2Error(f"truncated or too long: {size} bytes, {data_at + data_size} expected")
-    return Header(format, width, height, layers, kvd_at, kvd_size, data_at, size)
+    return Header(format, width, height, layers, data_at, size)
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
@@ -197,34 +190,14 @@ def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
     """
     view = memoryview(data)
     header = read_header(view, len(view))
-    metadata = _unpack_metadata(bytes(view[header.metadata_at : header.metadata_at + header.metadata_size]))
     size = layer_bytes(header.format, header.width, header.height)
     payload = [view[at : at + size] for at in range(header.data_at, header.nbytes, size)]
-    return Ktx2Image(payload, header.format, header.width, header.height, metadata)
+    return Ktx2Image(payload, header.format, header.width, header.height)
 
 
-def _pack_metadata(metadata: Mapping[str, str]) -> bytes:
-    packed = b""
-    for key in sorted(metadata):
-        entry = key.encode() + b"\0" + metadata[key].encode() + b"\0"
-        packed += struct.pack("<I", len(entry)) + entry + bytes(-len(entry) % 4)
-    return packed
-
-
-def _unpack_metadata(data: bytes) -> dict[str, str]:
-    metadata: dict[str, str] = {}
-    at = 0
-    while at < len(data):
-        if at + 4 > len(data):
-            raise Ktx2Error("the key/value data ends within an entry")
-        (length,) = struct.unpack_from("<I", data, at)
-        entry = data[at + 4 : at + 4 + length]
-        if length < 2 or len(entry) != length or b"\0" not in entry:
-            raise Ktx2Error("the key/value data ends within an entry")
-        key, value = entry.split(b"\0", 1)
-        try:
-            metadata[key.decode()] = value.rstrip(b"\0").decode()
-        except UnicodeDecodeError:
-            pass  # the specification allows binary values
-        at += 4 + length + -length % 4
-    return metadata
+def _key_values(pairs: Mapping[str, str]) -> bytes:
+    data = b""
+    for key in sorted(pairs):
+        entry = key.encode() + b"\0" + pairs[key].encode() + b"\0"
+        data += struct.pack("<I", len(entry)) + entry + bytes(-len(entry) % 4)
+    return data

@@ -93,7 +93,7 @@ def points_of(text: str) -> Tensor:
     low, high = _RATES
     good = (points[:, :3].abs() <= LIMITS["means"][0]).all() and ((points[:, 3] >= low) & (points[:, 3] <= high)).all()
     if not bool(good):  # also for NaN
-        raise PydanticCustomError("points", "must hold places and rates in range")
+        raise PydanticCustomError("points", "must hold positions and rates in range")
     return points
 
 
@@ -115,7 +115,7 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Column(Part):
-    """A column of integers, as `streams.pack` packs it."""
+    """A column of integers, as `streams.compress` writes it."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
     step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
@@ -126,8 +126,8 @@ class Column(Part):
     ]
 
 
-class PlaceFrame(Part):
-    """The grid of the surfels' places: x = center + scale sinh(low + step k), see `bake.surfel_codes.Frame`."""
+class PositionFrame(Part):
+    """Grid of the positions: x = center + scale sinh(low + step k), `codec.surfel_codes.PositionGrid`."""
 
     center: tuple[Coordinate, Coordinate, Coordinate]
     scale: Annotated[float, Field(gt=0, le=LIMITS["means"][0])]
@@ -139,7 +139,7 @@ class Surfels(Part):
 
     file: Literal["surfels.ply", "surfels.bin"] = SURFELS
     count: Whole
-    frame: PlaceFrame | None = None
+    frame: PositionFrame | None = None
     columns: Annotated[list[Column], Field(max_length=64)] | None = None
     """Of surfels.bin, in their order."""
     view_color: Kind
@@ -167,7 +167,7 @@ class Atlas(Part):
     """Of coefficients of grade 0, in texels.bin."""
     page_width: Side | None = None
     page_rows: Side | None = None
-    """What `bake.packing.pack` is given for where tiles lie to follow from their sizes, in a compact bundle."""
+    """Arguments of `codec.packing.pack`, by which the packing follows from the sizes of the tiles."""
     columns: Annotated[list[Column], Field(max_length=64)] | None = None
     """Of texels.bin, in their order."""
     width: Side
@@ -214,7 +214,7 @@ class Render(Part):
     background: tuple[Share, Share, Share]
 
 
-class Place(Part):
+class WorldFrame(Part):
     """How the scene lies in the capture's own frame, x_scene = scale * (transform @ [x_capture, 1]), and in the real
     world, as far as that is known: since versions 1.3 and 2.2."""
 
@@ -228,7 +228,7 @@ class Place(Part):
     """Length of a unit of the scene."""
 
     @model_validator(mode="after")
-    def _up_is_a_direction(self) -> Place:
+    def _up_is_a_direction(self) -> WorldFrame:
         if (self.up is None) != (self.up_from is None):
             raise PydanticCustomError("up", "must have up and up_from, or neither")
         if self.up is not None and not abs(math.hypot(*self.up) - 1) <= UNIT_LENGTH:
@@ -260,7 +260,7 @@ class Manifest(Part):
     atlas: Atlas | None
     color_bias: _only(COLOR_BIAS) = COLOR_BIAS  # type: ignore[valid-type]
     render: Render
-    world: Place
+    world: WorldFrame
     bounds: Bounds
     statistics: Statistics
     files: Annotated[dict[str, FileEntry], Field(max_length=1 << 14)]

@@ -23,11 +23,14 @@ from bitymi_ns.bundle.manifest import (
     Manifest,
     dump,
 )
+from bitymi_ns.trust import Refused, json_of, keep
 
 MANIFEST_LIMIT = 4 << 20
 """Bytes that a bundle.json may have."""
 DIRECTORY_LIMIT = 4 << 20
 """Bytes that the directory of a bundle in one file may have."""
+CONFIG = "config.yml"
+"""Configuration for nerfstudio's tools, for which bundle.json does not vouch."""
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
 # The last records of a ZIP: where that of large files is, that of large files itself, and the end.
@@ -149,35 +152,30 @@ _DAMAGE = (zipfile.BadZipFile, OSError, EOFError, RuntimeError, struct.error)
 
 
 @contextmanager
-def parts_of(bundle: str | Path | BinaryIO, source: str | Path | None = None, inside: bool = False) -> Iterator[Parts]:
-    """The files of a bundle.
+def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
+    """Open the files of a bundle.
 
     Args:
-        bundle: its folder or its one file; or that file, open and seekable.
-        source: for messages.
+        bundle: its folder, or its one file.
         inside: refuse links that lead out of the folder, because what is read is passed on.
 
     Raises:
         BundleError: the one file is damaged.
     """
-    if isinstance(bundle, (str, Path)):
-        path = Path(bundle)
-        if not os.path.isfile(path):
-            yield Parts(path, None, 0, inside)
-            return
-        with open_regular(path) as file, parts_of(file, path, inside) as parts:
-            yield parts
+    path = Path(bundle)
+    if not os.path.isfile(path):
+        yield Parts(path, None, 0, inside)
         return
-    where = Path(source or "the bundle")
-    try:
-        size = _check_directory(bundle)
-        archive = zipfile.ZipFile(bundle)
-    except (*_DAMAGE, ValueError) as error:
-        raise BundleError(f"{where} is not a bundle in one file: {error}") from error
-    with archive:
-        if len(archive.NameToInfo) != len(archive.filelist):
-            raise BundleError(f"{where} is not a bundle in one file: two parts have one name")
-        yield Parts(where, archive, size, inside)
+    with open_regular(path) as file:
+        try:
+            size = _check_directory(file)
+            archive = zipfile.ZipFile(file)
+        except (*_DAMAGE, ValueError) as error:
+            raise BundleError(f"{path} is not a bundle in one file: {error}") from error
+        with archive:
+            if len(archive.NameToInfo) != len(archive.filelist):
+                raise BundleError(f"{path} is not a bundle in one file: two parts have one name")
+            yield Parts(path, archive, size, inside)
 
 
 def _check_directory(file: BinaryIO) -> int:
@@ -205,3 +203,47 @@ def _check_directory(file: BinaryIO) -> int:
         raise ValueError("its directory is not where it is said to be")
     file.seek(0)
     return size
+
+
+def check_target(folder: str | Path, overwrite: bool = False) -> None:
+    """Check that a bundle may be written to a folder, before the work of making one.
+
+    Raises:
+        BundleError: it exists and `overwrite` is off; or it is something other than a bundle, or holds something else.
+    """
+    folder = Path(folder)
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_dir():
+        what = "a link to nothing" if folder.is_symlink() and not folder.exists() else "not a folder"
+        raise BundleError(f"{folder} is {what}; choose another folder")
+    if not any(folder.iterdir()):
+        return
+    if not (folder / MANIFEST).is_file():
+        raise BundleError(
+            f"{folder} is not a bundle (it has no {MANIFEST}) and is not overwritten; choose another folder"
+        )
+    if not overwrite:
+        raise BundleError(f"{folder} is a bundle already; choose another folder, or replace it (--overwrite True)")
+    try:
+        keep(folder, files_of(folder))
+    except Refused as error:
+        raise BundleError(str(error)) from error
+
+
+def files_of(folder: Path) -> list[str]:
+    """Names of the files of a bundle of any version: bundle.json, those that it lists, and the configuration for
+    nerfstudio's tools.
+
+    Raises:
+        BundleError: bundle.json cannot be read.
+    """
+    try:
+        with parts_of(folder) as parts:
+            listed = json_of(bytes(parts.read(MANIFEST, MANIFEST_LIMIT)))["files"]
+        return [MANIFEST, CONFIG, *map(str, listed)]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise BundleError(
+            f"{folder / MANIFEST} cannot be read ({error}): which files of {folder} are the bundle is not known. "
+            "Remove it yourself, or choose another folder"
+        ) from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,12 +73,11 @@ def read_header(data: bytes | bytearray, size: int) -> Header:
     return header
 
 
-def parse_ply(data: bytes | bytearray, unbounded: Collection[str] = ()) -> dict[str, dict[str, npt.NDArray]]:
+def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
     """Reads a file written by `write_ply`.
 
     Args:
         data: the whole file.
-        unbounded: properties that may be infinite.
 
     Returns:
         element to name to [N] float32 or int32 array, in the file's order; the first element is `vertex`.
@@ -94,7 +93,7 @@ def parse_ply(data: bytes | bytearray, unbounded: Collection[str] = ()) -> dict[
         at += rows.nbytes
         elements[element] = {name: np.ascontiguousarray(rows[name]) for name in declared.names}
         for name, column in elements[element].items():
-            bad = np.isnan(column) if name in unbounded else ~np.isfinite(column)
+            bad = ~np.isfinite(column)
             if bad.any():
                 raise PlyError(f"{name} is not finite in row {int(np.flatnonzero(bad)[0])}")
     return elements

@@ -101,11 +101,6 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
             return assemble(parts.bundle, info, files, decode)
 
 
-def verify_bundle(folder: str | Path) -> Manifest:
-    """Checks everything `read_bundle` checks, hashes included, and returns bundle.json."""
-    return read_bundle(folder, verify=True).info
-
-
 def read_manifest(folder: str | Path) -> Manifest:
     """bundle.json of a bundle, a folder or one file, checked as far as it can be without the other files.
 
@@ -185,9 +180,7 @@ def _whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha2
     return data if keep else bytearray()
 
 
-def assemble(
-    folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True, textured: bool = True
-) -> Bundle:
+def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
     """The bundle of what `read_file` read.
 
     Args:
@@ -195,13 +188,12 @@ def assemble(
         info: bundle.json.
         files: contents of the files with surfels and texels, by name.
         decode: as in `read_bundle`.
-        textured: False leaves the texels of a compact bundle alone: its surfels show their constant residuals.
 
     Raises:
         BundleError: a file is malformed, or a value is out of range.
     """
     if info.surfels.file == COMPACT_SURFELS:
-        return _assemble_compact(folder, info, files, decode, textured)
+        return _assemble_compact(folder, info, files, decode)
     path = folder / SURFELS
     kind = info.surfels.view_color
     try:
@@ -236,25 +228,23 @@ def assemble(
     return Bundle(scene, info)
 
 
-def _assemble_compact(
-    folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool, textured: bool
-) -> Bundle:
+def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool) -> Bundle:
     """The bundle of surfels.bin and texels.bin."""
     atlas, where = info.atlas, folder / COMPACT_SURFELS
     try:
-        codes, residual, step = compact.unpack_surfels(info.surfels, memoryview(files[COMPACT_SURFELS]))
+        codes, residual, step = compact.decode_surfels(info.surfels, memoryview(files[COMPACT_SURFELS]))
         sizes = torch.from_numpy(codes.sizes)
         tiles, texels, blocks = torch.zeros(len(codes), 5, dtype=torch.int32), None, None
-        if atlas is not None and textured:
+        if atlas is not None:
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
-            found = compact.unpack_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]))
+            found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]))
             value_range = Range(atlas.offset, atlas.scale, "")
             texels = _rounded(found.texels(), packing, value_range)
             if not decode and texels.numel() >= LARGE_ATLAS:
                 blocks = _blocks(texels)
                 texels = texels if blocks is None else None
-        elif atlas is None and bool((sizes > 0).any()):
+        elif bool((sizes > 0).any()):
             raise StreamError("a surfel has a tile, and there is no atlas")
     except StreamError as error:
         raise BundleError(f"{where}: {error}") from error

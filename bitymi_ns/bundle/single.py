@@ -1,17 +1,15 @@
-"""A bundle in one file: a ZIP whose parts are stored as they are, in the order in which a viewer needs them."""
+"""A bundle in one file: an uncompressed ZIP whose parts lie in the order in which a viewer needs them."""
 
 from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
-from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, parse
+from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError
 from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
-from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file, read_manifest
+from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.sizes import enough_memory, machine_memory
 from bitymi_ns.files import size_text, write_file
 
@@ -37,7 +35,7 @@ class Written:
 
 
 def write_single(bundle: str | Path, path: str | Path) -> Written:
-    """Writes the files of a bundle that bundle.json vouches for and the format names into one, whole or not at all.
+    """Write the files of a bundle that bundle.json lists and the format names into one, whole or not at all.
 
     Nothing is deflated, sizes stand before the parts, and bundle.json comes first: a reader of the beginning knows
     where everything lies, and any part is one range of the file.
@@ -64,7 +62,7 @@ def is_single(path: Path) -> bool:
 
 
 def joined(bundle: str | Path) -> tuple[bytes, Written]:
-    """What `write_single` writes, and what it says of it; raises as it does."""
+    """Contents of `write_single`'s file, and what it returns; raises as it does."""
     first, buffer = 0, io.BytesIO()
     with parts_of(bundle, inside=True) as parts:
         info = manifest_of(parts)
@@ -85,58 +83,3 @@ def joined(bundle: str | Path) -> tuple[bytes, Written]:
         with enough_memory(parts.bundle, info):
             whole = buffer.getvalue()
     return whole, Written(first, len(whole), left_out(info))
-
-
-def read_single(file: BinaryIO, textured: bool = True, verify: bool = True, source: str = "the bundle") -> Bundle:
-    """Opens a bundle of `write_single`, of which no more is read than is needed.
-
-    Args:
-        file: seekable; `Ranges` is one of a server that answers range requests.
-        textured: False leaves the texels alone: every surfel then shows its constant residual.
-        verify: compare the parts with their SHA-256.
-        source: for messages.
-
-    Raises:
-        BundleError: the file is damaged, or what is in it.
-    """
-    with parts_of(file, source) as parts:
-        info = parse(parts.read(MANIFEST, MANIFEST_LIMIT), f"{source}: {MANIFEST}")
-        if not textured and info.surfels.file != COMPACT_SURFELS:
-            raise BundleError(f"{source}: only a compact bundle can be opened without its texels")
-        wanted = {info.surfels.file} | ({info.atlas.file} if info.atlas is not None and textured else set())
-        with enough_memory(parts.bundle, info):
-            files = {name: read_file(parts, info, name, verify) for name in sorted(wanted)}
-            return assemble(parts.bundle, info, files, textured=textured)
-
-
-class Ranges(io.RawIOBase):
-    """A file of which pieces are fetched when they are read."""
-
-    def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
-        """
-        Args:
-            fetch: the bytes from a position, and how many of them.
-            size: of the file.
-        """
-        self._fetch, self._size, self._at = fetch, size, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
-        self._at = max(0, base + offset)
-        return self._at
-
-    def read(self, size: int | None = -1) -> bytes:
-        left = max(0, self._size - self._at)
-        count = left if size is None or size < 0 else min(size, left)
-        data = self._fetch(self._at, count) if count else b""
-        self._at += len(data)
-        return data

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Place
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldFrame
 from bitymi_ns.bundle.parts import Parts, parts_of
 from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
@@ -75,13 +75,13 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
     return bundle, [*checks, _tiles(bundle), _statements(bundle), *check_certificate(bundle)]
 
 
-def _real_world(place: Place) -> str:
+def _real_world(place: WorldFrame) -> str:
     """What is stated of up and of lengths."""
     text = "" if place.up is None else f", up ({', '.join(f'{x:.3f}' for x in place.up)}) by {place.up_from}"
     return text + ("" if place.metres_per_unit is None else f", {place.metres_per_unit:.4g} m per unit")
 
 
-def check_place(stated: Place, world: World) -> Check:
+def check_world(stated: WorldFrame, world: World) -> Check:
     """Compares what a bundle states of its place in the capture's frame and in the real world with that of its run.
 
     Args:

@@ -15,7 +15,6 @@ import torch
 
 from bitymi_ns import __version__
 from bitymi_ns.bundle import compact, ktx2, ply
-from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,
@@ -33,6 +32,7 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
+from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.statistics import Statistics
 from bitymi_ns.bundle.surfel_table import (
@@ -75,7 +75,7 @@ class World:
     metres_per_unit: float | None = None
 
     def described(self) -> dict[str, Any]:
-        """`manifest.Place`: up and length in the scene's own frame."""
+        """`manifest.WorldFrame`: up and length in the scene's own frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
         place: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:
@@ -226,12 +226,12 @@ def write_surfels(path: Path, scene: BakedScene) -> None:
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """The two files of a compact bundle; their description goes into `info`."""
-    of_surfels, surfels = compact.pack_surfels(codes.surfels, codes.residual, codes.residual_step)
+    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
     info["version"] = f"{VERSION[0]}.{VERSION[1]}"
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
-        of_texels, parts[TEXELS] = compact.pack_texels(codes.texels)
+        of_texels, parts[TEXELS] = compact.encode_texels(codes.texels)
         pages = {"page_width": codes.page_width, "page_rows": codes.page_rows}
         info["atlas"] |= {"file": TEXELS, "format": "dct", **pages, **of_texels}
         info["atlas"].pop("extent_column")

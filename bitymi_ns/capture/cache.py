@@ -141,7 +141,7 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
     return True
 
 
-def read_from(work: Path) -> None:
+def keep_work_folder(work: Path) -> None:
     """Keep a work folder until this process ends: no other one removes it."""
     with suppress(files.Busy, OSError):  # a folder that cannot be written is not removed either
         mark = work / f"{IN_USE}{os.getpid()}"

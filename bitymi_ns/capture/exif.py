@@ -105,6 +105,18 @@ def number(value: object) -> float | None:
     return found if math.isfinite(found) and found > 0 else None
 
 
+def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
+    """Read shutter time (seconds), f-number and ISO of an opened image; None where the time is not stated."""
+    detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    values = []
+    for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings):
+        value = detail.get(tag)
+        if isinstance(value, (tuple, list)):  # several ISO values
+            value = value[0] if value else None
+        values.append(number(value))
+    return tuple(values) if values[0] else None
+
+
 def _up(
     image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
 ) -> tuple[float, float, float] | None:

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, finished, take_place, work_folder
-from bitymi_ns.capture.masks import counted
+from bitymi_ns.capture.masks import mask_pixels
 from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.sfm import process
@@ -44,7 +44,7 @@ class KnownView:
     world_to_camera: np.ndarray
     """[3,4] rotation and translation, OpenCV axes (x right, y down, z forward)."""
     mask: Path | None = None
-    """Picture that is black where no point is to be found; see `masks.counted`."""
+    """Picture that is black where no point is to be found; see `masks.mask_pixels`."""
 
     @property
     def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
@@ -119,7 +119,7 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
         names[plain] = name
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
         if view.mask is not None and view.mask.is_file():
-            mask = _read(view.mask, lambda image: Image.fromarray(counted(image)))
+            mask = _read(view.mask, lambda image: Image.fromarray(mask_pixels(image)))
             size = (view.width, view.height)
             mask.resize(size, Image.Resampling.NEAREST).convert("L").save(masks / f"{plain}.png")
     return Job(

@@ -55,10 +55,10 @@ def mask_folder(photographs: Path, data: Path, given: Path | None = None, reduct
 
 
 def _is_there(masks: Path, reduction: int) -> bool:
-    return masks.is_dir() or (reduction > 1 and smaller_masks(masks, reduction).is_dir())
+    return masks.is_dir() or (reduction > 1 and downscaled_masks(masks, reduction).is_dir())
 
 
-def smaller_masks(masks: Path, reduction: int) -> Path:
+def downscaled_masks(masks: Path, reduction: int) -> Path:
     """Where masks that are so many times smaller lie."""
     return masks.with_name(f"{masks.name}_{reduction}")
 
@@ -75,7 +75,7 @@ def mask_of(masks: Path, name: str) -> Path | None:
     return mask_of(masks, stem) if is_copy else found
 
 
-def counted(image: Image.Image) -> npt.NDArray[np.bool_]:
+def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
     """Which pixels [H, W] of a mask count: those that are not black; of a lossy format those with a channel above
     MIDDLE. Transparent pixels do not.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from bitymi_ns.capture.masks import counted, in_proportion, mask_of
+from bitymi_ns.capture.masks import in_proportion, mask_of, mask_pixels
 from bitymi_ns.capture.photos import COPY, Photo, upright
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.types import CaptureError
@@ -82,7 +82,7 @@ def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, wo
 def _read_mask(path: Path, photo: Photo) -> Image.Image:
     try:
         with open_picture(path) as image:
-            mask = Image.fromarray(counted(image))
+            mask = Image.fromarray(mask_pixels(image))
     except Exception as error:
         raise CaptureError(f"the mask {path} cannot be read: save it anew, or remove it") from error
     size = (photo.width, photo.height)

@@ -1,4 +1,4 @@
-"""Where the texels of tiles lie in the pages of an atlas."""
+"""Indices of texels in the pages of an atlas, and texels as a list and as pages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
 
 
 def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None, chunk: int = 1 << 20) -> Tensor:
-    """Mean of every tile of `texels` [layers, height, width, 3]: [N, 3]; `constant` [N, 3] or 0 without one."""
+    """[N, 3] mean of every tile of `texels` [layers, height, width, 3]; without a tile `constant` [N, 3], or 0."""
     tiles = torch.from_numpy(packing.tiles)
     flat = texels.reshape(-1, 3)
     means = torch.zeros(len(tiles), 3) if constant is None else constant.clone()
@@ -59,9 +59,9 @@ def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None,
     return means
 
 
-def places(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows of the list of `ops.TexelTiles`, where a surfel without a tile has one texel, and rows of the flattened
-    pages that are the same texels: one pair per tile size."""
+def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows of a texel list (`ops.TexelTiles`: a surfel without a tile has one texel) and rows of the flattened pages of
+    the same texels, a pair for each tile size."""
     tiles = torch.from_numpy(packing.tiles)
     area = tiles[:, 3:].long().clamp(min=1).prod(dim=1)
     first = area.cumsum(0) - area
@@ -72,43 +72,25 @@ def places(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
-    """[T, 3] texels of pages [layers, height, width, 3] as the list of `ops.TexelTiles`; of a surfel without a tile
-    its constant, of [N, 3]."""
+    """Texel list [T, 3] of pages [layers, height, width, 3]; a surfel without a tile has its constant of [N, 3]."""
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
-    for listed, paged in places(packing):
+    for listed, paged in _texel_rows(packing):
         texels[listed] = pages.reshape(-1, 3)[paged]
     return texels
 
 
 def paged_texels(texels: Tensor, packing: Packing, elsewhere: Tensor | float = 0.0) -> Tensor:
-    """[layers, height, width, ...] the texels [T, ...] of such a list where their tiles lie; elsewhere a number, or
-    what other pages have there."""
+    """Pages [layers, height, width, ...] of a texel list [T, ...]; outside of tiles a number, or texels of pages."""
     size, rest = (packing.layers, packing.height, packing.width), texels.shape[1:]
     pages = elsewhere.clone() if isinstance(elsewhere, Tensor) else texels.new_full((*size, *rest), elsewhere)
-    for listed, paged in places(packing):
+    for listed, paged in _texel_rows(packing):
         pages.view(-1, *rest)[paged] = texels[listed]
     return pages
 
 
-def moved_texels(texels: Tensor, tiles: Tensor, packing: Packing) -> Tensor:
-    """Texels of tiles that lie elsewhere: [layers, height, width, 3] of `packing`, 0 outside of its tiles.
-
-    Args:
-        texels: [layers, height, width, 3] that they are read from.
-        tiles: [N, 5] int32, where each lies there; their sizes are those of `packing`, row by row.
-        packing: where they go.
-    """
-    pages = torch.zeros(packing.layers * packing.height * packing.width, 3)
-    flat, to = texels.reshape(-1, 3), torch.from_numpy(packing.tiles)
-    for r_u, r_v, rows in size_classes(tiles):
-        index = texel_index(to[rows], (r_u, r_v), packing.width, packing.height)
-        pages[index] = flat[texel_index(tiles[rows], (r_u, r_v), texels.shape[2], texels.shape[1])]
-    return pages.reshape(packing.layers, packing.height, packing.width, 3)
-
-
-def coverage(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:
-    """Which 4 x 4 blocks belong to a tile: [layers, height / 4, width / 4] bool."""
+def covered_blocks(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:
+    """[layers, height / 4, width / 4] bool, True for 4 x 4 blocks that belong to a tile."""
     blocks = torch.from_numpy(np.ascontiguousarray(tiles)).clone()
     blocks[:, [0, 1, 3, 4]] //= 4
     mask = torch.zeros(layers * (height // 4) * (width // 4), dtype=torch.bool)

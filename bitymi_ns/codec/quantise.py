@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import coverage
+from bitymi_ns.codec.pages import covered_blocks
 from bitymi_ns.ops.bc7 import decode_bc7
 from bitymi_ns.progress import Progress, no_progress
 
@@ -165,7 +165,7 @@ def encode(
         value_range = Range(0.0, 1.0, "none")
     elif value_range is None:
         value_range = choose_range(texels, packing)
-    owned = coverage(packing.tiles, width, height, layers)
+    owned = covered_blocks(packing.tiles, width, height, layers)
     encoder = bc7_encoder(profile) if format == "bc7" else None
 
     def strip(layer: int, top: int) -> tuple[bytes, int, float]:
@@ -183,18 +183,18 @@ def encode(
         clipped = int(((inside < low - slack) | (inside > high + slack)).sum())
         return data, clipped, float(np.square(decoded[mask].astype(np.float64) - inside).sum())
 
-    places = [(layer, top) for layer in range(layers) for top in range(0, height, _STRIP)]
+    strips = [(layer, top) for layer in range(layers) for top in range(0, height, _STRIP)]
     pages: list[list[bytes]] = [[] for _ in texels]
     clipped, squares = 0, 0.0
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        results = pool.map(lambda place: strip(*place), places)
-        for done, ((layer, _), (data, clips, square)) in enumerate(zip(places, results, strict=True), start=1):
+        results = pool.map(lambda at: strip(*at), strips)
+        for done, ((layer, _), (data, clips, square)) in enumerate(zip(strips, results, strict=True), start=1):
             pages[layer].append(data)
             clipped, squares = clipped + clips, squares + square
-            progress("encoding the atlas", done, len(places))
+            progress("encoding the atlas", done, len(strips))
     values = max(1, int(owned.sum()) * 16 * 3)
     return EncodedAtlas(
-        payload=[b"".join(strips) for strips in pages],
+        payload=[b"".join(page) for page in pages],
         format=format,
         width=width,
         height=height,
@@ -292,7 +292,7 @@ def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, threads: int | No
 def _extremes(texels: npt.NDArray[np.float32], packing: Packing) -> tuple[float, float]:
     layers, height, width, _ = texels.shape
     low, high = np.inf, -np.inf
-    for page, owned in zip(texels, coverage(packing.tiles, width, height, layers), strict=True):
+    for page, owned in zip(texels, covered_blocks(packing.tiles, width, height, layers), strict=True):
         blocks = page.reshape(height // 4, 4, width // 4, 4, 3)
         if owned.any():
             low = min(low, float(blocks.min(axis=(1, 3, 4))[owned].min()))

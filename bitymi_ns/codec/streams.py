@@ -1,4 +1,4 @@
-"""Columns of integers as compressed bytes: a Zstandard frame for each byte of each number, of a known size."""
+"""Columns of integers as Zstandard frames, one for each byte plane of each number, of known sizes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class StreamError(ValueError):
 
 
 @dataclass(frozen=True)
-class Packed:
-    """A column of integers, packed.
+class Compressed:
+    """A compressed column of integers.
 
     Attributes:
         low: of each of its numbers, the smallest value, which was subtracted.
@@ -34,8 +34,8 @@ class Packed:
     data: bytes
 
 
-def pack(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Packed:
-    """Packs integers [rows, numbers] below 2^53 in size, with an effort of 1 to 22."""
+def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:
+    """Compress int64 [rows, numbers] below 2^53 in size at a Zstandard level of 1 to 22."""
     compressor = zstandard.ZstdCompressor(level=level, write_content_size=True)
     low = [int(column.min()) if len(column) else 0 for column in codes.T]
     frames: list[list[bytes]] = []
@@ -46,17 +46,17 @@ def pack(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Packed:
             rest = rest >> np.uint64(8)
         frames.append(planes)
     sizes = [[len(frame) for frame in planes] for planes in frames]
-    return Packed(low, sizes, b"".join(frame for planes in frames for frame in planes))
+    return Compressed(low, sizes, b"".join(frame for planes in frames for frame in planes))
 
 
-def unpack(
+def decompress(
     view: memoryview,
     rows: int,
     low: Sequence[int],
     planes: Sequence[Sequence[int]],
     dtype: type[np.integer] = np.int64,
 ) -> npt.NDArray:
-    """The integers [rows, numbers] of what `pack` made; memory for `rows` of them is needed and no more.
+    """Decompress integers [rows, numbers] of `compress`, in memory for `rows` of them and no more.
 
     Raises:
         StreamError: a frame is damaged, or holds another number of bytes than there are rows.
@@ -66,7 +66,7 @@ def unpack(
     for number, sizes in enumerate(planes):
         column = np.zeros(rows, dtype=dtype)
         for plane, size in enumerate(sizes):
-            column += unpacked_bytes(view[at : at + size], rows).astype(dtype) << (8 * plane)
+            column += plane_bytes(view[at : at + size], rows).astype(dtype) << (8 * plane)
             at += size
         codes[:, number] = column + low[number]
     if at != len(view):
@@ -74,8 +74,8 @@ def unpack(
     return codes
 
 
-def unpacked_bytes(frame: memoryview, size: int) -> npt.NDArray[np.uint8]:
-    """The bytes of a frame that must hold `size` of them; nothing is allocated before its header has said so.
+def plane_bytes(frame: memoryview, size: int) -> npt.NDArray[np.uint8]:
+    """Bytes of a frame that must hold `size` of them; its header is checked before anything is allocated.
 
     Raises:
         StreamError: it is damaged or holds another number.

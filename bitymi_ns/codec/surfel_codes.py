@@ -1,4 +1,4 @@
-"""Surfels as integers: what a compact bundle keeps of each, and the numbers that it stands for."""
+"""Integer codes of surfels, and the parameters that they decode to."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 
 Codes = npt.NDArray[np.int64]
 
-PLACE_BITS = 17
-"""Bits per axis of a place: three times as many are exact in a float64."""
+POSITION_BITS = 17
+"""Bits per axis of a position: three times as many are exact in a float64."""
 SMALLEST_SHARE = 1.0 / 1024
 """Opacities and betas keep this distance from their ends, where a logit would be infinite."""
 REFERENCE: dict[str, float] = {
@@ -33,15 +33,15 @@ REFERENCE: dict[str, float] = {
     "term_shape": 1.0 / 12,
     "term_color": 1.0 / 64,
 }
-"""Columns whose precision is chosen, with steps of which the error is about proportional to the step: those of place in
-`Frame` units, of opacity and beta as shares of their ranges, of term_shape in units of asinh."""
+"""Columns whose precision is chosen, with steps to which the error is about proportional: of place (positions) in
+`PositionGrid` units, of opacity and beta as shares of their ranges, of term_shape in units of asinh."""
 PARAMETERS = {"place": "means", "rotation": "quats", "opacity": "opacity_logits", "beta": "beta_raw"}
 """Parameters of the surfels by column, where the names differ."""
 
 
 @dataclass(frozen=True)
-class Frame:
-    """The grid of places: x = center + scale sinh(low + step k), per axis, with integers k from 0. It is about uniform
+class PositionGrid:
+    """Grid of positions: x = center + scale sinh(low + step k), per axis, with integers k from 0. It is about uniform
     within `scale` of the centre, and beyond its cells grow with the distance.
 
     Attributes:
@@ -60,21 +60,21 @@ class SurfelCodes:
 
     Attributes:
         kind: of the view colours, a name of `ops.VIEW_COLORS`.
-        frame: the grid of places.
+        frame: the grid of positions.
         steps: the distance of neighbouring values by column, as in `REFERENCE`.
         codes: column to [rows, numbers] int64.
-            place [N, 1]: bit 3 i + a is bit i of the cell along axis a; ascending.
+            place [N, 1]: Morton codes of the positions, ascending: bit 3 i + a is bit i of the cell along axis a.
             largest [N, 1], rotation [N, 3]: which of w, x, y, z has the largest size and is positive; the others.
             log_scales [N, 2], opacity [N, 1], beta [N, 1].
             size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
             extent [tiles, 1]: half sides of the tiles that there are.
             view_base [N, 3], view_count [N, 1]: base colours and numbers of terms.
             term_shape, term_color [T, ...]: the terms, those numbers that are no colours and those that are.
-            Colours are green, red less green, blue less green.
+            Colours are green, red - green, blue - green.
     """
 
     kind: str
-    frame: Frame
+    frame: PositionGrid
     steps: Mapping[str, float]
     codes: Mapping[str, Codes]
 
@@ -88,7 +88,7 @@ class SurfelCodes:
 
     def nbytes(self) -> int:
         """Bytes of surfels.bin without residuals."""
-        return sum(len(streams.pack(column).data) for column in self.columns.values())
+        return sum(len(streams.compress(column).data) for column in self.columns.values())
 
     @property
     def sizes(self) -> npt.NDArray[np.int64]:
@@ -103,7 +103,7 @@ class SurfelCodes:
         return torch.from_numpy(extent.astype(np.float32)).clamp(*EXTENTS)
 
     def surfels(self) -> dict[str, Tensor]:
-        """The parameters that the integers stand for, float32; view colours are lean."""
+        """Decoded parameters, float32, with lean view colours."""
         entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
         terms = np.zeros((len(self.codes["term_color"]), entry.lean_width))
         count = self.codes["view_count"][:, 0]
@@ -127,7 +127,7 @@ class SurfelCodes:
 
     def _means(self) -> npt.NDArray[np.float64]:
         frame = self.frame
-        bent = np.array(frame.low) + self.steps["place"] * cells(self.codes["place"])
+        bent = np.array(frame.low) + self.steps["place"] * morton_cells(self.codes["place"])
         return np.array(frame.center) + frame.scale * _sinh(bent)
 
     def _rotations(self) -> npt.NDArray[np.float64]:
@@ -146,23 +146,23 @@ def code_surfels(
     extent: Tensor,
     steps: Mapping[str, float],
 ) -> tuple[SurfelCodes, Tensor]:
-    """Rounds surfels to the given steps and puts them into the order of a Morton curve.
+    """Round surfels to the given steps, in Morton order of their positions.
 
     Args:
         surfels: parameters by name, on the CPU, with lean view colours.
         kind: a name of `ops.VIEW_COLORS`.
         sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
         extent: [N] half sides of the tiles, scale units.
-        steps: by column, as in `REFERENCE`; that of place may have to be larger for its cells to fit.
+        steps: by column, as in `REFERENCE`; that of place grows where its cells would exceed `POSITION_BITS`.
 
     Returns:
         the codes, and [N] int64: the row that each of them was.
     """
     values = {name: value.detach().double().numpy() for name, value in surfels.items()}
-    frame, step, cell = _placed(values["means"], steps["place"])
+    frame, step, cell = _grid_cells(values["means"], steps["place"])
     steps = {**steps, "place": step}
-    place = keys(cell)
-    order = np.argsort(place, kind="stable")
+    position = morton_codes(cell)
+    order = np.argsort(position, kind="stable")
     quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)
     quats = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
@@ -171,7 +171,7 @@ def code_surfels(
     tiled = sides[:, 0] > 0
     exponents = np.log2(np.maximum(sides, 1)).astype(np.int64)
     per_surfel = {
-        "place": place[:, None],
+        "place": position[:, None],
         "largest": largest[:, None],
         "rotation": _codes(rest, steps["rotation"]),
         "log_scales": _codes(values["log_scales"], steps["log_scales"]),
@@ -209,29 +209,30 @@ def term_numbers(kind: str) -> tuple[list[int], list[int]]:
     return colors, [i for i in range(len(every)) if i not in colors]
 
 
-def keys(cell: Codes) -> Codes:
-    """[N] places on the Morton curve of cells [N, 3] of at most 2^17 per axis."""
-    return sum(((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(PLACE_BITS) for a in range(3))
+def morton_codes(cell: Codes) -> Codes:
+    """[N] Morton codes of cells [N, 3] of at most 2^17 per axis."""
+    return sum(((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(POSITION_BITS) for a in range(3))
 
 
-def cells(place: Codes) -> Codes:
-    """[N, 3] cells of places [N, 1]."""
-    axes = [sum(((place[:, 0] >> (3 * i + a)) & 1) << i for i in range(PLACE_BITS)) for a in range(3)]
+def morton_cells(codes: Codes) -> Codes:
+    """[N, 3] cells of Morton codes [N, 1]."""
+    axes = [sum(((codes[:, 0] >> (3 * i + a)) & 1) << i for i in range(POSITION_BITS)) for a in range(3)]
     return np.stack(axes, axis=1)
 
 
-def _placed(means: npt.NDArray[np.float64], step: float) -> tuple[Frame, float, Codes]:
+def _grid_cells(means: npt.NDArray[np.float64], step: float) -> tuple[PositionGrid, float, Codes]:
+    """Grid of the positions [N, 3], its step, and the cells [N, 3]."""
     center = np.median(means, axis=0)
     scale = float(np.median(np.abs(means - center))) or 1.0
     bent = np.arcsinh((means - center) / scale)
     low = bent.min(axis=0)
-    step = max(step, float((bent.max(axis=0) - low).max()) / (2**PLACE_BITS - 1))
-    frame = Frame(tuple(map(float, center)), scale, tuple(map(float, low)))  # type: ignore[arg-type]
+    step = max(step, float((bent.max(axis=0) - low).max()) / (2**POSITION_BITS - 1))
+    frame = PositionGrid(tuple(map(float, center)), scale, tuple(map(float, low)))  # type: ignore[arg-type]
     return frame, step, np.rint((bent - low) / step).astype(np.int64)
 
 
 def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Rows of the terms of surfels, surfel after surfel, of their spans [N, 2]."""
+    """Rows of the terms, surfel after surfel, of spans [N, 2]."""
     first, count = span[:, 0], span[:, 1]
     start = np.cumsum(count) - count
     return np.repeat(first - start, count) + np.arange(int(count.sum()))
@@ -242,7 +243,7 @@ def _codes(values: npt.NDArray[np.float64], step: float) -> Codes:
 
 
 def _differences(rgb: Codes) -> Codes:
-    """Colours of channels (..., 3 each): green, red less green, blue less green."""
+    """Green, red - green, blue - green of channels (..., 3 each)."""
     r, g, b = (rgb[:, i::3] for i in range(3))
     return np.stack([g, r - g, b - g], axis=2).reshape(rgb.shape)
 
@@ -266,6 +267,6 @@ def _logit(share: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float
 
 
 def _within(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:
-    """float32 values within what a bundle may hold: rounding may have led beyond."""
+    """float32 values clipped to the limits of a bundle, which rounding may exceed."""
     limit = np.array(limit_of(name, kind) if name == "view_terms" else LIMITS.get(name, (np.inf,)))
     return torch.from_numpy(np.clip(values, -limit, limit).astype(np.float32))

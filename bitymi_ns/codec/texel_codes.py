@@ -132,7 +132,7 @@ class TexelCodes:
 
     def nbytes(self, level: int = streams.LEVEL) -> int:
         """Bytes of texels.bin."""
-        return sum(len(streams.pack(column, level).data) for column in self.columns.values())
+        return sum(len(streams.compress(column, level).data) for column in self.columns.values())
 
     @property
     def constants(self) -> Tensor:

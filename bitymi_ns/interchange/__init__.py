@@ -1,26 +1,26 @@
 """Baked scenes for other programs: as 3D Gaussians, and as a textured mesh; and how those would draw them."""
 
-from bitymi_ns.interchange.bundle_cameras import Given, given_with
+from bitymi_ns.interchange.bundle_cameras import BundleCameras, read_cameras
 from bitymi_ns.interchange.extras import (
     FILES,
     Frame,
     Kind,
     Written,
     check_extras,
-    described,
-    place_of,
+    extras_folder,
+    summary_line,
     write_extras,
 )
 
 __all__ = [
     "FILES",
     "Frame",
-    "Given",
+    "BundleCameras",
     "Kind",
     "Written",
     "check_extras",
-    "described",
-    "given_with",
-    "place_of",
+    "extras_folder",
+    "read_cameras",
+    "summary_line",
     "write_extras",
 ]

@@ -46,8 +46,8 @@ MOST_CAMERAS = 100_000
 
 
 @dataclass(frozen=True)
-class Given:
-    """What is known of a bundle's capture.
+class BundleCameras:
+    """Cameras of the capture that a bundle was made of.
 
     Attributes:
         train: the training cameras.
@@ -66,8 +66,8 @@ class NamedCamera(NamedTuple):
     camera: Camera
 
 
-def given_with(folder: str | Path, info: Manifest) -> Given:
-    """What cameras.json of a bundle says, and the photographs that it names; nothing, where it has no such file.
+def read_cameras(folder: str | Path, info: Manifest) -> BundleCameras:
+    """Read cameras.json of a bundle and the photographs that it names; empty where there is no such file.
 
     Args:
         folder: the bundle's folder, or its one file.
@@ -77,15 +77,15 @@ def given_with(folder: str | Path, info: Manifest) -> Given:
         BundleError: a file is missing, altered or malformed.
     """
     if CAMERAS not in info.files:
-        return Given()
+        return BundleCameras()
     with parts_of(folder) as parts:
         rows = _rows(parts, info)
         held_out = [_view(parts, info, row) for row in rows if row.held_out and row.photograph is not None]
-    return Given([row.camera() for row in rows if not row.held_out], held_out)
+    return BundleCameras([row.camera() for row in rows if not row.held_out], held_out)
 
 
 def named_cameras(folder: str | Path, info: Manifest) -> list[NamedCamera]:
-    """The cameras of the capture that a bundle was made of, as cameras.json has them; see `given_with`."""
+    """The cameras of the capture that a bundle was made of, as cameras.json has them; see `read_cameras`."""
     if CAMERAS not in info.files:
         return []
     with parts_of(folder) as parts:

@@ -19,10 +19,10 @@ from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
 from bitymi_ns.interchange.glb import glb_bytes
-from bitymi_ns.interchange.looks import Looks, fit_looks, shown_residual
 from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.interchange.splat import draw_gaussians
+from bitymi_ns.interchange.surfel_colors import SurfelColors, fit_colors, weighted_residuals
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -68,14 +68,14 @@ class Written:
     views: int
 
 
-def place_of(bundle: Path) -> Path:
+def extras_folder(bundle: Path) -> Path:
     """The folder for the extras of a bundle: beside it, with its name and `SUFFIX`."""
     bundle = bundle.absolute()
     return bundle.with_name((bundle.stem if bundle.suffix == ".bitymi" else bundle.name) + SUFFIX)
 
 
 def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
-    """Checks what is asked for and its place, before the work.
+    """Check the kinds and the folder before the work.
 
     Raises:
         BundleError: there is no such kind, or the folder is there and may not be replaced, or holds more.
@@ -87,9 +87,9 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / SUMMARY).is_file():
-        raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another place")
+        raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another folder")
     if not overwrite:
-        raise BundleError(f"{folder} is there already: choose another place, or add --overwrite")
+        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite")
     try:
         keep(folder, [SUMMARY, *FILES.values()])
     except Refused as error:
@@ -112,7 +112,7 @@ def write_extras(
 
     Args:
         bundle: on the CPU, texels decoded.
-        folder: the place.
+        folder: to write.
         kinds: gaussians, mesh.
         frame: in which the files are: the scene's, or the capture's own, which bundle.json leads to.
         cameras: of the training photographs: colours are fitted to what they see. Without any, harmonics are fitted
@@ -134,7 +134,7 @@ def write_extras(
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
     chosen = [view.to("cpu") for view in evenly(held_out, MEASURED_VIEWS)]
     views = [at_size(view, smaller(view.camera, MEASURED_SIDE), "cpu") for view in chosen]
-    looks = _looks(scene, cameras, progress)
+    colors = _fitted_colors(scene, cameras, progress)
     base = _psnr(lambda camera: scene.render(camera, background).rgb, views, background)
     written: dict[str, Written] = {}
     try:
@@ -142,14 +142,14 @@ def write_extras(
             for kind in dict.fromkeys(kinds):
                 path = new / FILES[kind]
                 if kind == "gaussians":
-                    gaussians = gaussians_of(scene, looks.harmonics)
+                    gaussians = gaussians_of(scene, colors.harmonics)
                     count = len(gaussians)
                     value = _psnr(
                         lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background
                     )
                     write_gaussians(path, gaussians if to is None else gaussians.moved(to))
                 else:
-                    quads = quads_of(scene, looks.color, LEVEL)
+                    quads = quads_of(scene, colors.color, LEVEL)
                     if not len(quads):
                         raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
                     chosen = [smaller(camera, COLORED_SIDE) for camera in evenly(cameras, COLORED_VIEWS)]
@@ -167,8 +167,8 @@ def write_extras(
     return written
 
 
-def described(written: Written) -> str:
-    """What was written, in a line for people."""
+def summary_line(written: Written) -> str:
+    """One line about a written file."""
     line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB"
     if written.psnr is None or written.psnr_bundle is None:
         return line
@@ -186,11 +186,11 @@ def smaller(camera: Camera, side: int) -> Camera:
     return camera.scaled(min(1.0, side / max(camera.width, camera.height)))
 
 
-def _looks(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> Looks:
+def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     """Fitted to what the cameras see."""
     chosen = [smaller(camera, SEEN_SIDE) for camera in cameras]
     seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.through_pixel, progress).seen
-    return fit_looks(scene, shown_residual(scene), seen, centers_of(cameras, scene.surfels["means"]))
+    return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 
 
 def _picture(scene: BakedScene, background: Tensor) -> Callable[[Camera], Tensor]:

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import BundleError, Place
+from bitymi_ns.bundle.manifest import BundleError, WorldFrame
 
 FARTHEST = 10_000.0
 """Units of the scene, whose cameras fit into a box from -1 to 1; so far from the origin float32 is off by 1/1,000."""
@@ -43,7 +43,7 @@ class Similarity:
         return torch.from_numpy(Rotation.from_matrix(new).as_quat()[:, [3, 0, 1, 2]])
 
 
-def to_capture(place: Place) -> Similarity:
+def to_capture(place: WorldFrame) -> Similarity:
     """What undoes x_scene = scale * (transform @ [x_capture, 1]).
 
     Raises:

@@ -29,14 +29,6 @@ _NAMES = {
 }
 """Columns of the PLY file of 3DGS, in its order; f_rest has all of red, then green, then blue."""
 
-_REST = tuple(3 * (n * n - 1) for n in range(1, 5))
-"""How many columns f_rest has, with harmonics up to degree 0, 1, 2 and 3."""
-_UNIT_LENGTH = 1e-6
-"""Rotations that differ by no more from it are left as they are."""
-
-_OPAQUE = 30.0
-"""In place of an infinite logit; its sigmoid is 1 in single precision."""
-
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -74,7 +66,7 @@ class Gaussians:
 @torch.no_grad()
 def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
     """The Gaussians that stand for the surfels of a scene on the CPU, flat, with the colours [N, 16, 3] of
-    `looks.fit_looks`.
+    `surfel_colors.fit_colors`.
 
     They have the surfels' opacities and the second moments of their kernels: of (1 - r^2 / R^2)^beta on the disc of
     radius R the mean of u^2 is R^2 / (2 (beta + 2)).
@@ -106,34 +98,3 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
     }
     columns = {name: values[group][:, i].numpy() for group, names in _NAMES.items() for i, name in enumerate(names)}
     ply.write_ply(path, columns)
-
-
-def read_gaussians(path: str | Path) -> Gaussians:
-    """Reads a PLY file of 3DGS, of `write_gaussians` or of other programs: its harmonics may end at any degree, normals
-    may be left out, and rotations may have any length but 0. Opacities of 0 and 1 have infinite logits, which programs
-    that store opacities in bytes do write; they become -30 and 30.
-
-    Raises:
-        ply.PlyError: it is another kind of PLY, a column is missing, or another value is not finite.
-    """
-    columns = ply.parse_ply(Path(path).read_bytes(), unbounded=_NAMES["opacity_logits"])["vertex"]
-    of_file = {**_NAMES, "rest": tuple(name for name in _NAMES["rest"] if name in columns)}
-    del of_file["normals"]
-    missing = [name for names in of_file.values() for name in names if name not in columns]
-    if len(of_file["rest"]) not in _REST:
-        missing.append(_NAMES["rest"][len(of_file["rest"])])
-    if missing:
-        raise ply.PlyError(f"the column {missing[0]} is missing")
-    count = len(columns["x"])
-    found = {
-        group: torch.from_numpy(np.stack([columns[n] for n in names], 1)) if names else torch.zeros(count, 0)
-        for group, names in of_file.items()
-    }
-    coefficients = torch.zeros(count, harmonics.TERMS, 3)
-    coefficients[:, 0] = found["dc"]
-    rest = found["rest"].unflatten(1, (3, len(of_file["rest"]) // 3)).transpose(1, 2)
-    coefficients[:, 1 : 1 + rest.shape[1]] = rest
-    length = found["quats"].norm(dim=1, keepdim=True)
-    quats = torch.where((length - 1).abs() > _UNIT_LENGTH, found["quats"] / length, found["quats"])
-    logits = found["opacity_logits"][:, 0].nan_to_num(posinf=_OPAQUE, neginf=-_OPAQUE)
-    return Gaussians(found["means"], quats, found["log_scales"], logits, coefficients)

@@ -1,8 +1,7 @@
-"""Quads as a binary glTF file, by trimesh, and back."""
+"""Quads as a binary glTF file, by trimesh."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,23 +48,6 @@ def glb_bytes(quads: Quads, up: Tensor | None = None) -> bytes:
         )
         scene.add_geometry(mesh, node_name=f"surfels-{page}", geom_name=f"surfels-{page}", transform=turn)
     return trimesh.exchange.gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
-
-
-def read_glb(path: str | Path) -> Quads:
-    """The quads of a file of `glb_bytes`, where its nodes put them."""
-    scene = trimesh.load_scene(path, process=False)
-    corners, coordinates, page, pages = [], [], [], []
-    for node in sorted(scene.graph.nodes_geometry):
-        transform, name = scene.graph[node]
-        mesh = scene.geometry[name]
-        placed = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
-        uv = np.array(mesh.visual.uv)
-        uv[:, 1] = 1.0 - uv[:, 1]
-        corners.append(torch.from_numpy(placed).float().view(-1, 4, 3))
-        coordinates.append(torch.from_numpy(uv).float().view(-1, 4, 2))
-        page.append(torch.full((len(mesh.vertices) // 4,), len(pages)))
-        pages.append(torch.from_numpy(np.array(mesh.visual.material.baseColorTexture.convert("RGBA"))))
-    return Quads(torch.cat(corners), torch.cat(coordinates), torch.cat(page), torch.stack(pages))
 
 
 def _unlit(tree: dict[str, Any]) -> None:

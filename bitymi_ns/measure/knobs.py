@@ -1,4 +1,4 @@
-"""What each quality knob costs and saves: error against the exact setting, beside milliseconds and bytes."""
+"""Measure each quality knob: error against its exact setting, milliseconds and bytes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, baked_and_reduced, rich_progress
 from bitymi_ns.codec.quantise import STEPS
-from bitymi_ns.measure.bench.machine import commit, machine, versions
+from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.errors import fail, say
@@ -50,15 +50,14 @@ Render = Callable[[Camera], Tensor]
 
 @dataclass(frozen=True)
 class Setting:
-    """One position of a knob.
+    """A value of a knob.
 
     Attributes:
-        knob, value: which, and where it stands.
         renderer: `trained` (the field at every fragment) or `baked`.
         render: camera -> [H, W, 3].
-        bytes: of the atlas in the format that is stored; None where the knob does not change it.
-        exact: whether the others are measured against this one.
-        default: whether it is what the run or the exporter uses.
+        bytes: of the atlas as it is stored; None where the knob does not change it.
+        exact: the setting that the others are compared with.
+        default: the setting of the run or of the exporter.
     """
 
     knob: str
@@ -70,28 +69,8 @@ class Setting:
     default: bool = False
 
 
-@dataclass(frozen=True)
-class Point:
-    """A measured setting. Errors are against the exact setting, over all pixels and colours of all views, before
-    rounding to 8 bits: `max_steps` and `mean_steps` in 8-bit steps, `psnr_exact` in dB. `psnr` is against the
-    photographs; `ms` and `cpu_ms` are a view's."""
-
-    knob: str
-    value: float | str
-    renderer: str
-    exact: bool
-    default: bool
-    max_steps: float
-    mean_steps: float
-    psnr_exact: float
-    psnr: float
-    ms: float
-    cpu_ms: float
-    bytes: int | None
-
-
 class HeldOut:
-    """Held-out views of a run, evenly spaced, with their photographs over the background."""
+    """Evenly spaced held-out views of a run with their photographs over the background."""
 
     def __init__(self, pipeline: Any, views: int) -> None:
         datamanager, model = pipeline.datamanager, pipeline.model
@@ -99,23 +78,13 @@ class HeldOut:
         if count == 0:
             fail("the run has no held-out views; knobs are measured on them")
         self.background: Tensor = model.background.cpu()
-        self.cameras: list[Camera] = []
-        self.photos: list[Tensor] = []
-        self.masks: list[Tensor | None] = []
-        for index in evenly_spaced(count, views):
-            view = datamanager.eval_views[index]
-            mask = view.mask
-            self.cameras.append(view.camera)
-            self.photos.append(view.target(self.background, "cpu"))
-            self.masks.append(None if mask is None else mask.cpu().bool().reshape(*mask.shape[:2], 1))
+        self.views = [datamanager.eval_views[index] for index in evenly_spaced(count, views)]
+        self.cameras: list[Camera] = [view.camera for view in self.views]  # on the device of the run
 
     def psnr(self, images: Sequence[Tensor]) -> float:
-        """Mean PSNR in dB against the photographs, where their masks say that pixels count."""
-        values = []
-        for image, photo, mask in zip(images, self.photos, self.masks, strict=True):
-            pair = (image, photo) if mask is None else (image * mask, photo * mask)
-            values.append(psnr(*pair, mask))
-        return statistics.fmean(values)
+        """Mean PSNR in dB against the photographs, inside their masks."""
+        pairs = [(image, view.to("cpu")) for image, view in zip(images, self.views, strict=True)]
+        return statistics.fmean(psnr(image, v.target(self.background, "cpu"), v.mask) for image, v in pairs)
 
     def render(self, setting: Setting, repeats: int) -> tuple[list[Tensor], float, float]:
         """Images [H, W, 3] in [0, 1], wall and CPU milliseconds per view (medians of repeats, mean of views)."""
@@ -132,8 +101,13 @@ class HeldOut:
         return images, statistics.fmean(wall), statistics.fmean(cpu)
 
 
-def measure(held_out: HeldOut, settings: Sequence[Setting], repeats: int) -> list[Point]:
-    """Measure the settings of one knob and renderer; exactly one of them is exact."""
+def measure(held_out: HeldOut, settings: Sequence[Setting], repeats: int) -> list[dict[str, Any]]:
+    """Measure the settings of one knob and renderer, of which exactly one is exact.
+
+    Errors are against the exact setting, over all pixels and colours of all views, before rounding to 8 bits:
+    `max_steps` and `mean_steps` in 8-bit steps, `psnr_exact` in dB. `psnr` is against the photographs; `ms` and
+    `cpu_ms` are per view.
+    """
     exact = next(s for s in settings if s.exact)
     drawn = {id(s): held_out.render(s, repeats) for s in [exact, *(s for s in settings if s is not exact)]}
     truth = drawn[id(exact)][0]
@@ -141,23 +115,16 @@ def measure(held_out: HeldOut, settings: Sequence[Setting], repeats: int) -> lis
     for setting in settings:
         images, ms, cpu_ms = drawn[id(setting)]
         errors = torch.cat([(a - b).abs().flatten() for a, b in zip(images, truth, strict=True)]).double()
-        mse = float(errors.square().mean())
-        points.append(
-            Point(
-                setting.knob,
-                setting.value,
-                setting.renderer,
-                setting.exact,
-                setting.default,
-                round(STEPS * float(errors.max()), 4),
-                round(STEPS * float(errors.mean()), 6),
-                round(psnr(torch.tensor(mse).sqrt(), torch.tensor(0.0)), 4),
-                round(held_out.psnr(images), 4),
-                round(ms, 3),
-                round(cpu_ms, 3),
-                setting.bytes,
-            )
-        )
+        figures = {
+            "max_steps": round(STEPS * float(errors.max()), 4),
+            "mean_steps": round(STEPS * float(errors.mean()), 6),
+            "psnr_exact": round(psnr(errors.square().mean().sqrt(), torch.tensor(0.0)), 4),
+            "psnr": round(held_out.psnr(images), 4),
+            "ms": round(ms, 3),
+            "cpu_ms": round(cpu_ms, 3),
+        }
+        about = {name: value for name, value in vars(setting).items() if name != "render"}
+        points.append({**about, **figures})
     return points
 
 
@@ -169,13 +136,13 @@ class Knobs:
         self.scene = model.scene
         self.background = model.background.cpu()
         self.options = replace(BakeOptions(), drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
-        cameras = pipeline.datamanager.undistorted_train_cameras()
+        cameras = pipeline.datamanager.train_dataset.cameras
         self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         self.bound = float(self.scene.config.weight_bound)
         self.has_learned = isinstance(self.scene.field, TexelField)
 
     def trained(self, camera: Camera, bound: float | None = None) -> Tensor:
-        """The trained scene, not baked."""
+        """Draw the trained scene, not baked."""
         with torch.no_grad():
             return self.scene.render(
                 camera, self.background.to(camera.K), "frozen", weight_bound=self.bound if bound is None else bound
@@ -188,7 +155,7 @@ class Knobs:
             return made.encoded(progress)
 
     def _all_colors(self, baked: Baked, scene: BakedScene) -> BakedScene:
-        """With the view colours as they were trained: the knobs are the atlas's."""
+        """A scene with the view colours as trained: the knobs are those of the atlas."""
         surfels = {name: value.detach()[baked.rows].float().cpu() for name, value in self.scene.surfels.items()}
         return replace(scene, surfels=surfels)
 
@@ -201,7 +168,7 @@ class Knobs:
         return self._all_colors(baked, baked.stored())
 
     def _draw(self, scene: BakedScene, bound: float | None = None, stop: float = TRANSMITTANCE_MIN) -> Render:
-        """Settings share the scene: what it keeps between views for its renderer is there once."""
+        """Settings share the scene and its cached state of the renderer."""
 
         def draw(camera: Camera) -> Tensor:
             scene.weight_bound = self.bound if bound is None else bound
@@ -214,13 +181,8 @@ class Knobs:
         """The settings of one knob and renderer after the other."""
         textured = self.scene.field is not None
         if "weight_bound" in wanted and textured:
-            values = sorted({*WEIGHT_BOUNDS, self.bound})
-            yield [
-                Setting(
-                    "weight_bound", v, "trained", lambda c, v=v: self.trained(c, v), None, v == 0.0, v == self.bound
-                )
-                for v in values
-            ]
+            draws = {v: lambda c, v=v: self.trained(c, v) for v in sorted({*WEIGHT_BOUNDS, self.bound})}
+            yield _group("weight_bound", 0.0, self.bound, draws, "trained")
         if {"weight_bound", "transmittance", "format", "resolution"} & set(wanted):
             yield from self._of_one_bake(wanted, textured)
         if "r_max" in wanted and textured and not self.has_learned:  # else the tiles have their sizes already
@@ -232,18 +194,15 @@ class Knobs:
         baked = self._bake()
         stored = self.stored_texels(baked)
 
-        def group(knob: str, exact: float, default: float, draws: dict[float, Render]) -> list[Setting]:
-            return [Setting(knob, v, "baked", draw, None, v == exact, v == default) for v, draw in draws.items()]
-
         if "weight_bound" in wanted and textured:
             bounds = sorted({*WEIGHT_BOUNDS, self.bound})
-            yield group("weight_bound", 0.0, self.bound, {v: self._draw(stored, bound=v) for v in bounds})
+            yield _group("weight_bound", 0.0, self.bound, {v: self._draw(stored, bound=v) for v in bounds})
         if "transmittance" in wanted:
             draws = {v: self._draw(stored, stop=v) for v in TRANSMITTANCES}
-            yield group("transmittance", 0.0, TRANSMITTANCE_MIN, draws)
+            yield _group("transmittance", 0.0, TRANSMITTANCE_MIN, draws)
         if "resolution" in wanted:
             draw = self._draw(stored)
-            yield group("resolution", 1.0, 1.0, {v: lambda c, v=v: _enlarged(draw, c, v) for v in SIZES})
+            yield _group("resolution", 1.0, 1.0, {v: lambda c, v=v: _enlarged(draw, c, v) for v in SIZES})
         if "format" in wanted and textured:
             texels = baked.texels
             assert texels is not None
@@ -268,8 +227,14 @@ class Knobs:
         return settings
 
 
+def _group(
+    knob: str, exact: float, default: float, draws: dict[float, Render], renderer: str = "baked"
+) -> list[Setting]:
+    return [Setting(knob, v, renderer, draw, None, v == exact, v == default) for v, draw in draws.items()]
+
+
 def _enlarged(draw: Render, camera: Camera, share: float) -> Tensor:
-    """[H, W, 3]: a view that is rendered at a share of its size, enlarged bilinearly."""
+    """Render a view at a share of its size and enlarge it bilinearly, [H, W, 3]."""
     small = draw(camera.scaled(share))
     if share == 1.0:
         return small
@@ -302,7 +267,7 @@ def measure_to_file(load_config: Path, output: Path, knobs: Sequence[str], views
     lines = []
     for settings in Knobs(config, pipeline).groups(list(knobs) or list(KNOBS)):
         for point in measure(held_out, settings, repeats):
-            lines.append(json.dumps({**asdict(point), **about, "against": KNOBS[point.knob], "made": origin}))
+            lines.append(json.dumps({**point, **about, "against": KNOBS[point["knob"]], "made": origin}))
         name = f"{settings[0].knob} ({settings[-1].renderer})"
         say(f"{name}: {len(settings)} settings on {len(held_out.cameras)} views")
     if not lines:

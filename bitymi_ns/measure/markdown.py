@@ -1,23 +1,84 @@
-"""Tables in Markdown."""
+"""Write Markdown tables and sections, and render the Jinja templates of the folder beside this module."""
 
 from __future__ import annotations
 
+import base64
+import datetime
+import os
+import shlex
+import sys
 from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from bitymi_ns.measure.machine import commit, machine, software
 
 
 def escaped(text: str) -> str:
-    """The text of a cell, in one line, its bars and backslashes as they are read."""
+    """Escape the text of a table cell: one line, with bars and backslashes kept literal."""
     return text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: Sequence[int] = (0,)) -> str:
-    """A table, without a line's end at its end.
+    """Format a table, without a trailing newline.
 
     Args:
         header: of the columns.
         rows: their cells; markup in them is kept.
-        text_columns: numbers of the columns that are flush left; the others hold numbers.
+        text_columns: indices of left-aligned columns; the others hold numbers.
     """
     rule = "".join("---|" if i in text_columns else "---:|" for i in range(len(header)))
     lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
     return "\n".join([lines[0], "|" + rule, *lines[1:]])
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Format a number with thousands separators; empty for None."""
+    return "" if value is None else f"{value:,.{digits}f}"
+
+
+def difference(value: float, digits: int = 3) -> str:
+    """Format a signed number; no sign where it rounds to zero."""
+    rounded = round(value, digits)
+    return f"{rounded:+.{digits}f}" if rounded else f"{0.0:.{digits}f}"
+
+
+def _command_line() -> str:
+    program = os.path.basename(sys.argv[0])
+    start = ["python", os.path.relpath(sys.argv[0])] if program.endswith(".py") else [program]
+    return shlex.join([*start, *sys.argv[1:]])
+
+
+def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
+    """Write a section: title, command line, machine and commit, body, notes.
+
+    Args:
+        commits: that measured the figures; empty = this checkout.
+    """
+    measured = sorted(set(commits)) or [commit()]
+    lines = [f"## {title}", "", f"`{_command_line()}`  ", f"{machine()}; {software()}  "]
+    lines += [f"{datetime.date.today():%Y-%m-%d}, commit {', '.join(c or 'unknown' for c in measured)}", "", body]
+    if notes:
+        lines += ["", *(f"- {note}" for note in notes)]
+    return "\n".join(lines) + "\n"
+
+
+@lru_cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("bitymi_ns.measure", "templates"),
+        autoescape=select_autoescape(("html.j2",)),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["data_uri"] = lambda data, mime: f"data:{mime};base64,{base64.b64encode(data).decode('ascii')}"
+    return environment
+
+
+def rendered(template: str, **values: Any) -> str:
+    """Render a template. In .html.j2 every value is escaped; an undefined name is an error."""
+    return _environment().get_template(template).render(**values)

@@ -1,4 +1,4 @@
-"""Pictures of the worst held-out views: what is wrong, and what each part of the scene contributes."""
+"""Draw the worst held-out views: errors, and the contribution of each part of the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from bitymi_ns.files import reason
-from bitymi_ns.measure.report.views import ERROR_CAPTION, ERROR_SCALE, heat
+from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.ops import composite
 from bitymi_ns.plugin.errors import fail, say
 from bitymi_ns.plugin.export.command import load_trained, replace_file
@@ -41,13 +41,13 @@ KINDS = {
 
 
 def heat_map(values: Tensor, scale: float) -> Tensor:
-    """[H, W] or [H, W, 1] values as colours [H, W, 3]: black at 0, yellow at `scale` and above."""
+    """Colours [H, W, 3] of values [H, W] or [H, W, 1]: black at 0, yellow at `scale` and above."""
     return torch.from_numpy(heat(values.reshape(*values.shape[:2]).float().cpu().numpy(), scale))
 
 
 @torch.no_grad()
 def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
-    """Blended positive and negative part of the residual: sum of w max(rho, 0) and of w max(-rho, 0), each [H, W, 3].
+    """Blend the positive and the negative part of the residual: sum of w max(rho, 0) and of w max(-rho, 0), [H, W, 3].
 
     As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
     of the two is the render wherever no colour had to be cut off at 0.
@@ -74,7 +74,7 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> dict[str, Tensor]:
-    """The pictures of one view, [H, W, 3] each; those of the residual are left out where there is no texture."""
+    """Draw the pictures of one view, [H, W, 3] each; without a texture there are none of the residual."""
     output = scene.render(camera, background, "frozen")
     final = output.rgb.clamp(0.0, 1.0)
     pictures = {
@@ -91,7 +91,7 @@ def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> d
 
 
 def png(image: Tensor) -> bytes:
-    """[H, W, 3] in [0, 1] as a PNG file."""
+    """Encode [H, W, 3] in [0, 1] as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(as_bytes(image).numpy()).save(buffer, format="PNG")
     return buffer.getvalue()
@@ -99,7 +99,7 @@ def png(image: Tensor) -> bytes:
 
 @torch.no_grad()
 def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
-    """Write the pictures of the held-out views with the lowest PSNR, and pictures.json, which says what they are.
+    """Write the pictures of the held-out views with the lowest PSNR, and pictures.json, which describes them.
 
     Args:
         load_config: config.yml of a trained run.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bitymi_ns.bundle.folder import files_of
 from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.parts import files_of
 from bitymi_ns.files import complete_folder
 from bitymi_ns.trust import Refused, keep
 

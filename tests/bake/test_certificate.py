@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.errors import listed_errors
-from bitymi_ns.bake.field.footprint import averaged, cells_per_pixel, closest_pixels
-from bitymi_ns.bake.field.plan import Shown
+from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, closest_pixels, listed_errors
+from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bake.verify import check_field
 from bitymi_ns.bundle import check_files, export
 from bitymi_ns.bundle.sketch import SIZE, estimated_rms, sketch, sketches_of, sketches_text

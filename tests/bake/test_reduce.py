@@ -9,8 +9,8 @@ import torch
 
 from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.field.plan import make_plan
-from bitymi_ns.bake.field.reference import references
-from bitymi_ns.bake.resample import fit, interpolation
+from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.reduce import fit, interpolation
 from bitymi_ns.ops.reference.texel import texel, texel_centers
 from bitymi_ns.scene.tile_sizes import kernel_parameters, visible_extent
 from bitymi_ns.train.rotations import tangents

@@ -17,7 +17,7 @@ from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.bundle.sizes import least_memory
 from bitymi_ns.cli import main
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import coverage, paged_texels
+from bitymi_ns.codec.pages import covered_blocks, paged_texels
 from bitymi_ns.codec.quantise import encode
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
@@ -98,7 +98,7 @@ def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path:
 def pixels_of(tiles: torch.Tensor, atlas: torch.Tensor) -> torch.Tensor:
     """Which texels of pages belong to a tile: [layers, height, width] bool."""
     layers, height, width = atlas.shape[:3]
-    owned = torch.from_numpy(coverage(tiles.numpy(), width, height, layers))
+    owned = torch.from_numpy(covered_blocks(tiles.numpy(), width, height, layers))
     return owned.repeat_interleave(4, 1).repeat_interleave(4, 2)
 
 

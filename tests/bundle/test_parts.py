@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import struct
 import time
@@ -14,7 +13,7 @@ import pytest
 
 from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.parts import is_known, parts_of
-from bitymi_ns.bundle.single import read_single, write_single
+from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.damage import amend
@@ -139,16 +138,18 @@ def test_a_directory_that_lies_elsewhere_than_it_says_is_refused(folder: Path, t
     # something behind it, a comment, other records, and something before it: a page, another such file
     more = (data + b"x", data[:-1] + b"\1", data[:-22] + moved + data[-22:], data + data[-22:-1])
     for bad in (*more, b"<html>" + data, data + data):
+        (tmp_path / "bad.bitymi").write_bytes(bad)
         with pytest.raises(BundleError, match="not a bundle in one file|truncated"):
-            read_single(io.BytesIO(bad))
+            read_bundle(tmp_path / "bad.bitymi")
 
 
 def test_a_part_that_is_encrypted_is_refused(folder: Path, tmp_path: Path) -> None:
     write_single(folder, tmp_path / "b.bitymi")
     data = bytearray((tmp_path / "b.bitymi").read_bytes())
     data[data.rindex(b"surfels.bin") - 38] |= 1
+    (tmp_path / "b.bitymi").write_bytes(data)
     with pytest.raises(BundleError, match="surfels.bin is not stored as it is$"):
-        read_single(io.BytesIO(bytes(data)))
+        read_bundle(tmp_path / "b.bitymi")
 
 
 def test_a_path_that_none_can_be_is_said(capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,10 +173,11 @@ def test_a_part_that_is_said_to_be_larger_than_the_file_is_refused(claimed: int,
     data = bytearray((tmp_path / "b.bitymi").read_bytes())
     at = data.rindex(b"surfels.bin") - 46
     data[at + 20 : at + 28] = struct.pack("<2L", claimed, claimed)
+    (tmp_path / "b.bitymi").write_bytes(data)
 
     def refused() -> None:
         with pytest.raises(BundleError, match="does not lie in it"):
-            read_single(io.BytesIO(bytes(data)))
+            read_bundle(tmp_path / "b.bitymi")
 
     assert peak(refused) < 4 << 20
 

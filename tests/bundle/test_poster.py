@@ -14,7 +14,7 @@ from PIL import Image
 from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.manifest import POSTER
 from bitymi_ns.bundle.poster import LEAST, SHARE, SIDE, draw_poster, encode_poster, most_bytes
-from bitymi_ns.bundle.single import read_single, write_single
+from bitymi_ns.bundle.single import write_single
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.made import make
 from tests.cuda.baked_scenes import front, textured
@@ -78,8 +78,6 @@ def test_it_comes_second_in_one_file_and_is_checked(tmp_path: Path) -> None:
         assert [check.name for check in check_files(place)[1] if not check.ok] == [POSTER]
         with pytest.raises(BundleError):
             read_bundle(place)
-    with open(single, "rb") as file:  # reads what it draws, and no poster
-        assert len(read_single(file)) == 12
 
 
 def test_a_file_that_no_reader_knows_is_checked_and_not_looked_at(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A bundle in one file: read in ranges, surfels before texels, and refused where it is damaged."""
+"""A bundle in one file: the parts in their order, and refused where it is damaged."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ import torch
 from bitymi_ns import cli
 from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle import single as single_module
-from bitymi_ns.bundle.single import Ranges, read_single, write_single
+from bitymi_ns.bundle.single import write_single
 from tests.bundle.compact_scene import make_codes, write_compact
-from tests.bundle.made import make
 
 
 @pytest.fixture
@@ -32,27 +31,6 @@ def middle_of(single: bytes, name: str) -> int:
     return entry.header_offset + 30 + len(name) + entry.file_size // 2
 
 
-def test_it_is_the_bundle(single: bytes, tmp_path: Path) -> None:
-    want, got = read_bundle(tmp_path / "b").scene, read_single(io.BytesIO(single)).scene
-    assert torch.equal(got.tiles, want.tiles) and torch.equal(got.atlas, want.atlas)
-    for name, value in want.surfels.items():
-        assert torch.equal(got.surfels[name], value)
-
-
-def test_it_is_read_in_ranges_and_surfels_do_without_the_texels(single: bytes) -> None:
-    fetched: list[tuple[int, int]] = []
-
-    def fetch(at: int, count: int) -> bytes:
-        fetched.append((at, count))
-        return single[at : at + count]
-
-    bundle = read_single(Ranges(fetch, len(single)), textured=False)
-    assert bundle.scene.atlas is None and bool(bundle.scene.mean_residual.any()) and len(bundle) == 40
-    middle = middle_of(single, "texels.bin")
-    assert not any(at <= middle < at + count for at, count in fetched)
-    assert sum(count for _, count in fetched) < len(single) / 4
-
-
 def test_parts_are_stored_in_the_order_of_their_use(single: bytes) -> None:
     entries = zipfile.ZipFile(io.BytesIO(single)).infolist()
     assert [entry.filename for entry in entries] == ["bundle.json", "surfels.bin", "texels.bin", "preview.jpg"]
@@ -60,13 +38,13 @@ def test_parts_are_stored_in_the_order_of_their_use(single: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", ["bundle.json", "surfels.bin", "texels.bin"])
-def test_damage_is_refused(single: bytes, name: str) -> None:
+def test_damage_is_refused(single: bytes, name: str, tmp_path: Path) -> None:
     data, at = bytearray(single), middle_of(single, name)
     data[at] ^= 255
-    with pytest.raises(BundleError):
-        read_single(io.BytesIO(bytes(data)))
-    with pytest.raises(BundleError):
-        read_single(io.BytesIO(single[:at]))
+    for bad in (bytes(data), single[:at]):
+        (tmp_path / "bad.bitymi").write_bytes(bad)
+        with pytest.raises(BundleError):
+            read_bundle(tmp_path / "bad.bitymi")
 
 
 def test_it_is_read_and_checked_by_its_path_as_a_folder_is(single: bytes, tmp_path: Path) -> None:
@@ -84,7 +62,9 @@ def test_it_is_read_and_checked_by_its_path_as_a_folder_is(single: bytes, tmp_pa
 
 def test_damage_anywhere_is_refused_or_changes_nothing(single: bytes, tmp_path: Path) -> None:
     rng, path = random.Random(0), tmp_path / "damaged.bitymi"
-    want = read_single(io.BytesIO(single)).scene
+    want = read_bundle(tmp_path / "b").scene
+    path.write_bytes(single)
+    assert torch.equal(read_bundle(path).scene.atlas, want.atlas)
     start = single.rindex(b"PK\x05\x06")  # the list of parts lies before it
     places = [*range(60), *range(start - 260, len(single))]
     for _ in range(300):
@@ -127,19 +107,9 @@ def test_the_command_packs_and_verifies(single: bytes, tmp_path: Path, capsys: p
     assert "is not replaced" in capsys.readouterr().err and (tmp_path / "mine.zip").read_bytes() == b"precious"
 
 
-def test_deflated_parts_are_refused(single: bytes) -> None:
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+def test_deflated_parts_are_refused(single: bytes, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "deflated.bitymi", "w", zipfile.ZIP_DEFLATED) as archive:
         for entry in zipfile.ZipFile(io.BytesIO(single)).infolist():
             archive.writestr(entry.filename, zipfile.ZipFile(io.BytesIO(single)).read(entry))
     with pytest.raises(BundleError, match="is not stored as it is"):
-        read_single(packed)
-
-
-def test_bundles_of_earlier_versions_fit_as_well(surfels, tmp_path: Path) -> None:
-    make(surfels, tmp_path / "b", format="bc7")
-    write_single(tmp_path / "b", tmp_path / "b.zip")
-    with open(tmp_path / "b.zip", "rb") as file:
-        assert torch.equal(read_single(file).scene.atlas, read_bundle(tmp_path / "b").scene.atlas)
-    with open(tmp_path / "b.zip", "rb") as file, pytest.raises(BundleError, match="only a compact bundle"):
-        read_single(file, textured=False)
+        read_bundle(tmp_path / "deflated.bitymi")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, World, check_target, ktx2, ply, read_bundle, verify_bundle
+from bitymi_ns.bundle import BundleError, World, check_target, ktx2, ply, read_bundle
 from bitymi_ns.bundle import write as bundle_module
 from bitymi_ns.ops.reference import view_color as reference
 from tests.bake.scenes import write
@@ -110,7 +110,7 @@ def test_the_manifest_states_files_world_and_statistics(surfels, tmp_path):
     statistics = {"psnr": np.float32(27.5), "never": float("nan"), "views": torch.tensor([1, 2]), "path": tmp_path}
     extra = {"preview.png": b"\x89PNG...", "config.yml": b"method: bitymi\n"}
     params, *_ = make(surfels, tmp_path / "b", world=world, statistics=statistics, extra_files=extra)
-    info = verify_bundle(tmp_path / "b").model_dump(mode="json")
+    info = read_bundle(tmp_path / "b").info.model_dump(mode="json")
     assert (info["format"], info["version"]) == ("bitymi-bundle", "1.4")
     assert info["generator"].startswith("bitymi-ns ")
     assert info["world"] == {"transform": [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]], "scale": 0.25}

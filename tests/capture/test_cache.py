@@ -13,7 +13,7 @@ from PIL import Image
 
 from bitymi_ns import files
 from bitymi_ns.capture import KnownView, SfmOptions, find_poses, triangulate
-from bitymi_ns.capture.cache import read_from
+from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.types import CaptureError
@@ -67,7 +67,7 @@ def test_results_of_something_else_stay(photographs: Path, kept: Callable[..., P
 
 def test_what_is_read_from_stays(photographs: Path, kept: Callable[..., Path]) -> None:
     first = kept(photographs)
-    read_from(first)
+    keep_work_folder(first)
     touch(photographs, 10)
     second = kept(photographs)
     assert first.is_dir()

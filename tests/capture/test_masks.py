@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import CaptureError
-from bitymi_ns.capture.masks import counted, in_proportion, mask_folder, mask_of
+from bitymi_ns.capture.masks import in_proportion, mask_folder, mask_of, mask_pixels
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def blob() -> np.ndarray:
 @pytest.mark.parametrize("values", [(0, 255), (0, 1), (0, 3)])
 def test_pixels_of_a_lossless_mask_count_where_they_are_not_black(tmp_path: Path, values: tuple[int, int]) -> None:
     Image.fromarray(np.where(blob(), values[1], values[0]).astype(np.uint8)).save(tmp_path / "m.png")
-    assert np.array_equal(counted(Image.open(tmp_path / "m.png")), blob())
+    assert np.array_equal(mask_pixels(Image.open(tmp_path / "m.png")), blob())
 
 
 @pytest.mark.parametrize("ending", ["jpg", "webp"])
@@ -102,7 +102,7 @@ def test_pixels_of_a_lossy_mask_count_above_the_middle(tmp_path: Path, ending: s
     stored = Image.open(path)
     ripples = np.asarray(stored.convert("L"))[~blob()]
     assert (ripples > 0).sum() > 50  # what would count where nothing does
-    assert (counted(stored) != blob()).sum() <= 20  # of 132 along the edge
+    assert (mask_pixels(stored) != blob()).sum() <= 20  # of 132 along the edge
 
 
 def test_masks_in_the_proportions_of_their_photographs() -> None:

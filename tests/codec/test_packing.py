@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import coverage
+from bitymi_ns.codec.pages import covered_blocks
 
 sides = st.sampled_from([4, 8, 16, 32, 64])
 sizes = hnp.arrays(np.int32, st.tuples(st.integers(0, 120), st.just(2)), elements=sides)
@@ -36,7 +36,7 @@ def test_tiles_lie_inside_pages_on_the_grid_without_overlap(resolution, page_wid
     count = painted(packing)
     assert count.max(initial=0) <= 1
     assert packing.occupancy == pytest.approx(count.mean())
-    np.testing.assert_array_equal(coverage(packing.tiles, packing.width, packing.height, packing.layers),
+    np.testing.assert_array_equal(covered_blocks(packing.tiles, packing.width, packing.height, packing.layers),
                                   count[:, ::4, ::4] > 0)  # fmt: skip
     again = pack(resolution.copy(), page_width, max_rows)
     np.testing.assert_array_equal(packing.tiles, again.tiles)

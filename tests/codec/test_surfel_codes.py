@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bitymi_ns.codec.limits import EXTENTS, LIMITS
-from bitymi_ns.codec.surfel_codes import PLACE_BITS, REFERENCE, cells, code_surfels, keys, reordered
+from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, code_surfels, morton_cells, morton_codes, reordered
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import view_color
@@ -53,9 +53,9 @@ def test_values_are_within_half_a_step(kind: str) -> None:
 
 
 def test_cells_come_back_from_their_places() -> None:
-    cell = np.random.default_rng(0).integers(0, 1 << PLACE_BITS, (50, 3))
-    np.testing.assert_array_equal(cells(keys(cell)[:, None]), cell)
-    assert keys(cell).max() < 1 << (3 * PLACE_BITS) <= 1 << 53
+    cell = np.random.default_rng(0).integers(0, 1 << POSITION_BITS, (50, 3))
+    np.testing.assert_array_equal(morton_cells(morton_codes(cell)[:, None]), cell)
+    assert morton_codes(cell).max() < 1 << (3 * POSITION_BITS) <= 1 << 53
 
 
 def test_far_surfels_keep_their_limits_and_near_ones_their_places() -> None:

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.pipeline import Baked, reduced
-from bitymi_ns.bake.trained_texels import learned
+from bitymi_ns.bake import Baked, reduced
+from bitymi_ns.bake.pipeline import trained_texels
 from bitymi_ns.bake.view_color_rate import ColorChoices, color_choices
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import Bands
@@ -199,7 +199,7 @@ def test_what_a_device_has_learned_can_be_baked(device: torch.device, cpu: Conte
     for _ in range(START + 3):
         trainer.advance()
     scene = trainer.scene
-    baked = learned(scene, BakeOptions())
+    baked = trained_texels(scene, BakeOptions())
     assert baked.texels is not None and baked.texels.device == baked.scene.tiles.device == HERE
     camera = scene_and_views()[1][0].camera
     with torch.no_grad():
@@ -215,7 +215,7 @@ def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu
     trainer = trainer_on(device)
     for _ in range(START + 3):
         trainer.advance()
-    baked, cameras = learned(trainer.scene, BakeOptions(tolerance=4.0)), [v.camera for v in scene_and_views()[1]]
+    baked, cameras = trained_texels(trainer.scene, BakeOptions(tolerance=4.0)), [v.camera for v in scene_and_views()[1]]
 
     def less(where: torch.device) -> tuple[Baked, ColorChoices]:
         there = [camera.to(where) for camera in cameras]

@@ -13,9 +13,8 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.measure.bench import Row, Run
-from bitymi_ns.measure.bench.commands import CURVE, Layout, read_curve, train_command
-from bitymi_ns.measure.bench.suites import local_scenes, standard_scenes, suites
+from bitymi_ns.measure.bench.engine import CURVE, Layout, read_curve, train_command
+from bitymi_ns.measure.bench.matrix import Row, Run, local_scenes, standard_scenes, suites
 
 SMALL = (
     "--pipeline.model.scene.log2-table-size", "10", "--pipeline.model.scene.min-resolution", "16",

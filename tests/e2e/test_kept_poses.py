@@ -22,15 +22,15 @@ from PIL import Image
 import bitymi_ns.capture
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.plugin.data import kept_poses
 from bitymi_ns.plugin.errors import InputError
 from bitymi_ns.plugin.export.command import load_trained, world_of
+from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.run_folder import POSES
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import a_run_of, checkpoint, different, rewrite
-from tests.plugin.data.captures import colmap_model, said
+from tests.plugin.data.captures import colmap_model, printed
 
 STEPS = 4
 
@@ -130,7 +130,7 @@ def test_evaluation_has_the_poses_of_the_training(
     stated = world_of(after.datamanager).described()
     assert stated.keys() == world.keys() and "metres_per_unit" in stated
     assert all(np.array_equal(stated[key], world[key]) for key in world)
-    text = said(capsys)
+    text = printed(capsys)
     assert f"Poses of 12 photographs of {shot.photographs} as the run was trained with them, of {kept}." in text
     assert "frame_00099.png (blurred)" in text and ("frame_00000_new.png" in text) is not upright
 
@@ -161,10 +161,10 @@ def test_poses_that_cannot_be_kept_do_not_stop_the_run(
     def full(*arguments: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(kept_poses, "write", full)
+    monkeypatch.setattr(run_folder, "write_kept_poses", full)
     shot = shoot()
     assert checkpoint(shot.config, STEPS - 1)["step"] == STEPS - 1 and not (shot.run / POSES).exists()
-    assert "the disk is full" in (text := said(capsys)) and "Nor are the poses: leave the photographs" in text
+    assert "the disk is full" in (text := printed(capsys)) and "Nor are the poses: leave the photographs" in text
 
 
 def test_a_resumed_run_goes_on_in_the_same_world(shoot: Callable[..., Shot]) -> None:
@@ -196,7 +196,7 @@ def test_options_for_poses_that_are_not_found_anew(
         capsys.readouterr()
         config.set_timestamp()
         assert config.pipeline.datamanager.dataparser.sfm == SfmSettings(mapper="global", max_features=500)
-        return said(capsys)
+        return printed(capsys)
 
     for same in (SfmSettings(), SfmSettings(mapper="global"), SfmSettings(mapper="global", max_features=500)):
         assert "--sfm" not in go_on("same", same)
@@ -213,7 +213,7 @@ def test_options_for_poses_that_are_not_found_anew(
         SfmSettings(frames=7),
     )
     config.set_timestamp()
-    assert "--sfm.frames 7 is not used" in said(capsys)
+    assert "--sfm.frames 7 is not used" in printed(capsys)
 
 
 def test_a_run_that_goes_on_in_its_own_folder(shoot: Callable[..., Shot]) -> None:
@@ -259,7 +259,7 @@ def test_a_bundle_has_the_world_of_its_run(
     shutil.rmtree(shot.run)
     with pytest.raises(pytest.fail.Exception, match="poses are found anew"):
         eval_setup(tmp_path / "bundle/config.yml")
-    assert f"are no longer in {shot.run / POSES}: others can be found now" in said(capsys)
+    assert f"are no longer in {shot.run / POSES}: others can be found now" in printed(capsys)
 
 
 def test_photographs_that_changed_are_named_in_one_message(shoot: Callable[..., Shot]) -> None:

@@ -11,12 +11,12 @@ from PIL import Image
 
 from bitymi_ns import cli
 from bitymi_ns.bundle import Bundle, BundleError, read_bundle
+from bitymi_ns.bundle.ply import parse_ply
 from bitymi_ns.bundle.single import write_single
-from bitymi_ns.interchange import extras, given_with, place_of, write_extras
-from bitymi_ns.interchange.gaussians import read_gaussians
-from bitymi_ns.interchange.glb import read_glb
+from bitymi_ns.interchange import extras, extras_folder, read_cameras, write_extras
 from bitymi_ns.train.views import View
 from tests.bundle.made import make
+from tests.interchange.glb import read_glb
 
 
 def row(camera, name: str, held_out: bool, **more) -> dict:
@@ -25,6 +25,12 @@ def row(camera, name: str, held_out: bool, **more) -> dict:
     return {
         "name": name, "held_out": held_out, **size, "fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2], **more
     }  # fmt: skip
+
+
+def positions(path: Path) -> torch.Tensor:
+    """[N, 3] of a PLY file."""
+    vertex = parse_ply(path.read_bytes())["vertex"]
+    return torch.from_numpy(np.stack([vertex[name] for name in "xyz"], 1))
 
 
 @pytest.fixture
@@ -49,8 +55,8 @@ def test_both_files_hold_the_scene_and_their_quality_is_stated(bundle: Bundle, c
     for kind, each in written.items():
         assert each.bytes == (out / each.file).stat().st_size and each.views == 2
         assert each.psnr is not None and 3 < each.psnr < 60 and stated[kind]["psnr"] == each.psnr
-        assert "dB in 2 held-out views" in extras.described(each)
-    assert torch.equal(read_gaussians(out / "gaussians.ply").means, bundle.scene.surfels["means"])
+        assert "dB in 2 held-out views" in extras.summary_line(each)
+    assert torch.equal(positions(out / "gaussians.ply"), bundle.scene.surfels["means"])
     assert len(read_glb(out / "mesh.glb")) == written["mesh"].count
 
 
@@ -63,9 +69,9 @@ def test_the_captures_frame_is_reached(bundle: Bundle, tmp_path: Path) -> None:
     def back(points: torch.Tensor) -> torch.Tensor:
         return place.scale * (points @ transform[:, :3].T + transform[:, 3])
 
-    for read, name, of in ((read_gaussians, "gaussians.ply", "means"), (read_glb, "mesh.glb", "corners")):
-        old, new = (getattr(read(tmp_path / frame / name), of) for frame in ("scene", "capture"))
-        if of == "corners":  # the scene's file is turned to y up; its up is z
+    for read, name in ((positions, "gaussians.ply"), (lambda path: read_glb(path).corners, "mesh.glb")):
+        old, new = (read(tmp_path / frame / name) for frame in ("scene", "capture"))
+        if name == "mesh.glb":  # the scene's file is turned to y up; its up is z
             old = torch.stack([old[..., 0], -old[..., 2], old[..., 1]], -1)
         assert torch.allclose(back(new), old, atol=2e-5)
 
@@ -77,7 +83,7 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
     out = capsys.readouterr().out
     assert "gaussians.ply: 12, " in out and "dB in 1 held-out views" in out
     folder = tmp_path / "scene.extras"
-    assert place_of(with_cameras) == folder and (folder / "mesh.glb").is_file()
+    assert extras_folder(with_cameras) == folder and (folder / "mesh.glb").is_file()
     assert cli.main(["extras", str(with_cameras)]) == 1
     assert "--overwrite" in capsys.readouterr().err
     args = ["extras", str(with_cameras), "--kinds", "gaussians", "--overwrite", "--frame", "capture"]
@@ -87,13 +93,13 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
 
 def test_cameras_and_photographs_are_read_from_folder_and_file(with_cameras: Path, tmp_path: Path) -> None:
     write_single(with_cameras, tmp_path / "scene.bitymi")
-    for place in (with_cameras, tmp_path / "scene.bitymi"):
-        given = given_with(place, read_bundle(place).info)
-        assert [camera.width for camera in given.train] == [64, 64] and len(given.held_out) == 1
-        (view,) = given.held_out
+    for bundle in (with_cameras, tmp_path / "scene.bitymi"):
+        found = read_cameras(bundle, read_bundle(bundle).info)
+        assert [camera.width for camera in found.train] == [64, 64] and len(found.held_out) == 1
+        (view,) = found.held_out
         assert view.image.shape == (24, 32, 3) and (view.camera.width, view.camera.height) == (32, 24)
         assert float(view.camera.K[0, 0]) == 30.0 and float(view.camera.K[1, 2]) == 12.0
-    assert place_of(tmp_path / "scene.bitymi") == tmp_path / "scene.extras"
+    assert extras_folder(tmp_path / "scene.bitymi") == tmp_path / "scene.extras"
 
 
 def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> None:
@@ -104,7 +110,7 @@ def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> N
     files = {"cameras.json": json.dumps({"cameras": [row]}).encode(), "p.jpg": postscript.getvalue()}
     make(surfels, tmp_path / "b", extra_files=files)
     with pytest.raises(BundleError, match="p.jpg cannot be read as a picture: cannot identify"):
-        given_with(tmp_path / "b", read_bundle(tmp_path / "b").info)
+        read_cameras(tmp_path / "b", read_bundle(tmp_path / "b").info)
 
 
 @pytest.mark.parametrize(
@@ -122,10 +128,10 @@ def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: byt
     make(surfels, tmp_path / "b", extra_files={"cameras.json": text})
     info = read_bundle(tmp_path / "b").info
     with pytest.raises(BundleError, match=message):
-        given_with(tmp_path / "b", info)
+        read_cameras(tmp_path / "b", info)
     (tmp_path / "b" / "cameras.json").write_bytes(text[:-1] + b"?")
     with pytest.raises(BundleError, match="altered"):
-        given_with(tmp_path / "b", info)
+        read_cameras(tmp_path / "b", info)
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(bundle: Bundle, tmp_path: Path) -> None:

@@ -7,19 +7,19 @@ import pytest
 import torch
 
 from bitymi_ns.bundle import BundleError
-from bitymi_ns.bundle.manifest import Place
+from bitymi_ns.bundle.manifest import WorldFrame
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.gaussians import gaussians_of
 from bitymi_ns.ops.reference.view_color import sh_basis
 from bitymi_ns.train.rotations import tangents
 from tests.interchange.conftest import TURN
-from tests.interchange.test_looks import baked
+from tests.interchange.test_surfel_colors import baked
 
 
-def place(matrix: torch.Tensor, scale: float) -> Place:
+def place(matrix: torch.Tensor, scale: float) -> WorldFrame:
     shift = torch.tensor([[0.5], [-2.0], [7.0]], dtype=torch.float64)
     transform = torch.cat([matrix, shift], 1).tolist()
-    return Place.model_validate_json(json.dumps({"transform": transform, "scale": scale}))
+    return WorldFrame.model_validate_json(json.dumps({"transform": transform, "scale": scale}))
 
 
 def covariance(g) -> torch.Tensor:

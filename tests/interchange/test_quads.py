@@ -8,12 +8,13 @@ import trimesh
 
 from bitymi_ns.bundle import Bundle
 from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest
-from bitymi_ns.interchange.glb import glb_bytes, read_glb
+from bitymi_ns.interchange.glb import glb_bytes
 from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.rotations import tangents
+from tests.interchange.glb import read_glb
 
 LEVEL = 0.15
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
-from bitymi_ns.measure.report.paper import VIEW_COLORS as OF_THE_PAPER
-from bitymi_ns.ops import VIEW_COLORS
-from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene import Scene, SceneConfig
 
 GEOMETRY = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "beta_raw": ()}
@@ -29,12 +24,3 @@ def test_parameters_per_surfel(kind: str, expected: int) -> None:
     scene = Scene(SceneConfig(view_color=kind, texture="none"), surfels, None)
     assert sum(p.numel() for p in scene.parameters()) == expected * n
     assert scene.parameters_per_surfel() == expected
-
-
-@pytest.mark.parametrize("preset", list(OF_THE_PAPER))
-def test_the_report_counts_the_numbers_of_each_preset(preset: str) -> None:
-    name, numbers = OF_THE_PAPER[preset]
-    config = load_preset(preset).scene
-    entry = VIEW_COLORS[config.view_color]
-    shapes = [*GEOMETRY.values(), *entry.shapes(entry.terms_of(getattr(config, entry.option)))]
-    assert (config.view_color, sum(math.prod(shape) for shape in shapes)) == (name.lower(), numbers)

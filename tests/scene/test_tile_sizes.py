@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake.field.texels import texel_centres, tile_points
+from bitymi_ns.bake.field.texels import tile_points
+from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.scene.tile_sizes import (
     coarsened,
     max_projected_extent,
@@ -71,7 +72,7 @@ def test_surfels_behind_the_camera_or_far_outside_the_image_are_unseen(camera):
 
 
 def test_texel_centres_leave_half_a_texel_at_both_ends():
-    torch.testing.assert_close(texel_centres(4, torch.tensor([3.0])), torch.tensor([-2.25, -0.75, 0.75, 2.25]))
+    torch.testing.assert_close(texel_centers(4, torch.tensor([3.0])), torch.tensor([-2.25, -0.75, 0.75, 2.25]))
 
 
 def test_tile_points_run_u_along_rows():

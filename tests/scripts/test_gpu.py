@@ -12,13 +12,13 @@ from tests.required import skip_without
 SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "gpu.py"
 
 
-@pytest.mark.parametrize("section", ["baked", "operations", "steps", "appearance"])
+@pytest.mark.parametrize("section", ["baked", "operations", "steps"])
 def test_a_section_without_a_card(section: str, tmp_path: Path) -> None:
     """A part that fails is a line of the page and not its end, so that it could go unnoticed."""
     if reason := why_not_emulated():
         skip_without("emulated", reason)
     page = tmp_path / "page.md"
-    command = [sys.executable, str(SCRIPT), "--emulated", "--no-peers", "--only", section, "--output", str(page)]
+    command = [sys.executable, str(SCRIPT), "--emulated", "--no-peers", "--sections", section, "--output", str(page)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     text = page.read_text("utf8")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from bitymi_ns.measure.stability.backends import BACKENDS, Backend, missing
+from bitymi_ns.measure.stability.errors import BACKENDS, Backend, missing
 from tests.required import REQUIRED, skip_without
 
 NAMES = sorted(name for name in BACKENDS if name != "cuda" or torch.cuda.is_available() or "cuda" in REQUIRED)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.backends import Backend
+from bitymi_ns.measure.stability.errors import Backend
 from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, front_scene
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render

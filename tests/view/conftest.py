@@ -13,8 +13,8 @@ from PIL import Image
 
 from bitymi_ns.bake import bake
 from bitymi_ns.bake.compact import compacted, with_coded_texels
-from bitymi_ns.bake.pipeline import BakeOptions
 from bitymi_ns.bundle import export
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.scene import Camera
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene

@@ -14,7 +14,7 @@ from threading import Thread
 import pytest
 
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.bundle.single import read_single, write_single
+from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from bitymi_ns.view import single_site, write_static
 from tests.view.browser import drive
@@ -66,8 +66,7 @@ def test_the_command_writes_the_page_and_one_file(bundle: Path, tmp_path: Path, 
     assert {"index.html", "index.js", "view.json", NAME} <= names and not any("/" in name for name in names)
     assert f'name="bundle" content="{NAME}"' in (folder / "index.html").read_text()
     assert json.loads((folder / "view.json").read_text()) == {"title": "little"}
-    with open(folder / NAME, "rb") as file:
-        assert len(read_single(file)) == len(read_bundle(bundle))
+    assert len(read_bundle(folder / NAME)) == len(read_bundle(bundle))
     single = tmp_path / "little.bitymi"
     write_single(bundle, single)
     # a folder that was written so is replaced by one of its like, of either kind

@@ -1,15 +1,16 @@
-"""What a tile has to hold: how far it is seen, how much an error in it counts, and the finest grid of use."""
+"""Plan of the tiles of a field: extents, weights of errors, and the finest useful grids."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.field.footprint import closest_pixels
+from bitymi_ns.bake.tile_errors import closest_pixels
+from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.scene.camera import Camera
@@ -39,28 +40,8 @@ class Field(Protocol):
 
 
 @dataclass
-class Shown:
-    """How much of a tile can be seen, and how strongly.
-
-    Attributes:
-        opacity: [N] largest blending weight of the surfel's centre.
-        beta: [N] exponent of the kernel.
-        extent: [N] half side of the tile in scale units: beyond it every fragment stays below the weight bound; 0 where
-            all do.
-        weight_bound: fragments of smaller weight get no residual.
-        pixels: [N, 2] pixels of a scale unit in the closest view (`footprint.closest_pixels`); None = not known.
-    """
-
-    opacity: Tensor
-    beta: Tensor
-    extent: Tensor
-    weight_bound: float
-    pixels: Tensor | None = field(default=None, kw_only=True)
-
-
-@dataclass
 class Plan(Shown):
-    """What is known of every tile before the field is looked at.
+    """Extents and grids of N tiles, before the field is evaluated.
 
     Attributes:
         means: [N, 3] world positions.

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, Looks, gain, look, set_aside
-from bitymi_ns.bake.pipeline import Baked
 from bitymi_ns.bake.texel_scene import TexelScene
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bundle.statistics import FineTuning

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.ops.backend import cuda_backend
@@ -15,19 +16,6 @@ from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.rotations import tangents
-
-
-def texel_centres(count: int, extent: Tensor) -> Tensor:
-    """Surfel coordinates of the texel centres along one axis: (i + 0.5) / count * 2 extent - extent.
-
-    Args:
-        count: texels along the axis.
-        extent: [...] half sides of tiles in scale units (e; 3 covers exactly the support), [1] or broadcast with it.
-
-    Returns:
-        [..., count] of the extents' type.
-    """
-    return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
 
 
 def tile_points(means: Tensor, axes: Tensor, size: tuple[int, int], extent: float) -> Tensor:
@@ -42,7 +30,7 @@ def tile_points(means: Tensor, axes: Tensor, size: tuple[int, int], extent: floa
     Returns:
         [N, r_v, r_u, 3] world positions; rows run along v.
     """
-    u, v = (texel_centres(count, means.new_tensor([extent])) for count in size)  # [r_u], [r_v]
+    u, v = (texel_centers(count, means.new_tensor([extent])) for count in size)  # [r_u], [r_v]
     across = u[:, None] * axes[:, None, :, 0]  # [N, r_u, 3]
     down = v[:, None] * axes[:, None, :, 1]  # [N, r_v, 3]
     return means[:, None, None, :] + across[:, None, :, :] + down[:, :, None, :]

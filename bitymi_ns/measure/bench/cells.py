@@ -1,7 +1,7 @@
-"""Finished cells on disk: one JSON object per line, appended when a cell is done.
+"""Store finished cells: one JSON object per line, appended when a cell is done.
 
-A line has `key` (everything that decides the result; cells of equal keys are the same cell), `value` (what came out;
-paths in it are relative to the work folder) and `made` (when, where and with what).
+A line has `key` (every setting that decides the result), `value` (the figures; paths are relative to the work folder)
+and `made` (time, machine, versions, command).
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.files import reason
-from bitymi_ns.measure.bench.machine import commit, machine, versions
 from bitymi_ns.measure.bench.process import BenchError
+from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
 NAMES = ("suite", "row")
-"""Entries of a key that name things and decide nothing."""
+"""Entries of a key that are labels and do not tell cells apart."""
 
 
 def identity(key: dict[str, Any]) -> str:
-    """What tells cells apart, as text."""
+    """Text that is equal for equal cells."""
     return json.dumps({name: value for name, value in key.items() if name not in NAMES}, sort_keys=True)
 
 
-def made(command: list[str], seconds: float) -> dict[str, Any]:
-    """Where a cell comes from."""
+def provenance(command: list[str], seconds: float) -> dict[str, Any]:
+    """Entry `made` of a cell."""
     return {
         "at": f"{datetime.datetime.now(datetime.timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
         "seconds": round(seconds, 2),
@@ -45,16 +45,14 @@ def made(command: list[str], seconds: float) -> dict[str, Any]:
 
 
 class Cells:
-    """The finished cells of a work folder. Several processes may append to the file at once."""
+    """The finished cells of a work folder; processes may append to the file at the same time."""
 
     def __init__(self, path: Path) -> None:
         """
         Raises:
-            BenchError: a line that is not the last is no cell.
+            BenchError: a line is no cell.
         """
         self.path = path
-        self._read_until = 0
-        self._known: dict[str, dict[str, Any]] = {}
         self.refresh()
 
     def __len__(self) -> int:
@@ -64,57 +62,49 @@ class Cells:
         return iter(self._known.values())
 
     def refresh(self) -> None:
-        """Read what other processes have added. A last line without its end (a writer that was killed) is left out."""
-        if not self.path.is_file():
-            return
-        with open(self.path, "rb") as file:
-            file.seek(self._read_until)
-            text = file.read()
-        whole = text[: text.rfind(b"\n") + 1]
-        first = self._read_until == 0
-        for number, line in enumerate(whole.splitlines(), 1):
+        """Read the file again. An unfinished last line (of a killed writer) is skipped."""
+        self._known: dict[str, dict[str, Any]] = {}
+        text = self.path.read_bytes() if self.path.is_file() else b""
+        for number, line in enumerate(text[: text.rfind(b"\n") + 1].splitlines(), 1):
             if not line.strip():
                 continue
             try:
                 cell = json_of(line)
                 self._known[identity(cell["key"])] = {**cell, "value": dict(cell["value"])}
             except (ValueError, KeyError, TypeError, AttributeError) as error:
-                where = f"line {number}" if first else "a line that was added"
                 raise BenchError(
-                    f"{self.path}, {where}, is not a finished cell ({error}): remove that line, or give another --work"
+                    f"{self.path}, line {number}, is not a finished cell ({error}): remove that line, or give another "
+                    "--work"
                 ) from error
-        self._read_until += len(whole)
 
     def get(self, key: dict[str, Any]) -> dict[str, Any] | None:
         """The line of a finished cell."""
         return self._known.get(identity(key))
 
-    def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> dict[str, Any]:
-        """Append a cell, whole or not at all; an unfinished line of a killed writer is cut off first."""
+    def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
+        """Append a cell as a whole line; an unfinished line of a killed writer is cut off first.
+
+        Raises:
+            BenchError: the file cannot be written.
+        """
         cell = {"key": key, "value": value, "made": origin}
         line = json.dumps(cell, allow_nan=False).encode("utf8") + b"\n"
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "a+b", opener=no_links) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
-                end = file.seek(0, os.SEEK_END)
-                if end:
-                    file.seek(max(0, end - (1 << 20)))
-                    tail = file.read()
-                    if not tail.endswith(b"\n"):
-                        end = max(0, end - len(tail)) + tail.rfind(b"\n") + 1
-                        file.truncate(end)
+                file.seek(0)
+                file.truncate(file.read().rfind(b"\n") + 1)
                 file.write(line)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
             raise BenchError(f"{self.path} cannot be written: {reason(error, self.path)}, with --work") from error
         self._known[identity(key)] = cell
-        return cell
 
 
 def without_nan(value: Any) -> Any:
-    """The same JSON value with null for numbers that JSON does not know."""
+    """Replace numbers that JSON cannot hold by None."""
     if isinstance(value, dict):
         return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

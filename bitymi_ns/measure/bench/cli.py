@@ -1,23 +1,35 @@
-"""The command line of a matrix: `bitymi bench local`, `bitymi bench mipnerf360`, ..."""
+"""Command line of a matrix: `bitymi bench local`, `bitymi bench mipnerf360`, ..."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from bitymi_ns.files import check_writable, explained, write_file
+from bitymi_ns.measure import markdown
+from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.engine import open_cells, run_chains
-from bitymi_ns.measure.bench.matrix import Matrix, Row, SceneSpec
+from bitymi_ns.measure.bench.matrix import (
+    FORMATS,
+    Matrix,
+    Row,
+    SceneSpec,
+    format_bundles,
+    local_scenes,
+    read_plan,
+    standard_scenes,
+    suites,
+)
 from bitymi_ns.measure.bench.process import BenchError, say
-from bitymi_ns.measure.bench.progress import Display
-from bitymi_ns.measure.bench.suites import FORMATS, format_bundles, local_scenes, read_plan, standard_scenes, suites
-from bitymi_ns.measure.bench.tables import results_page
+from bitymi_ns.measure.report.read import read_cells
+from bitymi_ns.measure.report.records import Records
+from bitymi_ns.measure.report.tables import NOTES, markdown_tables, quality_tables
 from bitymi_ns.trust import printable
 
 # A switch without its --no- twin, where this tyro knows how.
@@ -38,7 +50,7 @@ class BenchRun:
     methods: tuple[str, ...] = ("bitymi",)
     """Methods of ns-train."""
     plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, overdraw, paper, resolution, or
+    """Rows to train instead of --methods: ablation, atlas, overdraw, resolution, or
     a YAML file of that form."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
@@ -49,21 +61,14 @@ class BenchRun:
     formats: tuple[str, ...] = FORMATS
     """Formats of bundles that each trained scene is baked into; none = no baking."""
     pictures: int = 2
-    """Worst held-out views of each run that are drawn with their decomposition and errors; 0 = none."""
+    """Number of worst held-out views of each run to draw with errors and decomposition."""
     knobs: Flag = False
-    """Also measure what each quality knob costs and saves, for every run."""
+    """Also measure the error, time and bytes of each quality knob, for every run."""
     work: Path = Path("outputs/bench")
-    """Folder of runs, bundles, logs and finished cells; what is finished there is not done again."""
+    """Folder of runs, bundles, logs and finished cells, which are not done again. The command may run several times at
+    once on one folder, with other GPUs or on other machines: each takes runs that no other is working on."""
     output: Path | None = None
     """Also write the table to this Markdown file."""
-    cluster: Literal["none", "local", "slurm"] = "none"
-    """Spread the runs with submitit: as processes of this machine, or by Slurm (pip install 'bitymi-ns[cluster]')."""
-    jobs: int = 1
-    """With --cluster: runs at a time."""
-    gpus: tuple[int, ...] = ()
-    """With --cluster local: GPUs by number, one for each run at a time."""
-    job_options: tuple[str, ...] = ()
-    """With --cluster: options of a job, as in timeout_min=600 slurm_partition=gpu gpus_per_node=1."""
     suite: tyro.conf.Suppress[str] = "local"
 
     def _scenes(self) -> list[SceneSpec]:
@@ -76,17 +81,15 @@ class BenchRun:
         return standard_scenes(suites()[self.suite], self.data[0], self.scenes)
 
     def matrix(self) -> Matrix:
-        """What is to be measured.
+        """The matrix of these options.
 
         Raises:
             BenchError: an option makes no sense; the message says which.
         """
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
-        if self.pictures < 0 or self.jobs < 1:
-            raise BenchError("--pictures must not be negative, and --jobs at least 1")
-        if self.cluster == "none" and (self.jobs > 1 or self.gpus or self.job_options):
-            raise BenchError("--jobs, --gpus and --job-options are for --cluster local or --cluster slurm")
+        if self.pictures < 0:
+            raise BenchError("--pictures must not be negative")
         if self.plan is None:
             rows, bundles = [Row(name, name) for name in self.methods], None
         else:
@@ -99,26 +102,18 @@ class BenchRun:
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures, self.knobs)
 
     def run(self) -> int:
-        """Do what is missing, then print the table; returns the exit status."""
+        """Run the missing cells, then print the table; returns the exit status."""
         matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
-        chains, cells = matrix.chains(), open_cells(work)
+        cells = open_cells(work)
         if self.output is not None:
             with explained(self.output, BenchError):
                 check_writable(self.output)
-        workers = 1 if self.cluster == "none" else len(self.gpus) or self.jobs
         try:
-            with Display(chains, cells, workers) as display:
-                if self.cluster == "none":
-                    failures = run_chains(work, chains, display)
-                else:
-                    from bitymi_ns.measure.bench.spread import job_options, spread
-
-                    options = job_options(self.job_options)
-                    failures = spread(work, chains, self.cluster, display, self.jobs, self.gpus, options)
+            failures = run_chains(work, matrix.chains())
         except KeyboardInterrupt:
-            done = len(open_cells(work))
-            kept = f"{done} finished cells are in {work}" if done else "no cell was finished"
-            say(f"interrupted; {kept}. The same command goes on")
+            finished = len(open_cells(work))
+            kept = f"{finished} finished cells are in {work}" if finished else "no cell was finished"
+            say(f"interrupted; {kept}. Run the same command to continue")
             return INTERRUPTED
         for failure in failures:
             say(failure)
@@ -134,3 +129,15 @@ class BenchRun:
         else:
             print("No cell was finished.", file=sys.stderr)
         return FAILED if failures else 0
+
+
+def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[str] = ()) -> str:
+    """Markdown of the quality tables of a matrix, as far as its cells are finished."""
+    stages = [stage for chain in matrix.chains() for stage in chain if stage.kind in ("train", "eval", "export")]
+    found = [cell for stage in stages if (cell := cells.get(stage.key)) is not None]
+    records = Records()
+    read_cells(list(enumerate(found, 1)), cells.path, records)
+    failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
+    body = "\n\n".join(markdown_tables(quality_tables(records.evaluations, training=True)))
+    training = "Training s, CPU s: of the steps alone; peak: of ns-train as a whole."
+    return markdown.page(title, body, [NOTES, training, *failed], [cell["made"]["commit"] for cell in found])

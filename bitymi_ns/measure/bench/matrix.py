@@ -1,15 +1,22 @@
-"""What is measured: scenes x rows x seeds, and the cells of each run."""
+"""Describe what is measured: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from bitymi_ns.capture.recognise import NotRecognised, recognise
+from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
+from bitymi_ns.trust import inside
 
 Kind = Literal["train", "eval", "export", "pictures", "knobs"]
 
@@ -19,24 +26,21 @@ class SceneSpec:
     """A capture and how it is read.
 
     Attributes:
-        name: shown in tables, and nerfstudio's experiment name.
+        name: label in tables, and nerfstudio's experiment name.
         data: its folder, absolute.
-        suite: name of the suite that it is from.
-        parser: nerfstudio's dataparser with its options, as they stand at the end of ns-train's command line; empty =
-            the method's own.
-        hold_out: every which image is held out, where the capture has no test images of its own; 0 = it has.
+        suite: name of the data set, or `local`.
+        parser: nerfstudio's dataparser with its options, the end of ns-train's command line; empty = the method's own.
     """
 
     name: str
     data: Path
     suite: str = "local"
     parser: tuple[str, ...] = ()
-    hold_out: int = 8
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is trained: a method with further options of ns-train."""
+    """A method with further options of ns-train."""
 
     name: str
     method: str
@@ -44,13 +48,13 @@ class Row:
 
     @property
     def ours(self) -> bool:
-        """Whether it is a method of this package: only these are baked and have a training curve."""
+        """True for a method of this package: only these are baked and have a training curve."""
         return self.method in preset_names()
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """How a trained scene is baked: options of `ns-export bitymi-atlas`."""
+    """A way to bake: options of `ns-export bitymi-atlas`."""
 
     name: str
     options: tuple[str, ...]
@@ -82,7 +86,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Of the run's folder: tells runs of one method on one capture apart."""
+        """Name of the run's folder, unique among the runs of a method on a capture."""
         settings = {k: v for k, v in self.key.items() if k not in ("suite", "row")}
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
         length = "own-length" if self.steps is None else f"{self.steps}-steps"
@@ -91,7 +95,7 @@ class Run:
 
     @property
     def folder(self) -> str:
-        """Relative place of everything that belongs to it: under runs/, bundles/, evals/, pictures/, logs/."""
+        """Its path below runs/, bundles/, evals/, pictures/, knobs/ and logs/."""
         return f"{self.scene.name}/{self.row.method}/{self.name}"
 
     def __str__(self) -> str:
@@ -111,7 +115,7 @@ class Stage:
 
     @property
     def key(self) -> dict[str, Any]:
-        """What decides the result of the cell."""
+        """Settings that decide the result of the cell."""
         key: dict[str, Any] = {"cell": self.kind, **self.run.key}
         if self.bundle is not None:
             key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
@@ -131,15 +135,13 @@ class Stage:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Everything that is to be measured.
+    """Every row is trained on every scene with every seed, then baked into every bundle.
 
     Attributes:
-        scenes, rows: each row is trained on each scene.
-        seeds: once for each of them; empty = once, with the method's own seed.
+        seeds: empty = once, with the method's own seed.
         steps: length of a run; None = the method's own for this machine.
-        bundles: how each trained scene is baked; each bundle is evaluated.
-        pictures: worst held-out views that are drawn with their decomposition; 0 = none.
-        knobs: whether the quality knobs of each run are measured.
+        pictures: number of worst held-out views that are drawn with their decomposition.
+        knobs: measure the quality knobs of each run.
     """
 
     scenes: Sequence[SceneSpec]
@@ -151,7 +153,7 @@ class Matrix:
     knobs: bool = False
 
     def runs(self) -> list[Run]:
-        """All trainings, the seeds of a row next to each other."""
+        """All trainings, the seeds of a row one after another."""
         seeds = list(self.seeds) or [None]
         return [Run(s, r, seed, self.steps) for s in self.scenes for r in self.rows for seed in seeds]
 
@@ -171,3 +173,153 @@ class Matrix:
     def chains(self) -> list[list[Stage]]:
         """The cells of every run."""
         return [self.stages(run) for run in self.runs()]
+
+
+FORMATS = ("fp16", "uint8", "bc7", "compact")
+"""Formats of `ns-export bitymi-atlas`."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A standard data set; `scenes` maps each scene to the folder of its images."""
+
+    name: str
+    title: str
+    layout: str
+    hold_out: int
+    scenes: dict[str, str]
+
+
+def _read(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text("utf8"))
+    except OSError as error:
+        raise BenchError(f"{path} cannot be read: {error.strerror or error}") from error
+    except RecursionError as error:
+        raise BenchError(f"{path} is nested too deeply") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BenchError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+
+
+def suites() -> dict[str, Suite]:
+    """The standard data sets by name."""
+    entries = _read(Path(__file__).with_name("suites.yaml"))
+    return {name: Suite(name=name, **entry) for name, entry in entries.items()}
+
+
+def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
+    """Own captures in any form that `ns-train bitymi --data` takes. A Blender data set starts from the points of its
+    `hull_pc.ply` if there is one.
+
+    Raises:
+        BenchError: a folder holds nothing to train on, or two have the same name.
+    """
+    if not folders:
+        raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
+    scenes = []
+    for folder in folders:
+        folder = Path(os.path.expanduser(folder)).resolve()
+        try:
+            found = recognise(folder)
+        except NotRecognised as error:
+            raise BenchError(f"{folder} is not a capture: {error}") from error
+        if found.format == "blender":
+            points = ("--ply-path", "hull_pc.ply") if (found.path / "hull_pc.ply").is_file() else ()
+            scenes.append(SceneSpec(folder.name, found.path, parser=("blender-data", *points)))
+        else:
+            scenes.append(SceneSpec(folder.name, folder))
+    names = [scene.name for scene in scenes]
+    if len(set(names)) < len(names):
+        raise BenchError(f"captures need folders of different names, not {', '.join(names)}")
+    return scenes
+
+
+def standard_scenes(suite: Suite, root: Path, only: Sequence[str] = ()) -> list[SceneSpec]:
+    """Scenes of a standard data set below its folder.
+
+    Raises:
+        BenchError: the folder, or a scene of it, does not have the layout.
+    """
+    unknown = sorted(set(only) - set(suite.scenes))
+    if unknown:
+        raise BenchError(f"{suite.name} has no scene {', '.join(unknown)}; it has {', '.join(suite.scenes)}")
+    root = Path(os.path.expanduser(root)).resolve()
+    return [_standard_scene(suite, name, root / name) for name in only or suite.scenes]
+
+
+def _standard_scene(suite: Suite, name: str, folder: Path) -> SceneSpec:
+    images = suite.scenes[name]
+    needed = [images, "sparse/0"] if suite.layout == "colmap" else ["transforms_train.json", "transforms_test.json"]
+    missing = [part for part in needed if not (folder / part).exists()]
+    if missing:
+        raise BenchError(
+            f"{folder} is not {suite.title}'s {name}: there is no {' and no '.join(missing)}. --data is the folder "
+            f"that holds the scenes; --scenes {name} ... chooses some of them"
+        )
+    if suite.layout == "blender":
+        return SceneSpec(name, folder, suite.name, ("blender-data",))
+    base, _, factor = images.partition("_")
+    parser = ["colmap", "--images-path", base, "--colmap-path", "sparse/0"]
+    parser += ["--downscale-factor", factor or "1", "--downscale-rounding-mode", "round"]
+    parser += ["--eval-mode", "interval", "--eval-interval", str(suite.hold_out)]
+    return SceneSpec(name, folder, suite.name, tuple(parser))
+
+
+def format_bundles(formats: Sequence[str]) -> list[Bundle]:
+    """One bundle per atlas format."""
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown:
+        raise BenchError(f"there is no atlas format {', '.join(unknown)}; there are {', '.join(FORMATS)}")
+    return [Bundle(name, ("--format", name)) for name in dict.fromkeys(formats)]
+
+
+Words = list[str | int | float]
+
+
+class _PlanRow(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    method: str
+    options: Words = []
+
+
+class _Plan(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    rows: Annotated[dict[str | int | float, _PlanRow], Field(min_length=1)]
+    bundles: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")], Words] | None = None
+
+
+def read_plan(name: str) -> tuple[list[Row], list[Bundle] | None]:
+    """Read a plan by name, or from a YAML file.
+
+    Returns:
+        rows, and the bundles; None when the plan names none.
+
+    Raises:
+        BenchError: there is no such plan, or it is malformed; the message says where.
+    """
+    if name.endswith((".yaml", ".yml")):
+        entry = _read(Path(os.path.expanduser(name)))
+    else:
+        plans = _read(Path(__file__).with_name("plans.yaml"))
+        if name not in plans:
+            raise BenchError(f"there is no plan {name}: give {', '.join(plans)}, or a file that ends in .yaml")
+        entry = plans[name]
+    try:
+        plan = _Plan.model_validate(entry)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ", ".join(map(str, first["loc"]))
+        raise BenchError(
+            f"plan {name}: {where or 'the file'}: {first['msg']}; a plan has rows, NAME: {{method: NAME, "
+            "options: [...]}}, and optionally bundles, NAME: [options of ns-export bitymi-atlas]"
+        ) from error
+    rows = []
+    for title, row in plan.rows.items():
+        try:
+            inside(Path("runs"), row.method)
+        except ValueError as error:
+            raise BenchError(f"plan {name}, row {title}: {error}") from error
+        rows.append(Row(str(title), row.method, tuple(map(str, row.options))))
+    if plan.bundles is None:
+        return rows, None
+    return rows, [Bundle(title, tuple(map(str, options))) for title, options in plan.bundles.items()]

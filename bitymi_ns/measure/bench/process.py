@@ -1,4 +1,4 @@
-"""Commands as measured subprocesses."""
+"""Run commands as measured subprocesses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from bitymi_ns.files import Lock
@@ -19,7 +18,7 @@ from bitymi_ns.trust import no_links, printable
 TAIL = 25
 """Lines of a failed command's log that are shown."""
 GRACE = 20.0
-"""Seconds that a command gets to end by itself after an interrupt, before it is killed."""
+"""Seconds from an interrupt until a command that has not ended is killed."""
 
 
 class BenchError(Exception):
@@ -30,38 +29,19 @@ class CommandFailed(BenchError):
     """A command ended with a non-zero status; the message has the end of its log."""
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a process used, all its threads and the children it waited for included."""
+def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> dict[str, float]:
+    """Run a command with its output in a file; an interrupt ends the command first, then this call.
 
-    seconds: float
-    cpu_seconds: float
-    peak_bytes: int
-
-    def as_dict(self) -> dict[str, float]:
-        """The names under which a cell records them."""
-        return {
-            "process_seconds": round(self.seconds, 2),
-            "process_cpu_seconds": round(self.cpu_seconds, 2),
-            "peak_bytes": self.peak_bytes,
-        }
-
-
-def environment() -> dict[str, str]:
-    """What a measured command runs in: OpenMP threads wait without spinning, so that CPU seconds count work."""
-    return {**os.environ, "OMP_WAIT_POLICY": "passive"}
-
-
-def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> Cost:
-    """Run a command with its output in a file.
-
-    An interrupt ends the command first, then this call.
+    OpenMP threads wait without spinning, so that CPU seconds count work.
 
     Args:
-        command: the command.
-        log: the file for its output.
-        lock: what the command holds, too, and is named in: should this process be killed while the command goes on,
-            the lock outlives it and says who has it.
+        command: the command line.
+        log: file for its output.
+        lock: inherited by the command and naming it: when this process is killed while the command goes on, the lock
+            outlives it.
+
+    Returns:
+        `process_seconds`, `process_cpu_seconds` and `peak_bytes` of the command with all threads and children.
 
     Raises:
         CommandFailed: non-zero exit status, or the command cannot be started.
@@ -72,7 +52,7 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
         try:
             process = subprocess.Popen(
                 command,
-                env=environment(),
+                env={**os.environ, "OMP_WAIT_POLICY": "passive"},
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
@@ -99,11 +79,15 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
             f"{shlex.join(command)} ended with status {process.returncode}; see {log}, whose end is:\n{tail}"
         )
     kibibytes = usage.ru_maxrss if sys.platform != "darwin" else usage.ru_maxrss / 1024
-    return Cost(time.perf_counter() - start, usage.ru_utime + usage.ru_stime, int(kibibytes * 1024))
+    return {
+        "process_seconds": round(time.perf_counter() - start, 2),
+        "process_cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
+        "peak_bytes": int(kibibytes * 1024),
+    }
 
 
 def tool(name: str) -> str:
-    """A console script of this Python's environment, else the one on PATH.
+    """Find a console script of this Python's environment, else on PATH.
 
     Raises:
         BenchError: there is none.
@@ -116,5 +100,5 @@ def tool(name: str) -> str:
 
 
 def say(text: str) -> None:
-    """Progress on stderr, apart from the tables."""
+    """Print progress to stderr."""
     print(f"[{datetime.datetime.now():%H:%M:%S}] {printable(text)}", file=sys.stderr, flush=True)

@@ -1,66 +1,47 @@
-"""The report as one HTML page and as Markdown."""
+"""Put a report together and write it as one self-contained HTML page."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from bitymi_ns.measure.report.drawing import Plot
-from bitymi_ns.measure.report.gallery import Group
-from bitymi_ns.measure.report.knob_plots import KNOBS
-from bitymi_ns.measure.report.plots import CURVES
-from bitymi_ns.measure.report.poses import PosesShown
-from bitymi_ns.measure.report.tables import NOTES, Table, to_markdown
-from bitymi_ns.measure.report.views import ERROR_CAPTION, ComparedSet
-from bitymi_ns.measure.templates import rendered
+from bitymi_ns import __version__
+from bitymi_ns.capture.report import PICTURE
+from bitymi_ns.files import check_writable, explained, write_file
+from bitymi_ns.measure.markdown import rendered
+from bitymi_ns.measure.report.pictures import (
+    ERROR_CAPTION,
+    ComparedSet,
+    Group,
+    Picture,
+    compare_views,
+    read_pictures,
+    worst_views,
+)
+from bitymi_ns.measure.report.plots import CURVES, Plot, draw_plots
+from bitymi_ns.measure.report.read import collect
+from bitymi_ns.measure.report.records import FoundPoses, Records, ReportError, over_seeds
+from bitymi_ns.measure.report.tables import (
+    NOTES,
+    Table,
+    knob_tables,
+    poses_tables,
+    quality_tables,
+    summary,
+    training_table,
+)
 
+PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="bitymi report">'
 """Marks a page as ours, so that it may be replaced."""
-
-
-@dataclass(frozen=True)
-class Content:
-    """What a report says, before it takes a form.
-
-    Attributes:
-        title: heading of the page.
-        intro: a line on what was read, and the program's version.
-        summary: sentences on what baking changed.
-        quality: tables of evaluations; training: of runs; everything: every recorded number.
-        poses: how the camera poses of captures were found.
-        plots: drawn plots.
-        knobs: tables of the quality knobs.
-        paper: the paper's tables, with ours.
-        views: held-out views, photograph, renders and errors; they come first.
-        worst: the worst views with their errors and decomposition.
-        gallery: other images.
-        notes: what was skipped and why.
-    """
-
-    title: str
-    intro: str
-    summary: list[str]
-    quality: list[Table]
-    training: Table | None
-    everything: Table | None
-    poses: list[PosesShown]
-    plots: list[Plot]
-    knobs: list[Table]
-    paper: list[Table]
-    views: list[ComparedSet]
-    worst: list[Group]
-    gallery: list[Group]
-    notes: list[str]
-
-
 VIEWS_NOTE = f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}."
-PAPER_NOTE = (
-    "Figures in the published rows are those that the paper prints: of other hardware, other implementations and, for "
-    "most methods, other publications. They stand beside ours for orientation; speeds cannot be compared."
-)
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
+KNOBS = "Quality knobs: error against time and bytes"
 KNOB_NOTE = (
-    "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views; "
-    "the thin line is one step. Milliseconds are per view at full size, of the renderer named."
+    "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views. "
+    "Milliseconds are per view at full size, of the renderer named."
 )
 
 
@@ -73,61 +54,124 @@ class Section:
 
     @property
     def note(self) -> str:
-        """What a reader of the plots has to know; "" = nothing."""
-        if self.name == KNOBS:
-            return KNOB_NOTE
+        """An explanation of the plots, possibly empty."""
         return TRADE_OFF if any(plot.name not in CURVES for plot in self.plots) else ""
 
     @property
     def full(self) -> bool:
-        """Whether a plot needs the whole width of the page."""
+        """True if a plot needs the whole width of the page."""
         return any(plot.panels > 1 for plot in self.plots)
 
 
-def _sections(plots: list[Plot]) -> list[Section]:
-    """Plots by section, in order."""
-    names = dict.fromkeys(plot.section for plot in plots)
-    return [Section(name, [plot for plot in plots if plot.section == name]) for name in names]
+@dataclass(frozen=True)
+class Content:
+    """The parts of a report in their order on the page.
+
+    Attributes:
+        summary: sentences on how baking changed each scene.
+        views: held-out views with photograph, renders and errors.
+        poses: tables of found camera poses, and a picture of cameras and points.
+        worst: the worst views with their errors and decomposition.
+        notes: what was skipped and why.
+    """
+
+    title: str
+    intro: str
+    summary: list[str]
+    views: list[ComparedSet]
+    quality: list[Table]
+    training: Table | None
+    poses: list[tuple[list[Table], tuple[Picture, ...]]]
+    sections: list[Section]
+    knobs: list[Table]
+    worst: list[Group]
+    notes: list[str]
 
 
-def to_page(content: Content) -> str:
-    """The report as a single HTML document that needs no other file."""
-    return rendered(
-        "report.html.j2",
-        content=content,
-        sections=_sections(content.plots),
-        knobs=KNOBS,
-        generator=GENERATOR,
-        notes={"views": VIEWS_NOTE, "tables": NOTES, "paper": PAPER_NOTE},
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _unique(found: Sequence[FoundPoses]) -> list[FoundPoses]:
+    """Without the copies that several runs of one capture hold."""
+    return list({(each.source, *each.numbers.items(), *each.seconds.items()): each for each in found}.values())
+
+
+def compose(records: Records, title: str) -> Content:
+    """Build everything that a page shows of these records."""
+    notes = list(records.notes)
+    found = _unique(records.poses)
+    counts = {
+        "evaluation": len(records.evaluations),
+        "training run": len(records.curves),
+        "scene": len({row.scene for row in records.evaluations}),
+        "knob setting": len(records.knobs),
+        "capture with found poses": len(found),
+    }
+    counted = ", ".join(_counted(number, noun) for noun, number in counts.items() if number)
+    measured = f" Measured on: {'; '.join(records.machines)}." if records.machines else ""
+    merged = over_seeds(records.evaluations)
+    plots = draw_plots(records.evaluations, records.curves)
+    poses = []
+    for each in found:
+        path = each.file.parent / PICTURE
+        caption = "Cameras (red) and points, from above and from the side."
+        poses.append((poses_tables(each), read_pictures([(caption, path)] if path.is_file() else [], notes)))
+    return Content(
+        title=title,
+        intro=f"{counted}. Made by bitymi report {__version__}.{measured}",
+        summary=summary(merged),
+        views=compare_views(records.images, notes),
+        quality=quality_tables(merged),
+        training=training_table(records.curves),
+        poses=poses,
+        sections=[
+            Section(name, [plot for plot in plots if plot.section == name])
+            for name in dict.fromkeys(plot.section for plot in plots)
+        ],
+        knobs=knob_tables(records.knobs),
+        worst=worst_views(records.worst, notes),
+        notes=notes,
     )
 
 
-def _markdown_tables(tables: list[Table]) -> list[str]:
-    parts = []
-    for table in tables:
-        parts += [f"### {table.title}", to_markdown(table)]
-        parts += [table.note] if table.note else []
-    return parts
+def to_page(content: Content) -> str:
+    """Write the report as a single HTML document that needs no other file."""
+    notes = {"views": VIEWS_NOTE, "tables": NOTES, "knobs": KNOB_NOTE}
+    return rendered("report.html.j2", content=content, knobs=KNOBS, generator=GENERATOR, notes=notes)
 
 
-def to_report_md(content: Content) -> str:
-    """The report as Markdown, its plots as files beside it."""
-    parts = [f"# {content.title}", content.intro]
-    if content.summary:
-        parts.append("\n".join(f"- {line}" for line in content.summary))
-    if content.quality:
-        parts += ["## Quality and speed", *_markdown_tables(content.quality), NOTES]
-    if content.training:
-        parts += ["## Training", to_markdown(content.training)]
-    for each in content.poses:
-        parts += ["## Camera poses", *_markdown_tables(list(each.tables))]
-    for section in _sections(content.plots):
-        parts += [f"## {section.name}", *(f"![{plot.title}]({plot.name}.png)" for plot in section.plots)]
-        parts += [*_markdown_tables(content.knobs), KNOB_NOTE] if section.name == KNOBS else []
-    if content.paper:
-        parts += ["## The paper's tables", PAPER_NOTE, *_markdown_tables(content.paper)]
-    if content.everything:
-        parts += [f"## {content.everything.title}", to_markdown(content.everything)]
-    if content.notes:
-        parts += ["## Left out", "\n".join(f"- {line}" for line in content.notes)]
-    return "\n\n".join(parts) + "\n"
+def _check_output(output_dir: Path) -> None:
+    """Refuse a destination that is a file, or holds a page that is no report."""
+    if output_dir.exists() and not output_dir.is_dir():
+        raise ReportError(f"{output_dir} is a file; give a folder for the report.")
+    page = output_dir / PAGE
+    if page.exists() and GENERATOR not in page.read_bytes()[:4096].decode("utf8", "replace"):
+        raise ReportError(f"{page} was not made by bitymi report and will not be replaced; give another folder.")
+
+
+def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
+    """Write a report: index.html, which needs no other file.
+
+    Args:
+        inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
+            `fragments`, `psnr`), cells, knobs and pictures of `bitymi bench`, report.json of camera poses, PNG images
+            of ns-eval, and folders that are searched for all of these.
+        output_dir: folder of the report; created if needed. A report of an earlier call is replaced.
+        title: heading of the page.
+
+    Returns:
+        The path of index.html.
+
+    Raises:
+        ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.
+    """
+    output_dir = Path(os.path.expanduser(output_dir)).absolute()
+    _check_output(output_dir)
+    with explained(output_dir, ReportError):
+        check_writable(output_dir)
+    text = to_page(compose(collect(list(inputs), output_dir), title))
+    with explained(output_dir, ReportError):
+        output_dir.mkdir(exist_ok=True)
+        write_file(output_dir / PAGE, text.encode("utf8"))
+    return output_dir / PAGE

@@ -1,185 +1,241 @@
-"""The plots of a report: error against training time, rendering time and size, with Pareto fronts."""
+"""Draw the plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
 
 from __future__ import annotations
 
+import io
+import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from bitymi_ns.measure.report.drawing import Plot, Sheet, Theme, draw, line_color, log_when_wide
-from bitymi_ns.measure.report.knob_plots import knob_sheets
-from bitymi_ns.measure.report.pareto import front
-from bitymi_ns.measure.report.records import Curve, Evaluation, Records, trained_parent
+from bitymi_ns.measure.report.records import Curve, Evaluation, trained_parent
 
+PLAIN = ("default", {"text.parse_math": False})
+"""Style of all plots, whatever a matplotlibrc in the current folder says: it may ask for LaTeX. Names may hold a $."""
+INK, GRID = "#26292e", "#e3e5e8"
+COLORS = (
+    "#0b62b8", "#d1540b", "#1a8a5a", "#a8358f", "#8a6d00", "#128a9e", "#c22f3d", "#5b4bc4", "#6b6f76", "#4f7a14",
+)  # fmt: skip
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Marks of baked evaluations, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
 """Headings of the page's sections of plots."""
-CURVES = ("psnr_seconds", "psnr_cpu_seconds", "surfels_steps")
-"""Names of the plots of training curves, which have no Pareto front."""
+CURVES = {
+    "psnr_seconds": ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
+    "psnr_cpu_seconds": ("PSNR by CPU seconds of training", "CPU seconds", "PSNR (dB)", ("cpu_seconds", "psnr")),
+    "surfels_steps": ("Surfels over training steps", "step", "surfels", ("step", "surfels")),
+}
+"""Plots of training curves: name -> title, axes, columns."""
+METRICS = {
+    "psnr": ("PSNR (dB)", True, 0.5),
+    "ssim": ("SSIM", True, 0.01),
+    "flip": ("FLIP", False, 0.01),
+    "lpips": ("LPIPS", False, 0.01),
+    "lpips_vgg": ("LPIPS (VGG)", False, 0.01),
+}
+"""Measure of quality -> title, True if more is better, least span of its axis."""
 MIN_POINTS = 3
 """Plots of fewer points are left out: the tables say the same."""
 
 
 @dataclass(frozen=True)
-class Metric:
-    """A measure of quality: key of its result, name, whether more is better, and the least span of its axis."""
+class Plot:
+    """A plot: name, title, section of the page, number of panels, PNG bytes."""
 
-    key: str
+    name: str
     title: str
-    up: bool
-    span: float
-
-
-METRICS = (
-    Metric("psnr", "PSNR (dB)", True, 0.5),
-    Metric("ssim", "SSIM", True, 0.01),
-    Metric("flip", "FLIP", False, 0.01),
-    Metric("lpips", "LPIPS", False, 0.01),
-    Metric("lpips_vgg", "LPIPS (VGG)", False, 0.01),
-)
+    section: str
+    panels: int
+    png: bytes
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What quality is bought with: name in file names, axis label, section, value, whether baking changes it, and
-    whether the bundles of a method lie along a curve."""
+    """A cost axis: name, in titles and on the axis, section, value. `arrows`: baking changes it.
+    `curve`: the bundles of a method lie along a curve."""
 
     name: str
     title: str
     label: str
     section: str
     value: Callable[[Evaluation], float | None]
-    arrows: bool
+    arrows: bool = False
     curve: bool = False
 
 
-def _positive(key: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
-    return lambda e: (e.get(key) or 0.0) * scale or None
-
-
 def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
-    """The x axes. Sizes are of whole bundles, which is what is downloaded, where all bundles state them; else of their
-    atlases."""
+    """The x axes. Sizes are of whole bundles (the download) where all bundles state them; else of their atlases."""
+
+    def positive(key: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
+        return lambda e: (e.get(key) or 0.0) * scale or None
+
     baked = [e for e in rows if e.baked]
     whole = bool(baked) and all(e.get("bundle_bytes") for e in baked)
     key, what = ("bundle_bytes", "bundle") if whole else ("atlas_bytes", "atlas")
     return (
-        Cost("train_seconds", "training seconds", "training seconds", TRAINING, _positive("train_seconds"), False),
-        Cost("render_ms", "render milliseconds", "milliseconds per view", RENDERING, _positive("render_ms"), True),
-        Cost("bytes", f"{what} size", f"{what} MB", SIZE, _positive(key, 1e-6), False, True),
+        Cost("train_seconds", "training seconds", "training seconds", TRAINING, positive("train_seconds")),
+        Cost("render_ms", "render milliseconds", "milliseconds per view", RENDERING, positive("render_ms"), True),
+        Cost("bytes", f"{what} size", f"{what} MB", SIZE, positive(key, 1e-6), curve=True),
     )
 
 
-def _curve_sheet(name: str, title: str, x: str, y: str, keys: tuple[str, str], curves: list[Curve],
-                 colors: dict[str, int]) -> Sheet | None:  # fmt: skip
-    """`keys[1]` against `keys[0]` of every curve that records both at least once."""
+def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, float]]:
+    """The Pareto front of (cost, quality) points, cheapest first.
+
+    Args:
+        points: costs, of which less is better, and qualities.
+        up: more quality is better (PSNR), else less (FLIP).
+
+    Returns:
+        The points of which none other is at least as good in both and better in one; equal points once.
+    """
+    best: list[tuple[float, float]] = []
+    for cost, quality in sorted(set(points), key=lambda p: (p[0], -p[1] if up else p[1])):
+        if not best or (quality > best[-1][1] if up else quality < best[-1][1]):
+            best.append((cost, quality))
+    return best
+
+
+def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]:
+    """Every plot for which there are at least MIN_POINTS points in a panel."""
+    names = dict.fromkeys([*sorted({e.method for e in evaluations}), *sorted({c.label for c in curves})])
+    colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)}
+    plots = [_curve_plot(name, curves, colors) for name in CURVES]
+    plots += [_pareto_plot(key, cost, evaluations, colors) for cost in costs(evaluations) for key in METRICS]
+    return [plot for plot in plots if plot is not None]
+
+
+def _curve_plot(name: str, curves: list[Curve], colors: dict[str, str]) -> Plot | None:
+    title, x, y, keys = CURVES[name]
     drawn = [c for c in curves if c.series(*keys)[0]]
-    if not drawn:
+    if max((len(c.series(*keys)[0]) for c in drawn), default=0) < MIN_POINTS:
         return None
 
-    def panel(axes: Axes, scene: str, theme: Theme) -> None:
+    def panel(axes: Axes, scene: str) -> None:
         for curve in drawn:
             if curve.scene == scene:
                 xs, ys = curve.series(*keys)
                 marker = "o" if len(xs) <= 20 else ""
-                axes.plot(xs, ys, color=line_color(theme, colors[curve.label]), linewidth=1.6, marker=marker, ms=3)
+                axes.plot(xs, ys, color=colors[curve.label], linewidth=1.6, marker=marker, ms=3)
         if keys[1] == "surfels":
             axes.set_ylim(bottom=0)
 
-    labels = sorted({c.label for c in drawn})
-    legend = tuple((label, {"color": colors[label], "linewidth": 2}) for label in labels)
-    return Sheet(name, title, TRAINING, x, y, tuple(sorted({c.scene for c in drawn})), panel,
-                 max(len(c.series(*keys)[0]) for c in drawn), legend)  # fmt: skip
+    legend = [Line2D([], [], color=colors[label], label=label) for label in sorted({c.label for c in drawn})]
+    scenes = sorted({c.scene for c in drawn})
+    return Plot(name, title, TRAINING, len(scenes), _png(scenes, panel, x, y, legend))
 
 
-def _scatter_sheet(metric: Metric, cost: Cost, evaluations: list[Evaluation], colors: dict[str, int]) -> Sheet | None:
-    """Quality against cost: hollow circles before baking, filled marks after, a thin line from parent to bundle or
-    through the bundles of a method, and the Pareto front of all points of a scene."""
-    points = {id(e): (cost.value(e), e.get(metric.key)) for e in evaluations}
-    drawn = [e for e in evaluations if None not in points[id(e)]]
-    if not drawn:
+def pareto_panel(
+    axes: Axes, rows: list[Evaluation], key: str, cost: Cost, colors: dict[str, str], markers: dict[str, str]
+) -> None:
+    """Draw quality against cost of one scene: hollow circles before baking, filled marks after, a thin line from parent
+    to bundle or through the bundles of a method, and the Pareto front of all points."""
+    _, up, span = METRICS[key]
+    points = {id(e): (cost.value(e), e.get(key)) for e in rows}
+    best = front(list(points.values()), up)
+    if len(best) > 1:
+        xs, ys = zip(*best, strict=True)
+        axes.step(xs, ys, where="post", color=INK, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.6, zorder=1)
+    thin = {"linewidth": 0.9, "alpha": 0.55, "zorder": 2}
+    for method in sorted({e.method for e in rows}) if cost.curve else ():
+        xs, ys = zip(*sorted(points[id(e)] for e in rows if e.method == method), strict=True)
+        axes.plot(xs, ys, color=colors[method], **thin)
+    for e in rows:
+        x, y = points[id(e)]
+        mark: dict[str, Any] = {"color": colors[e.method], "linestyle": "", "zorder": 3}
+        if e.baked:
+            parent = trained_parent(e, rows) if cost.arrows else None
+            if parent is not None:
+                axes.plot(*zip(points[id(parent)], (x, y), strict=True), color=colors[e.method], **thin)
+            axes.plot([x], [y], marker=markers[_variant(e)], ms=6, **mark)
+        else:
+            axes.plot([x], [y], marker="o", ms=7, markerfacecolor="white", markeredgewidth=1.8, **mark)
+    axes.margins(0.12)
+    low, high = (f(y for _, y in points.values()) for f in (min, max))
+    if high - low < span:  # differences in the third decimal shall not look like cliffs
+        axes.set_ylim((low + high) / 2 - 0.6 * span, (low + high) / 2 + 0.6 * span)
+    _log_when_wide(axes, [x for x, _ in points.values()])
+
+
+def _pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dict[str, str]) -> Plot | None:
+    drawn = [e for e in evaluations if cost.value(e) is not None and e.get(key) is not None]
+    if max(Counter(e.scene for e in drawn).values(), default=0) < MIN_POINTS:
         return None
     variants = sorted({_variant(e) for e in drawn if e.baked})
     markers = {variant: MARKERS[i % len(MARKERS)] for i, variant in enumerate(variants)}
-
-    def panel(axes: Axes, scene: str, theme: Theme) -> None:
-        here = [e for e in drawn if e.scene == scene]
-        best = front([points[id(e)] for e in here], metric.up)
-        if len(best) > 1:
-            xs, ys = zip(*best, strict=True)
-            axes.step(xs, ys, where="post", color=theme.ink, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.6, zorder=1)
-        for method in sorted({e.method for e in here}) if cost.curve else ():
-            xs, ys = zip(*sorted(points[id(e)] for e in here if e.method == method), strict=True)
-            axes.plot(xs, ys, color=line_color(theme, colors[method]), linewidth=0.9, alpha=0.55, zorder=2)
-        for e in here:
-            color = line_color(theme, colors[e.method])
-            px, py = points[id(e)]
-            if e.baked:
-                parent = trained_parent(e, drawn) if cost.arrows else None
-                if parent is not None:
-                    qx, qy = points[id(parent)]
-                    axes.plot([qx, px], [qy, py], color=color, linewidth=0.9, alpha=0.55, zorder=2)
-                axes.plot([px], [py], color=color, marker=markers[_variant(e)], ms=6, linestyle="", zorder=3)
-            else:
-                axes.plot([px], [py], color=color, marker="o", ms=7, linestyle="", zorder=3,
-                          markerfacecolor=theme.paper, markeredgewidth=1.8)  # fmt: skip
-        axes.margins(0.12)
-        _at_least(axes, [points[id(e)][1] for e in here], metric.span)
-        log_when_wide(axes, [points[id(e)][0] for e in here])
-
-    legend: list[tuple[str, dict]] = [
-        (method, {"color": colors[method], "linewidth": 4}) for method in sorted({e.method for e in drawn})
-    ]
+    legend = [Line2D([], [], color=colors[m], label=m, linewidth=4) for m in sorted({e.method for e in drawn})]
+    mark = {"color": INK, "linestyle": ""}
     if any(not e.baked for e in drawn):
-        legend.append(("pre-bake", {"marker": "o", "ms": 7, "linestyle": "", "hollow": True, "markeredgewidth": 1.8}))
+        hollow = {"markerfacecolor": "white", "markeredgewidth": 1.8}
+        legend.append(Line2D([], [], marker="o", ms=7, label="trained", **hollow, **mark))
     legend += [
-        (f"post-bake, {variant}" if variant else "post-bake", {"marker": marker, "ms": 6, "linestyle": ""})
+        Line2D([], [], marker=marker, ms=6, label=f"baked, {variant}" if variant else "baked", **mark)
         for variant, marker in markers.items()
     ]
-    if len(drawn) > 1:
-        legend.append(("Pareto front", {"linestyle": (0, (4, 3)), "linewidth": 0.9}))
-    scenes = tuple(sorted({e.scene for e in drawn}))
-    name, title = f"{metric.key}_{cost.name}", f"{metric.title.split()[0]} against {cost.title}"
-    most = max(Counter(e.scene for e in drawn).values())
-    return Sheet(name, title, cost.section, cost.label, metric.title, scenes, panel, most, tuple(legend))
+    legend.append(Line2D([], [], color=INK, linestyle=(0, (4, 3)), linewidth=0.9, label="Pareto front"))
+    scenes = sorted({e.scene for e in drawn})
 
+    def panel(axes: Axes, scene: str) -> None:
+        pareto_panel(axes, [e for e in drawn if e.scene == scene], key, cost, colors, markers)
 
-def _at_least(axes: Axes, values: list[float], span: float) -> None:
-    """A y axis of at least `span`, so that differences in the third decimal do not look like cliffs."""
-    low, high = min(values), max(values)
-    if high - low < span:
-        middle = (low + high) / 2
-        axes.set_ylim(middle - 0.6 * span, middle + 0.6 * span)
+    png = _png(scenes, panel, cost.label, METRICS[key][0], legend)
+    title = f"{METRICS[key][0].removesuffix(' (dB)')} against {cost.title}"
+    return Plot(f"{key}_{cost.name}", title, cost.section, len(scenes), png)
 
 
 def _variant(row: Evaluation) -> str:
-    """What a label says beyond the method: the atlas format, or what tells it from its namesakes."""
+    """The part of a label beyond the method: the atlas format, or what tells it from its namesakes."""
     return (row.group or row.label).removeprefix(row.method).strip(", ()")
 
 
-def draw_plots(records: Records) -> list[Plot]:
-    """Every plot for which there are enough data."""
-    rows, curves = records.evaluations, records.curves
-    names = dict.fromkeys([*sorted({e.method for e in rows}), *sorted({c.label for c in curves})])
-    colors = {name: i for i, name in enumerate(names)}
-    psnr = "PSNR (dB)"
-    sheets = [
-        _curve_sheet("psnr_seconds", "PSNR in the course of training", "training seconds", psnr,
-                     ("seconds", "psnr"), curves, colors),
-        _curve_sheet("psnr_cpu_seconds", "PSNR in the course of training, by CPU seconds", "CPU seconds", psnr,
-                     ("cpu_seconds", "psnr"), curves, colors),
-        _curve_sheet("surfels_steps", "Surfels over training steps", "step", "surfels",
-                     ("step", "surfels"), curves, colors),
-    ]  # fmt: skip
-    sheets += [_scatter_sheet(metric, cost, rows, colors) for cost in costs(rows) for metric in METRICS]
-    sheets += knob_sheets(records.knobs)
-    return [draw(sheet) for sheet in sheets if sheet is not None and sheet.points >= MIN_POINTS]
+def _log_when_wide(axes: Axes, values: list[float]) -> None:
+    """A logarithmic x axis for positive values that span more than a factor of eight."""
+    if min(values) > 0 and max(values) / min(values) > 8:
+        axes.set_xscale("log")
+        narrow = math.log10(max(values) / min(values)) < 2
+        axes.xaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if narrow else (1,), numticks=12))
+        axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def is_plot_name(name: str) -> bool:
-    """Whether `draw_plots` could have given a plot this name."""
-    known = set(CURVES) | {f"{metric.key}_{cost.name}" for metric in METRICS for cost in costs([])}
-    return name in known or name.startswith("knob_")
+@style.context(PLAIN)
+def _png(scenes: list[str], panel: Callable[[Axes, str], None], x: str, y: str, legend: list[Line2D]) -> bytes:
+    """Draw a figure: at most three panels per row, one legend below."""
+    columns = min(3, len(scenes))
+    rows = math.ceil(len(scenes) / columns)
+    width, height = (6.4, 3.9) if columns == 1 else (3.5 * columns, 2.9)
+    figure = Figure(figsize=(width, rows * height), dpi=160, layout="constrained")
+    FigureCanvasAgg(figure)
+    plain = FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for i, axes in enumerate(grid.flat):
+        if i >= len(scenes):
+            axes.remove()
+            continue
+        panel(axes, scenes[i])
+        axes.grid(True, color=GRID, linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.tick_params(labelsize=8, length=3, which="both")
+        axes.xaxis.set_major_formatter(plain)
+        axes.yaxis.set_major_formatter(plain)
+        axes.spines[["top", "right"]].set_visible(False)
+        if len(scenes) > 1:
+            axes.set_title(scenes[i] or "no scene named", fontsize=9)
+        if i + columns >= len(scenes):
+            axes.set_xlabel(x, fontsize=9)
+        if i % columns == 0:
+            axes.set_ylabel(y, fontsize=9)
+    if len(legend) > 1:
+        longest = max(len(handle.get_label()) for handle in legend)
+        ncols = max(1, min(len(legend), int(width * 16) // (longest + 7)))
+        figure.legend(handles=legend, loc="outside lower center", frameon=False, fontsize=8, ncols=ncols)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": "bitymi report"})
+    return buffer.getvalue()

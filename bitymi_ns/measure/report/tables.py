@@ -1,14 +1,14 @@
-"""The tables of a report, as data and as Markdown; their HTML is in templates/report.html.j2."""
+"""Build the tables of a report; their HTML is in templates/report.html.j2."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
-from bitymi_ns.measure.report.records import Curve, Evaluation, Records, psnr_delta, trained_parent
+from bitymi_ns.measure.report.records import Curve, Evaluation, FoundPoses, KnobPoint, psnr_delta, trained_parent
 
 MISSING = "–"
 
@@ -56,11 +56,6 @@ def significant(value: float) -> str:
     return f"{value:,.{decimals}f}"
 
 
-def exact(value: float) -> str:
-    """Six significant digits; whole numbers in full."""
-    return f"{value:,.0f}" if abs(value) >= 1e5 or value == round(value) else f"{value:.6g}"
-
-
 def signed(value: float) -> str:
     """A difference with its sign and three decimals."""
     return f"{value:+.3f}".replace("-", "−")
@@ -77,6 +72,10 @@ def _key(name: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
         return None if number is None else number * scale
 
     return value
+
+
+def _trained(name: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
+    return lambda row: None if row.baked else _key(name, scale)(row)
 
 
 def _fps(row: Evaluation) -> float | None:
@@ -103,22 +102,28 @@ COLUMNS = (
     Column("Atlas MB", _atlas_mb, significant, "down"),
     Column("Bundle MB", _key("bundle_bytes", 1e-6), significant, "down"),
 )
-"""The paper's columns and the run-time figures beside them."""
+TRAINING = (
+    Column("Training s", _trained("train_seconds"), count),
+    Column("Training CPU s", _trained("train_cpu_seconds"), count),
+    Column("Training peak MB", _trained("train_peak_bytes", 1e-6), count),
+)
+"""Of the training steps alone; the peak is that of ns-train as a whole."""
 
 STAGES = {False: "Trained scene", True: "Baked bundle"}
 
 NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
-    "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard "
-    "deviation of the PSNR over seeds. ccPSNR: after an affine fit of each view's colours to its photograph, so that "
-    "exposure and white balance do not count. Bold: best of its scene."
+    "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
+    "ccPSNR: after an affine fit of each view's colours to its photograph, so that exposure and white balance do not "
+    "count. Bold: best of its scene."
 )
 
 
-def _numbers(evaluations: list[Evaluation], everyone: list[Evaluation]) -> list[Column]:
+def _numbers(evaluations: list[Evaluation], training: bool) -> list[Column]:
     """The columns that at least one row fills."""
-    delta = Column("ΔPSNR", lambda row: psnr_delta(row, everyone), signed)
-    return [c for c in (*COLUMNS, delta) if any(c.value(row) is not None for row in evaluations)]
+    delta = Column("ΔPSNR", lambda row: psnr_delta(row, evaluations), signed)
+    wanted = (*COLUMNS, *(TRAINING if training else ()), delta)
+    return [c for c in wanted if any(c.value(row) is not None for row in evaluations)]
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
@@ -185,7 +190,6 @@ def training_table(curves: list[Curve]) -> Table | None:
         ("Seconds", lambda c: c.last("seconds"), significant),
         ("CPU seconds", lambda c: c.last("cpu_seconds"), significant),
         ("Last PSNR", lambda c: c.last("psnr"), "{:.2f}".format),
-        ("Best PSNR", lambda c: c.best("psnr"), "{:.2f}".format),
         ("Last ccPSNR", lambda c: c.last("cc_psnr"), "{:.2f}".format),
         ("Points", lambda c: c.last("surfels"), count),
         ("Fragments", lambda c: c.last("fragments"), count),
@@ -200,48 +204,21 @@ def training_table(curves: list[Curve]) -> Table | None:
     return Table("Training", ("Run", *(c[0] for c in columns)), tuple(rows))
 
 
-def everything_table(evaluations: list[Evaluation]) -> Table | None:
-    """Every number that was recorded, with its spread over the views and its file."""
-    if not evaluations:
-        return None
-    recorded = {key for row in evaluations for key in row.results}
-    keys = sorted(key for key in recorded if key.removesuffix("_std") not in recorded - {key})
-
-    def text(row: Evaluation, key: str) -> str:
-        value, spread = row.get(key), row.get(f"{key}_std")
-        if value is None:
-            return MISSING
-        return f"{exact(value)} ± {spread:.3g}" if spread and spread < 1000 else exact(value)
-
-    rows = tuple(
-        Row(
-            (
-                f"{row.scene}: {row.label}{', baked' if row.baked else ''}",
-                *(text(row, key) for key in keys),
-                str(row.source),
-            )
-        )
-        for row in sorted(evaluations, key=lambda e: (e.scene, e.baked, e.label))
-    )
-    return Table("All recorded numbers (mean ± standard deviation over the views)", ("Evaluation", *keys, "File"), rows)
-
-
-def quality_tables(records: Records) -> list[Table]:
-    """One table per scene in the paper's layout, and the means when there are several scenes."""
-    evaluations = records.evaluations
-    columns = _numbers(evaluations, evaluations)
+def quality_tables(evaluations: list[Evaluation], training: bool = False) -> list[Table]:
+    """One table per scene, and their means when there are several scenes; with the cost of training if `training`."""
+    columns = _numbers(evaluations, training)
     scenes = sorted({row.scene for row in evaluations})
     tables = [scene_table(scene, [e for e in evaluations if e.scene == scene], columns) for scene in scenes]
     mean = mean_table(evaluations, columns)
     return [*tables, mean] if mean else tables
 
 
-def summary(records: Records, limit: int = 8) -> list[str]:
+def summary(evaluations: list[Evaluation], limit: int = 8) -> list[str]:
     """A sentence for each baked evaluation with a trained parent; none when there are more than `limit`."""
     lines = []
-    for row in sorted(records.evaluations, key=lambda e: (e.scene, e.label)):
-        delta = psnr_delta(row, records.evaluations)
-        parent = trained_parent(row, records.evaluations)
+    for row in sorted(evaluations, key=lambda e: (e.scene, e.label)):
+        delta = psnr_delta(row, evaluations)
+        parent = trained_parent(row, evaluations)
         if parent is None or delta is None:
             continue
         parts = [f"{parent.results['psnr']:.2f} dB trained, {row.results['psnr']:.2f} dB baked ({signed(delta)})"]
@@ -257,6 +234,82 @@ def summary(records: Records, limit: int = 8) -> list[str]:
     return lines if len(lines) <= limit else []
 
 
+KNOBS = {
+    "weight_bound": "Weight bound",
+    "transmittance": "Termination threshold",
+    "format": "Atlas format",
+    "r_max": "Largest tile side",
+    "tolerance": "Atlas tolerance",
+    "resolution": "Resolution of rendering",
+}
+"""Knob -> title of its table."""
+
+
+def knob_tables(points: list[KnobPoint]) -> list[Table]:
+    """One table per knob; the error is against its exact setting."""
+    tables = []
+    header = ("Setting", "mean steps", "max steps", "dB to exact", "PSNR", "ms", "CPU ms", "MB")
+    columns = (
+        ("mean_steps", 1.0, "{:.3f}".format), ("max_steps", 1.0, "{:.2f}".format), ("psnr_exact", 1.0, _decibel),
+        ("psnr", 1.0, "{:.2f}".format), ("ms", 1.0, significant), ("cpu_ms", 1.0, significant),
+        ("bytes", 1e-6, significant),
+    )  # fmt: skip
+    for knob in dict.fromkeys(p.knob for p in points):
+        groups: dict[str, list[KnobPoint]] = {}
+        of_knob = [p for p in points if p.knob == knob]
+        for p in of_knob:
+            groups.setdefault(f"{p.scene}, {p.run}, {p.renderer} renderer", []).append(p)
+        rows: list[Row] = []
+        for title, group in groups.items():
+            rows.append(Row((title,), section=True))
+            for p in group:
+                marks = [text for text, holds in (("exact", p.exact), ("default", p.default)) if holds]
+                texts = (text(scale * p.figures[key]) if key in p.figures else MISSING for key, scale, text in columns)
+                rows.append(Row((p.value + (f" ({', '.join(marks)})" if marks else ""), *texts)))
+        note = f"{of_knob[0].against[:1].upper()}{of_knob[0].against[1:]}." if of_knob[0].against else ""
+        tables.append(Table(KNOBS.get(knob, knob), header, tuple(rows), note))
+    return tables
+
+
+def _decibel(value: float) -> str:
+    return "equal" if value >= 100 else f"{value:.1f}"
+
+
+MOST_NAMED = 60
+"""Photographs that a table names; report.json has them all."""
+
+
+def poses_tables(found: FoundPoses) -> list[Table]:
+    """Statistics of the camera poses of a capture, seconds of each stage, and photographs with a reason or remark."""
+
+    def text(key: str, form: str) -> str:
+        return form.format(found.numbers[key]) if key in found.numbers else MISSING
+
+    overview = {
+        "Photographs with a pose": f"{text('registered', '{:,.0f}')} of {text('given', '{:,.0f}')}",
+        "Mean reprojection error, pixels": text("reprojection_error", "{:.2f}"),
+        "Mean track length, photographs per point": text("track_length", "{:.2f}"),
+        "Points": text("points", "{:,.0f}"),
+        "Median parallax, degrees": text("parallax_degrees", "{:.1f}"),
+        "Up, scale": found.frame,
+    }
+    seconds = {stage: f"{value:.1f}" for stage, value in found.seconds.items()}
+    tables = [
+        Table("Poses", ("", found.source), tuple(map(Row, overview.items()))),
+        Table("Time of every stage", ("Stage", "Seconds"), tuple(map(Row, seconds.items()))),
+        _named(found.left_out, "Left out", "Why"),
+        _named(found.notes, "Notes", ""),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def _named(photographs: Mapping[str, str], title: str, header: str) -> Table:
+    rows = tuple(map(Row, list(photographs.items())[:MOST_NAMED]))
+    more = len(photographs) - len(rows)
+    note = f"And {more:,} more, which report.json names." if more else ""
+    return Table(f"{title}: {len(photographs):,}", ("Photograph", header), rows, note)
+
+
 def to_markdown(table: Table) -> str:
     """A table as Markdown, without its title."""
     width, rows = len(table.header), []
@@ -266,3 +319,11 @@ def to_markdown(table: Table) -> str:
             cells[0] = f"*{cells[0]}*"
         rows.append([f"**{c}**" if i in row.best else c for i, c in enumerate(cells)])
     return markdown.table([escaped(text) for text in table.header], rows)
+
+
+def markdown_tables(tables: Sequence[Table]) -> list[str]:
+    """Tables as Markdown paragraphs, each with its title and note."""
+    parts = []
+    for table in tables:
+        parts += [f"### {table.title}", to_markdown(table), *filter(None, [table.note])]
+    return parts

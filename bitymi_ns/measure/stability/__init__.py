@@ -1,1 +1,1 @@
-"""How far float32 can be trusted: extreme scenes, errors against float64 and extended precision, a page of them."""
+"""Float32 errors of extreme scenes against float64 and extended precision, and the page that lists them."""

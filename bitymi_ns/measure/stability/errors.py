@@ -1,8 +1,10 @@
-"""Errors of a backend against the float64 reference, and how much of them the rounding of the inputs alone explains."""
+"""Measure errors of a backend against the float64 reference, and the share that the rounding of the inputs explains."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,13 +12,59 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.backends import Backend
-from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, SceneCase
-from bitymi_ns.measure.stability.ways import PLAIN, TEXELS, Way, cells, tile_images, tiles_of
+from bitymi_ns.measure.stability.scenes import (
+    PLAIN,
+    SURFEL_KEYS,
+    SV_KEYS,
+    TEXELS,
+    SceneCase,
+    Way,
+    cells,
+    tile_images,
+    tiles_of,
+)
+from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.reference import extended
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A set of compiled kernels behind `bitymi_ns.ops`.
+
+    Attributes:
+        name: for tables and tests.
+        device: of the tensors that it takes.
+        use: context in which `bitymi_ns.ops` uses it, where the device alone does not choose it.
+    """
+
+    name: str
+    device: str
+    use: Callable[[], AbstractContextManager[object]] = nullcontext
+
+
+BACKENDS: dict[str, Backend] = {
+    "cpu": Backend("cpu", "cpu"),
+    "cuda": Backend("cuda", "cuda"),
+    "emulated": Backend("emulated", "cpu", emulated_cuda),
+}
+"""Backends by name; tests/stress runs every case on those that are there. `emulated`: CUDA kernels, run on the host."""
+
+
+def missing(backend: Backend) -> str:
+    """The reason why a backend cannot be used here; empty when it can."""
+    device = torch.device(backend.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        return "no CUDA device (or torch without CUDA)"
+    try:
+        with backend.use():
+            module(device)
+    except RuntimeError as error:
+        return str(error)
+    return ""
+
 
 IMAGES = ("rgb", "alpha", "depth", "normal", "beta_map")
 CHANNELS = {
@@ -26,7 +74,7 @@ CHANNELS = {
     "depth": slice(5, 6),
     "normal": slice(6, 9),
 }
-"""Places of the channels in the image of `ops.composite_image`."""
+"""Channels of the image of `ops.composite_image`."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
 """Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene
@@ -54,13 +102,13 @@ class Errors:
     flipped: float
     """Share of the pixels that are not compared."""
     input_forward: float
-    """How much the reference's images change when each input is moved by up to half a unit in its last place."""
+    """Change of the reference's images when each input is moved by up to half a unit in its last place."""
     input_gradient: float
     """The same of its gradients."""
     drawn: int
     """Blended fragments of the reference."""
     finite: bool
-    """Whether every image and gradient of the backend is finite, over all pixels."""
+    """True if every image and gradient of the backend is finite, over all pixels."""
 
 
 @dataclass

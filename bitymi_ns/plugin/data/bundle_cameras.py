@@ -1,4 +1,4 @@
-"""A bundle whose capture is gone: its cameras.json stands for the capture in all that needs no photographs."""
+"""Parser of a bundle's cameras.json, for commands that need no photographs where the capture is gone."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 
 from bitymi_ns.bundle import BundleError
@@ -16,24 +17,24 @@ from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.interchange.bundle_cameras import NamedCamera, named_cameras
 from bitymi_ns.plugin.data.lens import Pinhole
-from bitymi_ns.plugin.data.views import ALONE, Views, pinhole_cameras
+from bitymi_ns.plugin.data.views import NO_PHOTOS, OPENCV_AXES, Views, pinhole_cameras
 from bitymi_ns.plugin.errors import fail
 from bitymi_ns.trust import inside
 
 
 @dataclass
 class BundleCamerasConfig(DataParserConfig):
-    """The cameras that a bundle has of its capture."""
+    """Cameras of a bundle."""
 
     _target: type = field(default_factory=lambda: BundleCameras)
     data: Path = Path()
-    """The bundle."""
+    """Folder of the bundle."""
     capture: Path = Path()
-    """Where its capture was."""
+    """Folder of the capture before it was lost."""
 
 
 class BundleCameras(DataParser):
-    """Views of a capture as a bundle has them: cameras, without photographs."""
+    """Views with the cameras of a bundle, without photographs."""
 
     config: BundleCamerasConfig
     downscale_factor = None  # nerfstudio sets it where photographs are not needed
@@ -55,24 +56,22 @@ class BundleCameras(DataParser):
             cameras=_cameras(chosen),
             dataparser_scale=float(world.scale),
             dataparser_transform=torch.tensor(np.asarray(world.transform, np.float64)[:3]),
-            metadata={ALONE: True},
+            metadata={NO_PHOTOS: True},
         )
 
 
 def has_cameras(bundle: Path) -> bool:
-    """Whether a bundle states the cameras of its capture."""
+    """Test if a bundle states the cameras of its capture."""
     try:
         return bool(named_cameras(bundle, read_manifest(bundle)))
     except BundleError as error:
         fail(str(error), error)
 
 
-def _cameras(rows: Sequence[NamedCamera]) -> Any:
+def _cameras(rows: Sequence[NamedCamera]) -> Cameras:
     poses, pinholes = [], []
     for _, _, camera in rows:
-        pose = torch.linalg.inv(camera.viewmat.double())
-        pose[:3, 1:3] *= -1.0  # OpenCV's axes to nerfstudio's
-        poses.append(pose.float())
+        poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())
         K = camera.K.tolist()
         pinholes.append(Pinhole(K[0][0], K[1][1], K[0][2], K[1][2], camera.width, camera.height))
     return pinhole_cameras(pinholes, torch.stack(poses))

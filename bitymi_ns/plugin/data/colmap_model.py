@@ -1,8 +1,7 @@
-"""COLMAP models as they are on disk: cameras, poses and points, in COLMAP's own frame.
+"""COLMAP models on disk: cameras, poses and points in COLMAP's frame, checked by file and entry.
 
-COLMAP's reader (pycolmap) stops at nothing in a file that is cut off, takes the name of a photograph in a text file to
-end at its first space, and reads no model without points. So files are read here, where what is wrong is said by file
-and entry; camera models and their geometry are pycolmap's (`plugin/data/lens.py`).
+pycolmap's reader accepts truncated files, ends photograph names in text files at the first space, and reads no model
+without points. So files are parsed here; camera models and their geometry are pycolmap's (`plugin/data/lens.py`).
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import math
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,16 +21,14 @@ import pycolmap
 
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.files import encoding_of
-from bitymi_ns.plugin.data.colmap import check_cameras, check_images, parameter_count, reading
-from bitymi_ns.plugin.data.ply import as_bytes, read_points
-from bitymi_ns.plugin.data.point_cloud import what_is_wrong_with
-from bitymi_ns.plugin.errors import fail, warn
+from bitymi_ns.plugin.data.point_files import color_bytes, ply_fault, read_points
+from bitymi_ns.plugin.errors import fail, listed, warn
 
 FORMS = (".txt", ".bin")
 
 
 class ModelCamera(NamedTuple):
-    """A camera of a model: the name of its camera model, the size of its pictures in pixels, and its parameters."""
+    """Camera: COLMAP camera model, width and height of its pictures in pixels, and parameters."""
 
     model: str
     width: int
@@ -39,7 +37,7 @@ class ModelCamera(NamedTuple):
 
 
 class ModelImage(NamedTuple):
-    """A photograph of a model: its name, its camera, and the rotation (wxyz) and translation of world to camera."""
+    """Photograph: name, camera, and world to camera as quaternion (wxyz) and translation."""
 
     name: str
     camera_id: int
@@ -48,30 +46,29 @@ class ModelImage(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A model.
+    """COLMAP model.
 
     Attributes:
         cameras: by number.
-        images: in the order of their names.
-        xyz: [N, 3] float64, the points.
-        rgb: [N, 3] uint8, their colours; [0, 3] where they have none.
-        without_colours: why they have none, in words that follow the name of the file; empty where they have.
+        images: sorted by name.
+        xyz: [N, 3] float64 points.
+        rgb: [N, 3] uint8 colors; [0, 3] where they have none.
+        without_colors: why they have none, in words that follow the name of the file; empty where they have.
     """
 
     cameras: dict[int, ModelCamera]
     images: list[ModelImage]
     xyz: npt.NDArray[np.float64]
     rgb: npt.NDArray[np.uint8]
-    without_colours: str = ""
+    without_colors: str = ""
 
 
 def read_model(folder: Path) -> Model:
-    """Read the model in this folder, binary or text; the text where both are there, as nerfstudio does.
-
-    Where they differ, that is said. A model is read once, also where several commands of a run ask for it.
+    """Read the model in a folder, binary or text; the text where both are there, as nerfstudio does, with a warning
+    where they differ. The last model is cached, as several commands of a run ask for it.
 
     Raises:
-        InputError: what is wrong with it, by file and entry.
+        InputError: it cannot be used; names file and entry.
     """
     names = [f"{name}{form}" for name in ("cameras", "images", "points3D") for form in FORMS]
     files = [*(folder / name for name in names), folder / "points3D.ply"]
@@ -82,96 +79,161 @@ def read_model(folder: Path) -> Model:
 @functools.lru_cache(maxsize=1)
 def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     path = _file(folder, "cameras")
-    with reading(path):
+    with _naming_file(path):
         cameras = dict(_cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path))
-    check_cameras(path, cameras)
+    _check_cameras(path, cameras)
     path = _file(folder, "images")
-    with reading(path):
+    with _naming_file(path):
         images = dict(_images_text(path) if path.suffix == ".txt" else _images_binary(path))
-    check_images(path, images, cameras)
+    _check_images(path, images, cameras)
+    _warn_of_other_form(folder, cameras, len(images))
+    path = _file(folder, "points3D")
+    xyz, rgb, without_colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
+    if path.is_file():
+        with _naming_file(path):
+            xyz, rgb, without_colors = _points_text(path) if path.suffix == ".txt" else (*_points_binary(path), "")
+            finite = np.isfinite(xyz).all(1)
+        if not finite.all():
+            warn(
+                f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, the first is point {np.argmin(finite) + 1}, are "
+                "not finite. They are left out."
+            )
+            xyz, rgb = xyz[finite], rgb[finite] if len(rgb) else rgb
+    elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
+        fault = ply_fault(cloud)
+        if fault is not None:
+            fail(f"the point cloud {cloud} {fault}. Copy it again, or move it away to have points triangulated.")
+        (xyz, rgb), without_colors = read_points(cloud)
+    # nerfstudio sorts paths, not text: so the same photographs are held out
+    return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
+
+
+def _file(folder: Path, name: str) -> Path:
+    """Choose the text or binary file. All are of one form where one is complete: a single file of the other form is of
+    another time."""
+
+    def is_complete(form: str) -> bool:
+        return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))
+
+    preferred = sorted(FORMS, key=is_complete, reverse=True)  # the text first, of two that are complete or are not
+    return next((file for form in preferred if (file := folder / f"{name}{form}").is_file()), folder / f"{name}.bin")
+
+
+def _warn_of_other_form(folder: Path, cameras: dict[int, ModelCamera], images: int) -> None:
+    """Warn where a binary model beside the text that is read differs from it."""
+    if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
+        return
+    differences = []
+    count = image_count(folder)  # of the binary one, where that is there
+    if count != images:
+        differences.append(f"{images} images in text and {count} in binary form")
+    path = folder / "cameras.bin"
+    if path.is_file():
+        with _naming_file(path):
+            if dict(_cameras_binary(path)) != cameras:
+                differences.append("other cameras in text than in binary form")
+    if differences:
+        warn(
+            f"{folder} holds two models: {' and '.join(differences)}. The text is read. To have the binary one read, "
+            "move cameras.txt, images.txt and points3D.txt away."
+        )
+
+
+@contextmanager
+def _naming_file(path: Path) -> Iterator[None]:
+    """Report errors of parsing a file by its name."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.", error)
+    except (struct.error, ValueError, LookupError, AssertionError, MemoryError, OverflowError) as error:
+        what = "is cut off or damaged" if path.suffix == ".bin" else f"has a line that cannot be read ({error})"
+        hint = " Each image has two lines; the second, of its 2D points, may be empty." * (path.name == "images.txt")
+        fail(f"{path} {what}.{hint} Copy the model again, or write it anew from COLMAP.", error)
+
+
+@functools.cache
+def parameter_count(model: str) -> int | None:
+    """Number of parameters of a COLMAP camera model; None where COLMAP has no such model."""
+    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+        return None
+    return len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params)
+
+
+def _check_cameras(path: Path, cameras: dict[int, ModelCamera]) -> None:
+    """Fail at parameters that are not finite, or not as many as the camera model has."""
+    for number, camera in cameras.items():
+        count = parameter_count(camera.model)
+        numbers = [camera.width, camera.height, *camera.params]
+        if not np.isfinite(numbers).all() or min(camera.width, camera.height) < 1:
+            written = " ".join(f"{value:g}" for value in numbers)
+            fail(
+                f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
+                "has to be positive and all numbers finite. Correct it, or write the model anew from COLMAP."
+            )
+        if count is not None and len(camera.params) != count:
+            fail(
+                f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}. "
+                "Correct its line."
+            )
+
+
+def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, ModelCamera]) -> None:
+    """Fail at images without a usable pose or camera, and at two images of one name."""
+    if not images:
+        fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path`.")
     first: dict[str, int] = {}
     for number, image in images.items():
+        if image.camera_id not in cameras:
+            fail(
+                f"{path}: image {number} ({image.name}) was taken by camera {image.camera_id}, but the model has only "
+                f"{listed(sorted(cameras))}. Correct its line, or copy the whole model again."
+            )
+        if not np.isfinite([*image.qvec, *image.tvec]).all() or not image.qvec.any():
+            fail(
+                f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its "
+                "rotation is zero. Correct its line or remove the image."
+            )
         if first.setdefault(image.name, number) != number:
             fail(
                 f"{path}: images {first[image.name]} and {number} are both of {image.name}. Correct the name of one of "
                 "them or remove it."
             )
-    _tell_other_form(folder, cameras, len(images))
-    path = _file(folder, "points3D")
-    xyz, rgb, without_colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
-    if path.is_file():
-        with reading(path):
-            xyz, rgb, without_colours = _points_text(path) if path.suffix == ".txt" else (*_points_binary(path), "")
-            kept = np.isfinite(xyz).all(1)
-        if not kept.all():
-            warn(
-                f"{path}: {np.sum(~kept):,} of {len(xyz):,} points, the first is point {np.argmin(kept) + 1}, are not "
-                "finite. They are left out."
-            )
-            xyz, rgb = xyz[kept], rgb[kept] if len(rgb) else rgb
-    elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
-        wrong = what_is_wrong_with(cloud)
-        if wrong is not None:
-            fail(f"the point cloud {cloud} {wrong}. Copy it again, or move it away to have points triangulated.")
-        (xyz, rgb), without_colours = read_points(cloud)
-    # nerfstudio sorts paths, not text: so the same photographs are held out
-    return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colours)
 
 
-def _file(folder: Path, name: str) -> Path:
-    """A file of a model. All are of one form where one is whole: a single file of the other form is of another time."""
-
-    def is_whole(form: str) -> bool:
-        return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))
-
-    preferred = sorted(FORMS, key=is_whole, reverse=True)  # the text first, of two that are whole or are not
-    return next((file for form in preferred if (file := folder / f"{name}{form}").is_file()), folder / f"{name}.bin")
-
-
-def _tell_other_form(folder: Path, cameras: dict[int, ModelCamera], images: int) -> None:
-    """Say what a binary model that is not read, because there is one in text, has that this has not."""
-    if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
-        return
-    differing = []
-    count = image_count(folder)  # of the binary one, where that is there
-    if count != images:
-        differing.append(f"{images} images in text and {count} in binary form")
-    path = folder / "cameras.bin"
-    if path.is_file():
-        with reading(path):
-            if dict(_cameras_binary(path)) != cameras:
-                differing.append("other cameras in text than in binary form")
-    if differing:
-        warn(
-            f"{folder} holds two models: {' and '.join(differing)}. The text is read. To have the binary one read, "
-            "move cameras.txt, images.txt and points3D.txt away."
-        )
+def _line_of(path: Path, number: int) -> str:
+    """Line of a text file that states this camera or image, as ", line N"; empty for a binary file."""
+    if path.suffix != ".txt":
+        return ""
+    with open(path, encoding="utf8", errors="replace") as file:
+        lines = [i for i, line in enumerate(file, 1) if line.split()[:1] == [str(number)]]
+    return f", line {lines[0]}" if lines else ""
 
 
 class _Binary:
-    """A binary file from its start to its end, neither less nor more."""
+    """Sequential reader of a binary file that fails where it has less or more than it states."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = path.read_bytes(), 0
+        self.data, self.offset = path.read_bytes(), 0
 
     def take(self, format: str) -> tuple[Any, ...]:
-        values = struct.unpack_from("<" + format, self.data, self.at)
+        values = struct.unpack_from("<" + format, self.data, self.offset)
         self.skip(struct.calcsize("<" + format))
         return values
 
     def skip(self, size: int) -> None:
-        self.at += size
-        if self.at > len(self.data):
+        self.offset += size
+        if self.offset > len(self.data):
             raise ValueError("ends too early")
 
     def name(self) -> str:
-        end = self.data.index(b"\0", self.at)
-        text = os.fsdecode(self.data[self.at : end])
-        self.skip(end + 1 - self.at)
+        end = self.data.index(b"\0", self.offset)
+        text = os.fsdecode(self.data[self.offset : end])
+        self.skip(end + 1 - self.offset)
         return text
 
     def end(self) -> None:
-        if self.at != len(self.data):
+        if self.offset != len(self.data):
             raise ValueError("has more than it states")
 
 
@@ -197,8 +259,8 @@ def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.
     file = _Binary(path)
     starts = []
     for _ in range(file.take("Q")[0]):
-        starts.append(file.at)
-        file.skip(43)  # number, position, colour, error
+        starts.append(file.offset)
+        file.skip(43)  # number, position, color, error
         file.skip(8 * file.take("Q")[0])  # track
     file.end()
     rows = np.frombuffer(file.data, np.uint8)[np.array(starts, int)[:, None] + np.arange(8, 35)]
@@ -221,7 +283,7 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, ModelCamera]]:
 
 
 def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    """The images; those of programs that leave the second line of an image out, too."""
+    """Parse images.txt, also where a program left out the second line of images."""
     number = None
     for line in _lines(path):
         if number is not None and _are_observations(line):
@@ -236,7 +298,7 @@ def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
 
 
 def _are_observations(line: str) -> bool:
-    """Whether it is the second line of an image: triples of numbers, or nothing."""
+    """Test for the second line of an image: triples of numbers, or nothing."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
@@ -245,13 +307,13 @@ def _are_observations(line: str) -> bool:
 
 
 def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], str]:
-    """Positions, colours, and why there are none."""
+    """Parse points3D.txt: positions, colors, and why it has no colors."""
     rows = [[float(word) for word in line.split(maxsplit=7)[1:7]] for line in _lines(path) if line]
     counts = {len(row) for row in rows}
     if not counts <= {3, 6} or len(counts) > 1:
-        raise ValueError("a point has a number, three coordinates and three colours")
+        raise ValueError("a point has a number, three coordinates and three colors")
     values = np.array(rows).reshape(len(rows), -1)
     if values.shape[1] < 6:
         return values[:, :3].reshape(-1, 3), np.zeros((0, 3), np.uint8), "its points have none" * bool(rows)
-    rgb = as_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))
+    rgb = color_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))
     return (values[:, :3], np.zeros((0, 3), np.uint8), rgb) if isinstance(rgb, str) else (values[:, :3], rgb, "")

@@ -1,86 +1,139 @@
-"""Photographs and masks as files: read by their bit depth, and what of them there is to learn from."""
+"""Image files of a capture: photographs and masks by their bit depth, sizes and EXIF from headers, blank and duplicate
+photographs."""
 
 from __future__ import annotations
 
 import hashlib
+import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
-from bitymi_ns.capture.masks import counted, has_transparency
+from bitymi_ns.capture.exif import exposure_settings
+from bitymi_ns.capture.masks import has_transparency, mask_pixels
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.train.exposure import exif_stops
 
 T = TypeVar("T")
 ORIENTATION = 0x0112
-"""The EXIF tag that asks viewers to turn a photograph; 1 = as it is stored."""
-MOST_PIXELS = 1_000_000_000
+"""EXIF tag that asks viewers to turn a photograph; 1 = as it is stored."""
+MAX_PIXELS = 1_000_000_000
 """Photographs with more pixels are refused; phones take some of 200 million."""
 THREADS = 4
-FINGERPRINT = 64
-"""Pixels across, and down, that decide whether two photographs are the same."""
-
-
-def of_header(path: Path, look: Callable[[Image.Image], T], otherwise: T) -> T:
-    """What a look at a photograph's header says, its pixels unread.
-
-    Args:
-        path: of the file.
-        look: gets the opened file.
-        otherwise: the result where there is nothing to read; what is wrong with a file is said where it is read.
-    """
-    try:
-        with open_picture(path) as image:
-            return look(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return otherwise
+FINGERPRINT_SIZE = 64
+"""Pixels across, and down, by which photographs are compared."""
+UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 def set_up_pillow() -> None:
-    """Raise the number of pixels from which Pillow takes a file for an attack, which is 179 million; and have it start
-    no Ghostscript, in nerfstudio's readers either, for a file that is PostScript whatever its name says."""
+    """Raise Pillow's pixel limit from 179 million to MAX_PIXELS, and keep it, in nerfstudio's readers too, from running
+    Ghostscript on files that are PostScript whatever their name."""
     EpsImagePlugin.gs_binary = False
-    Image.MAX_IMAGE_PIXELS = MOST_PIXELS // 2  # PIL refuses twice as many
+    Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
+
+
+def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
+    """Apply `read` to an opened image whose pixels are not decoded; `default` for files that cannot be opened."""
+    try:
+        with open_picture(path) as image:
+            return read(image)
+    except UNREADABLE:
+        return default
+
+
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Read width and height from the header; None for files that cannot be opened."""
+    return from_header(path, lambda image: image.size, None)
+
+
+def file_has_transparency(path: Path) -> bool:
+    """Read from the header if the image has transparency; False for files that cannot be opened."""
+    return from_header(path, has_transparency, False)
+
+
+def orientation(path: Path) -> int:
+    """Read the EXIF orientation, 1 to 8; 1 where there is none."""
+
+    def read(image: Image.Image) -> int:
+        if image.format == "PNG" and "exif" not in image.info:
+            return 1  # else PIL would decode the whole image in search of it
+        return image.getexif().get(ORIENTATION, 1)
+
+    value = from_header(path, read, 1)
+    return value if value in range(1, 9) else 1
+
+
+def exposure_stops(paths: Sequence[Path]) -> list[float]:
+    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN where unknown.
+
+    A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has counts as equal for
+    all. Photographs that lack what most have cannot be compared with these, and are NaN.
+    """
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = list(pool.map(lambda path: from_header(path, exposure_settings, None), paths))
+    kinds = Counter(tuple(value is not None for value in each) for each in found if each is not None)
+    if not kinds:
+        return [math.nan] * len(paths)
+    usual = kinds.most_common(1)[0][0]
+    return [
+        math.nan
+        if each is None or tuple(value is not None for value in each) != usual
+        else exif_stops(*(value or 1.0 for value in each))
+        for each in found
+    ]
 
 
 def check_sizes(paths: Sequence[Path]) -> None:
-    """Stop at photographs that are too large to be meant, of which only the headers are read."""
+    """Fail at photographs with more than MAX_PIXELS, by their headers."""
+
+    def too_large(path: Path) -> bool:
+        try:
+            with open_picture(path):
+                return False
+        except Image.DecompressionBombError:
+            return True
+        except (OSError, SyntaxError, ValueError):
+            return False  # other faults are reported where the file is read
+
     with ThreadPoolExecutor(THREADS) as pool:
-        large = [path for path, too_large in zip(paths, pool.map(_is_too_large, paths), strict=True) if too_large]
+        large = [path for path, refused in zip(paths, pool.map(too_large, paths), strict=True) if refused]
     if large:
         fail(
-            f"{listed(large)} has more than {MOST_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy "
+            f"{listed(large)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy "
             "of its camera with it."
         )
 
 
-def _is_too_large(path: Path) -> bool:
-    try:
-        with open_picture(path):
-            return False
-    except Image.DecompressionBombError:
-        return True
-    except (OSError, SyntaxError, ValueError):
-        return False  # what else is wrong is said where it is read
+def check_orientation(paths: Sequence[Path]) -> None:
+    """Warn of photographs with an EXIF orientation: they are used as they are stored."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        turned = [path for path, value in zip(paths, pool.map(orientation, paths), strict=True) if value != 1]
+    if turned:
+        warn(
+            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "
+            "as COLMAP and nerfstudio do. If the pose was made from the turned picture, write the turn into the pixels "
+            "(`mogrify -auto-orient <photos>`)."
+        )
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """The photograph with 8 bits per channel, RGB or, where it has transparency, RGBA.
+    """Read a photograph as 8-bit sRGB, mode RGB or, where it has transparency, RGBA.
 
-    PIL's own conversion clips what has more bits: a grey picture of 16 bits would come out white. Colours are those of
-    screens; see `in_srgb`.
+    Deep grey images are scaled to 8 bits, where PIL would clip them to white.
 
     Args:
-        path: of the file.
+        path: image file.
         stored: width and height that it must have; None = any.
-        wanted: width and height to which it will be reduced. A JPEG file may then be decoded at a half, a quarter or an
-            eighth of its size, but no smaller than this; that takes a fraction of the time and memory.
+        wanted: width and height to which it will be downscaled. A JPEG may then be decoded at a half, a quarter or an
+            eighth of its size, but no smaller than this.
 
     Raises:
         InputError: it is missing, cannot be read, or has another size.
@@ -95,58 +148,29 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             return picture.convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except UNREADABLE as error:
         fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
 
 
 def read_mask(path: Path) -> Image.Image:
-    """The mask as one channel of truth values; see `counted`."""
+    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`."""
     try:
         with open_picture(path) as file:
-            return Image.fromarray(counted(file))
+            return Image.fromarray(mask_pixels(file))
     except FileNotFoundError as error:
         fail(f"the mask {path} is missing", error)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except UNREADABLE as error:
         fail(f"the mask {path} cannot be read: {error}. Replace it, or remove the masks from the capture.", error)
 
 
-def file_has_transparency(path: Path) -> bool:
-    """The same for a file, of which only the header is read; False when there is none to read."""
-    return of_header(path, has_transparency, False)
-
-
-def orientation(path: Path) -> int:
-    """How the file asks viewers to turn it, by its EXIF tag; 1 = not at all, also where there is none to read."""
-
-    def look(image: Image.Image) -> int:
-        if image.format == "PNG" and "exif" not in image.info:
-            return 1  # else PIL would decode the whole image in search of it
-        return image.getexif().get(ORIENTATION, 1)
-
-    value = of_header(path, look, 1)
-    return value if value in range(1, 9) else 1
-
-
-def check_orientation(paths: Sequence[Path]) -> None:
-    """Say which photographs ask to be turned: they are used as they are stored."""
+def blank_masks(paths: Sequence[Path]) -> list[int]:
+    """Indices of the masks that exclude every pixel."""
     with ThreadPoolExecutor(THREADS) as pool:
-        turned = [path for path, value in zip(paths, pool.map(orientation, paths), strict=True) if value != 1]
-    if turned:
-        warn(
-            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "
-            "as COLMAP and nerfstudio do. If the pose was made from the turned picture, write the turn into the pixels "
-            "(`mogrify -auto-orient <photos>`)."
-        )
+        return [i for i, box in enumerate(pool.map(lambda path: read_mask(path).getbbox(), paths)) if box is None]
 
 
 def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
-    """Why a photograph does not fit its camera, and what to do.
-
-    Args:
-        path: the photograph.
-        size: its width and height in pixels.
-        declared: those of its camera.
-    """
+    """Message for an image whose `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"
     if size == declared[::-1] and orientation(path) >= 5:
         return (
@@ -159,35 +183,25 @@ def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> 
     )
 
 
-def masks_without_pixels(paths: Sequence[Path]) -> list[int]:
-    """Which of the masks let no pixel count."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        return [i for i, box in enumerate(pool.map(lambda path: read_mask(path).getbbox(), paths)) if box is None]
-
-
-class Note(NamedTuple):
-    """What is remembered of a photograph once it has been read.
-
-    Attributes:
-        empty: why there is nothing to learn from it; "" where there is.
-        fingerprint: equal for photographs with the same pixels.
-    """
+class ImageSummary(NamedTuple):
+    """Kept of a photograph once it has been read: why nothing can be learned from it ("" = something can), and a
+    fingerprint that is equal for equal pixels."""
 
     empty: str
     fingerprint: bytes
 
 
-def note(image: npt.NDArray[np.uint8]) -> Note:
-    """The note on a photograph [H, W, 3 or 4]."""
+def summarize(image: npt.NDArray[np.uint8]) -> ImageSummary:
+    """Summarize a photograph [H, W, 3 or 4]."""
     height, width = image.shape[:2]
-    sample = image[:: max(1, height // FINGERPRINT), :: max(1, width // FINGERPRINT)]
+    sample = image[:: max(1, height // FINGERPRINT_SIZE), :: max(1, width // FINGERPRINT_SIZE)]
     fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()
     empty = ""
     if _transparent(sample) and _transparent(image):
         empty = "transparent everywhere"
     elif _plain(sample) and _plain(image):
-        empty = "of one colour throughout"
-    return Note(empty, fingerprint)
+        empty = "of one color throughout"
+    return ImageSummary(empty, fingerprint)
 
 
 def _transparent(image: npt.NDArray[np.uint8]) -> bool:
@@ -196,3 +210,45 @@ def _transparent(image: npt.NDArray[np.uint8]) -> bool:
 
 def _plain(image: npt.NDArray[np.uint8]) -> bool:
     return bool((image == image[0, 0]).all())
+
+
+Pair = tuple[int, int]
+"""Index of a training photograph, and of a held-out one."""
+
+
+def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
+    """Pairs of files with the same bytes. Only files of equal size are read."""
+    sizes = [[path.stat().st_size for path in paths] for paths in (train, held_out)]
+    shared = set(sizes[0]) & set(sizes[1])
+    contents = [
+        [_digest(path) if size in shared else path for path, size in zip(paths, of, strict=True)]
+        for paths, of in zip((train, held_out), sizes, strict=True)
+    ]
+    return duplicates(*contents)
+
+
+def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
+    """Pairs of equal items, each held-out one with the first of its equals; None equals nothing."""
+    first: dict[Any, int] = {}
+    for i, content in enumerate(train):
+        first.setdefault(content, i)
+    return [(first[content], j) for j, content in enumerate(held_out) if content is not None and content in first]
+
+
+def _digest(path: Path) -> bytes:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.digest()
+
+
+def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:
+    """Warn of held-out photographs that are trained on, unless all views are used for both on request."""
+    if not pairs or list(train) == list(held_out):
+        return
+    named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
+    warn(
+        f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. Figures on them "
+        "say nothing about new views: remove the duplicates from the capture."
+    )

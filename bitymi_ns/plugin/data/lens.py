@@ -1,4 +1,4 @@
-"""Lenses of photographs: pictures of a pinhole camera out of what COLMAP's camera models describe."""
+"""Lens distortion: turn photographs of any COLMAP or nerfstudio camera model into pictures of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -12,31 +12,33 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.panorama import PANORAMAS
-from bitymi_ns.plugin.data.cameras import LITTLE_LEFT, NOTHING_LEFT
 from bitymi_ns.plugin.data.images import wrong_size
 from bitymi_ns.plugin.errors import fail, warn
 
-WIDEST = 110.0
-"""Degrees that a pinhole picture of a photograph spans at most, across and down. Beyond, a picture grows fast and shows
-little: each further degree takes more pixels, out of ever fewer of the photograph."""
-STEP = 4
-"""Pixels between the points at which a lens is evaluated; between them its distortion is linear to far less than a
-pixel."""
-ALONG = 32
-"""Points along a ray on which a lens must not fold the picture."""
-AROUND = 64
-"""Rays to each edge of a picture on which that is tested."""
-MAPS = 4
-"""Lenses whose maps are kept; one of 12 million pixels takes 72 MB."""
+MAX_VIEW_ANGLE = 110.0
+"""Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on
+ever less of the photograph."""
+NODE_STEP = 4
+"""Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
+less than a pixel."""
+RADIAL_SAMPLES = 32
+"""Samples along a ray for testing that the distortion does not fold the picture."""
+EDGE_SAMPLES = 64
+"""Rays per picture edge for the same test."""
+CACHED_MAPS = 4
+"""Lenses whose remapping tables are cached; 72 MB for 12 megapixels."""
+DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05
+"""Share of a photograph's area that undistorting leaves, below which to warn or to fail."""
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole camera, in pixels; the upper left corner of a picture is at (0, 0)."""
+    """Pinhole camera in pixels, with (0, 0) at the upper left corner of the picture."""
 
     fx: float
     fy: float
@@ -47,7 +49,7 @@ class Pinhole:
 
     @property
     def view(self) -> tuple[float, float]:
-        """Degrees that its picture spans across and down."""
+        """Horizontal and vertical view angle, degrees."""
         across = math.atan(self.cx / self.fx) + math.atan((self.width - self.cx) / self.fx)
         down = math.atan(self.cy / self.fy) + math.atan((self.height - self.cy) / self.fy)
         return math.degrees(across), math.degrees(down)
@@ -55,14 +57,14 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Lens:
-    """How a photograph becomes the picture of a pinhole camera.
+    """Maps a photograph to the picture of a pinhole camera.
 
     Attributes:
-        model: camera model of COLMAP.
+        model: COLMAP camera model.
         params: its parameters, for pictures of `size`.
-        size: width and height to which a photograph is reduced first.
-        stored: width and height of the photograph in its file.
-        pinhole: the camera of the result.
+        size: width and height to which a photograph is downscaled first.
+        stored: width and height of the image file.
+        pinhole: camera of the result.
     """
 
     model: str
@@ -73,12 +75,11 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether pixels move."""
+        """True if undistorting moves pixels."""
         return _distorts(_camera(self))
 
-    def picture(self, image: Image.Image) -> Image.Image:
-        """The pinhole picture of a photograph, of any 8-bit mode; it may have been decoded to a smaller size than that
-        of its file, but not below `size`."""
+    def undistort(self, image: Image.Image) -> Image.Image:
+        """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below `size`."""
         if image.size != self.size:
             image = image.resize(self.size, Image.Resampling.BOX)
         if not self.distorts:
@@ -86,9 +87,9 @@ class Lens:
         pixels = cv2.remap(np.asarray(image), *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return Image.fromarray(pixels, image.mode)
 
-    def mask(self, mask: Image.Image, path: Path) -> Image.Image:
-        """The same for a mask: pixels count where the nearest of the photograph does. It may have another size, as that
-        of a photograph that was reduced, but not other proportions."""
+    def undistort_mask(self, mask: Image.Image, path: Path) -> Image.Image:
+        """Undistort a mask by nearest neighbors. It may have another size than the photograph, but not another aspect
+        ratio; `path` is for the message."""
         if not in_proportion(mask.size, self.stored):
             fail(wrong_size(path, mask.size, self.stored))
         pixels = np.asarray(mask.resize(self.size, Image.Resampling.NEAREST)).astype(np.uint8)
@@ -96,38 +97,37 @@ class Lens:
             pixels = cv2.remap(pixels, *_maps(self), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return Image.fromarray(pixels.astype(bool))
 
-    def reduced(self, factor: float) -> Lens:
-        """The same lens for pictures that are smaller by a factor."""
+    def downscaled(self, factor: float) -> Lens:
+        """Return the same lens for pictures scaled by `factor`."""
         width, height = (max(1, round(side * factor)) for side in self.size)
-        return lens(
-            self.model, rescaled(self.model, self.params, self.size, (width, height)), width, height, self.stored, ""
-        )[0]
+        params = rescaled(self.model, self.params, self.size, (width, height))
+        return make_lens(self.model, params, width, height, self.stored, "")[0]
 
 
-def lens(
-    model: str, params: tuple[float, ...], width: int, height: int, stored: tuple[int, int], whose: str
+def make_lens(
+    model: str, params: tuple[float, ...], width: int, height: int, stored: tuple[int, int], label: str
 ) -> tuple[Lens, list[str]]:
-    """The lens of a camera.
+    """Choose the pinhole camera for a camera model.
 
     Args:
-        model: camera model of COLMAP.
+        model: COLMAP camera model.
         params: its parameters, for pictures of `width` x `height`.
-        stored: width and height of the photographs in their files, which may be larger.
-        whose: the camera or its photographs, for messages.
+        stored: width and height of the image files, which may be larger.
+        label: names the camera in messages.
 
     Returns:
-        the lens, and sentences on what is lost with it.
+        the lens, and messages on what is lost with it.
 
     Raises:
-        InputError: the camera cannot be used; says why.
+        InputError: the camera cannot be used.
     """
     camera = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     if camera.is_spherical():
-        fail(f"{whose} is {model}. {PANORAMAS}")
+        fail(f"{label} is {model}. {PANORAMAS}")
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
-            f"{whose} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used: its size and focal "
+            f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used: its size and focal "
             "lengths have to be positive and all parameters finite. Correct it, or write the model anew from COLMAP."
         )
     center = (camera.principal_point_x, camera.principal_point_y)
@@ -137,33 +137,65 @@ def lens(
     left, right, top, bottom = _window(camera)
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
-    if share < NOTHING_LEFT or min(w, h) < 1:
+    if share < ABSURD_AREA or min(w, h) < 1:
         fail(
-            f"the lens distortion of {whose} is absurd: with {model} {camera.params_to_string()} undistorting would "
+            f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting would "
             f"leave {100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler model "
             "(SIMPLE_RADIAL)."
         )
-    if share < LITTLE_LEFT:
-        warn(f"Undistorting leaves only {100.0 * share:.2g} % of {whose}. The lens distortion may be wrong.")
+    if share < DOUBTFUL_AREA:
+        warn(f"Undistorting leaves only {100.0 * share:.2g} % of {label}. The lens distortion may be wrong.")
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
-    told = []
-    if camera.is_perspective_fisheye() or max(pinhole.view) > WIDEST - 0.5:
+    messages = []
+    if camera.is_perspective_fisheye() or max(pinhole.view) > MAX_VIEW_ANGLE - 0.5:
         across, down = pinhole.view
-        told.append(
-            f"{whose} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
+        messages.append(
+            f"{label} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
             f"({w} x {h} pixels); what they show beyond is not used."
         )
-    return Lens(model, params, (width, height), stored, pinhole), told
+    return Lens(model, params, (width, height), stored, pinhole), messages
+
+
+def colmap_distortion(kind: CameraType, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
+    """Convert nerfstudio's camera type and distortion_params (k1, k2, k3, k4, p1, p2; FISHEYE624: 12) to COLMAP's.
+
+    Returns:
+        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy.
+
+    Raises:
+        InputError: there is no such COLMAP camera.
+    """
+    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624):
+        hint = PANORAMAS if kind == CameraType.EQUIRECTANGULAR else "Correct the capture."
+        fail(
+            f"the camera {label} cannot be used: it is neither a perspective nor a fisheye camera, which are the kinds "
+            f"that can be trained on, but {kind.name}. {hint}"
+        )
+    counts, needs = {
+        CameraType.PERSPECTIVE: ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
+        CameraType.FISHEYE: ((4, 6), "fisheye cameras need four: k1, k2, k3, k4"),
+        CameraType.FISHEYE624: ((12,), "FISHEYE624 needs twelve"),
+    }[kind]
+    if len(values) not in counts:
+        fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
+    if kind == CameraType.FISHEYE624:
+        return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(values)
+    if kind == CameraType.FISHEYE:
+        return "OPENCV_FISHEYE", tuple(values[:4])
+    k1, k2, k3, k4, p1, p2 = values
+    if k4 != 0.0:
+        fail(
+            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras are undistorted by k1, k2, "
+            "k3, p1 and p2 alone. For a fisheye write camera_model OPENCV_FISHEYE; else undistort the photographs "
+            "first (COLMAP's image_undistorter)."
+        )
+    if k3 != 0.0:
+        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
 
 
 def rescaled(model: str, params: Sequence[float], size: tuple[int, int], new: tuple[int, int]) -> tuple[float, ...]:
-    """The parameters of a camera for pictures of another size.
-
-    Args:
-        model: camera model of COLMAP.
-        params: its parameters, for pictures of `size`, width and height.
-        new: width and height.
-    """
+    """Rescale the parameters of a COLMAP camera from pictures of `size` (width, height) to pictures of `new`."""
     if new == size:
         return tuple(params)
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
@@ -176,35 +208,35 @@ def _camera(lens: Lens) -> pycolmap.Camera:
 
 
 def _distorts(camera: pycolmap.Camera) -> bool:
-    # pycolmap's test looks at the coefficients alone, of which fisheye models need none
+    # pycolmap tests the coefficients alone, of which fisheye models need none
     return camera.is_perspective_fisheye() or not camera.is_undistorted()
 
 
 def _window(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
-    """How far a pinhole picture can reach to the left, right, top and bottom of the axis, in focal lengths.
+    """Largest extent of the pinhole picture to the left, right, top and bottom of the axis, in focal lengths.
 
     It shows nothing that the photograph does not: neither beyond its edges, nor where the model folds the picture. Each
-    side reaches as far as it can on its own, then all are scaled until the corners fit, too.
+    side is maximized on its own, then all are scaled until the corners fit, too.
     """
-    most = math.tan(math.radians(0.5 * WIDEST))
+    most = math.tan(math.radians(0.5 * MAX_VIEW_ANGLE))
     reach = np.zeros(4)
     for side, direction in enumerate(((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))):
         reach[side] = most * _largest(lambda s, d=direction: _is_seen(camera, s * most * np.array([d])))
 
-    def window(scale: float) -> npt.NDArray[np.float64]:
+    def border(scale: float) -> npt.NDArray[np.float64]:
         left, right, top, bottom = scale * reach
-        t = np.linspace(0.0, 1.0, AROUND)
+        t = np.linspace(0.0, 1.0, EDGE_SAMPLES)
         x, y = -left + t * (left + right), -top + t * (top + bottom)
-        edges = [(x, np.full(AROUND, -top)), (x, np.full(AROUND, bottom))]
-        edges += [(np.full(AROUND, -left), y), (np.full(AROUND, right), y)]
+        edges = [(x, np.full_like(t, -top)), (x, np.full_like(t, bottom))]
+        edges += [(np.full_like(t, -left), y), (np.full_like(t, right), y)]
         return np.concatenate([np.stack(edge, -1) for edge in edges])
 
-    left, right, top, bottom = reach * _largest(lambda s: _is_seen(camera, window(s)))
+    left, right, top, bottom = reach * _largest(lambda s: _is_seen(camera, border(s)))
     return left, right, top, bottom
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """The largest number of [0, 1] for which a condition holds that holds for all smaller ones."""
+    """Bisect for the largest number in [0, 1] that fits, where all smaller ones fit."""
     if fits(1.0):
         return 1.0
     low, high = 0.0, 1.0
@@ -215,10 +247,10 @@ def _largest(fits: Callable[[float], bool]) -> float:
 
 
 def _is_seen(camera: pycolmap.Camera, rays: npt.NDArray[np.float64]) -> bool:
-    """Whether the photograph shows all rays (x, y, 1) [N, 2], and on the way to each moves outwards all the time."""
-    t = np.linspace(0.0, 1.0, ALONG + 1)[1:]
+    """Test that the photograph shows all rays (x, y, 1), [N, 2], and that pixels move outwards along each of them."""
+    t = np.linspace(0.0, 1.0, RADIAL_SAMPLES + 1)[1:]
     points = (t[:, None, None] * rays).reshape(-1, 2)
-    pixels = camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], 1)).reshape(ALONG, -1, 2)
+    pixels = camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], 1)).reshape(len(t), -1, 2)
     if not np.isfinite(pixels).all():
         return False
     inside = (pixels >= 0.0).all() and (pixels <= (camera.width, camera.height)).all()
@@ -226,15 +258,15 @@ def _is_seen(camera: pycolmap.Camera, rays: npt.NDArray[np.float64]) -> bool:
     return bool(inside and (np.diff(away, axis=0) > 0.0).all())
 
 
-@lru_cache(maxsize=MAPS)
+@lru_cache(maxsize=CACHED_MAPS)
 def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
-    """For each pixel of the result where it lies in the photograph, as cv2.remap takes it."""
+    """Position in the photograph of each pixel of the result, as fixed-point maps for cv2.remap."""
     to = lens.pinhole
-    x, y = (np.arange(0, size + STEP, STEP) + 0.5 for size in (to.width, to.height))
+    x, y = (np.arange(0, size + NODE_STEP, NODE_STEP) + 0.5 for size in (to.width, to.height))
     rays = np.stack(np.meshgrid((x - to.cx) / to.fx, (y - to.cy) / to.fy), -1).reshape(-1, 2)
     nodes = _camera(lens).img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1)) - 0.5
     nodes = nodes.reshape(len(y), len(x), 2).astype(np.float32)
-    scale = np.array([[1.0 / STEP, 0.0, 0.0], [0.0, 1.0 / STEP, 0.0]])
+    scale = np.array([[1.0 / NODE_STEP, 0.0, 0.0], [0.0, 1.0 / NODE_STEP, 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     whole = cv2.warpAffine(nodes, scale, (to.width, to.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return cv2.convertMaps(whole, None, cv2.CV_16SC2)

@@ -1,4 +1,4 @@
-"""Files by the names that a capture's files give them, also where these were written on another machine."""
+"""Find files by the names in a capture's metadata, also where these were written on another machine."""
 
 from __future__ import annotations
 
@@ -16,54 +16,53 @@ from bitymi_ns.plugin.errors import listed
 from bitymi_ns.trust import leads_inside
 
 Parts = tuple[str, ...]
-"""Of a name: its folders and the file, folded: of one case and one form of Unicode."""
+"""Folders and file of a name, folded to one case and one Unicode form."""
 _DRIVE = re.compile(r"^[A-Za-z]:")
 
 
 def folded(name: str) -> Parts:
-    """A name without what differs between machines: separators, case, the form of Unicode, `.` and a drive."""
+    """Remove from a name what differs between machines: separators, case, Unicode form, `.` and a drive."""
     portable = _DRIVE.sub("", name).replace("\\", "/")
     plain = unicodedata.normalize("NFC", os.path.normpath(portable)).casefold()
     return tuple(part for part in plain.split("/") if part not in ("", "."))
 
 
-def without_ending(parts: Parts) -> Parts:
-    """A folded name without the ending of a picture."""
+def without_extension(parts: Parts) -> Parts:
+    """Remove the extension of an image from a folded name."""
     stem, ending = os.path.splitext(parts[-1])
     return (*parts[:-1], stem if ending in PHOTOGRAPHS else parts[-1])
 
 
-class Files:
-    """The files below a folder, found by names that may differ in what machines and programs change.
+class FileFinder:
+    """Finds files below a folder by names that may differ in what machines and programs change.
 
-    In this order: the name itself; with other separators, case, Unicode or leading folders, as in absolute names of
-    another machine; also with another ending, or none. Only what is unambiguous is found.
+    In this order: the exact name; other separators, case, Unicode form or leading folders, as in absolute names of
+    another machine; another extension, or none. Only unambiguous files are found.
 
     Args:
         folder: to which the names are relative.
-        outside: names may lead out of the folder; else only files in it are found.
-        endings: of the files, in lower case.
+        outside: names may lead out of the folder.
+        extensions: of the files, in lower case.
     """
 
-    def __init__(self, folder: Path, outside: bool = False, endings: tuple[str, ...] = PHOTOGRAPHS) -> None:
+    def __init__(self, folder: Path, outside: bool = False, extensions: tuple[str, ...] = PHOTOGRAPHS) -> None:
         self.folder = folder
         self.outside = outside
-        self.endings = endings
+        self.extensions = extensions
 
     def find(self, name: str) -> Path | None:
-        """The file of a name; None = there is none, or more than one."""
+        """Find one file; None = there is none, or more than one."""
         for exact in (name, name.replace("\\", "/")):
-            if self.may_be(exact) and (self.folder / exact).is_file():
+            if self._allowed(exact) and (self.folder / exact).is_file():
                 return self.folder / exact
         parts = folded(name)
         if not parts:
             return None
-        other = (parts, without_ending(parts))  # one more than it has, or another one
-        return self._like(parts) or next(filter(None, (self._like(each, endings=True) for each in other)), None)
+        stems = (parts, without_extension(parts))  # the name lacks an extension, or has another one
+        return self._match(parts, self._whole) or next(filter(None, (self._match(p, self._stems) for p in stems)), None)
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
-        """The files of several names. A file that would be that of two of them is that of the one it has the name of,
-        or of none."""
+        """Find the files of several names. A file that fits two of them is that of the exact name, or of none."""
         found = [self.find(name) for name in names]
         users: dict[Path, list[int]] = defaultdict(list)
         for i, path in enumerate(found):
@@ -77,24 +76,23 @@ class Files:
                         found[i] = None
         return found
 
-    def may_be(self, name: str) -> bool:
-        """Whether a file may be looked for under this very name."""
+    def _allowed(self, name: str) -> bool:
         return self.outside or leads_inside(name)
 
     def missing(self, name: str) -> Path:
-        """Where a file that was not found is said to be missing."""
-        if self.may_be(name):
+        """Path to show for a file that was not found."""
+        if self._allowed(name):
             return self.folder / name
         parts = PurePosixPath(name.replace("\\", "/").replace("\0", "_")).parts
         return self.folder.joinpath(*("_" if part in ("/", "//", "..") else part for part in parts))
 
     def ambiguous(self, name: str) -> list[str]:
-        """The files that a name without its ending may mean, where they are several."""
-        files = self._stems.get(without_ending(folded(name)), [])
+        """Files that a name without extension may mean, where there are several."""
+        files = self._stems.get(without_extension(folded(name)), [])
         return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
 
     def nearest(self, name: str) -> str:
-        """Words on a file whose name is nearly this one, and what differs; empty where there is none."""
+        """Describe a file with a similar name, as "but there is ..."; empty where there is none."""
         wanted = folded(name)[-1:]
         last = {parts[-1]: files[0] for parts, files in self._whole.items()}
         near = difflib.get_close_matches(wanted[0] if wanted else "", last, n=1, cutoff=0.8)
@@ -104,8 +102,7 @@ class Files:
         same = there.isascii() and name.isascii()
         return f"but there is {there}" if same else f"but there is {there}, {ascii(there)}, instead of {ascii(name)}"
 
-    def _like(self, parts: Parts, endings: bool = False) -> Path | None:
-        table = self._stems if endings else self._whole
+    def _match(self, parts: Parts, table: dict[Parts, list[Path]]) -> Path | None:
         for start in range(len(parts)):  # the whole name first, then without its leading folders
             files = table.get(parts[start:], [])
             if files:
@@ -124,18 +121,18 @@ class Files:
     def _stems(self) -> dict[Parts, list[Path]]:
         table: dict[Parts, list[Path]] = defaultdict(list)
         for parts, files in self._whole.items():
-            table[without_ending(parts)] += files
+            table[without_extension(parts)] += files
         return dict(table)
 
     def _walk(self) -> Iterator[Path]:
         for folder, below, files in os.walk(self.folder):
             below[:] = [name for name in below if not name.startswith(".")]
-            yield from (Path(folder, name) for name in files if name.lower().endswith(self.endings))
+            yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
 
 
-def renamed(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
-    """A sentence on the files that were found under another name; empty where none was. Names without their ending are
-    usual, and so are either separators."""
+def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
+    """Describe the files that were found under another name; empty where none was. Names without extension are usual,
+    and so are either separators."""
 
     def is_usual(name: str, file: Path) -> bool:
         plain = Path(os.path.normpath(folder / name.replace("\\", "/")))

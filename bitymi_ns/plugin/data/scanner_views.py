@@ -1,5 +1,5 @@
-"""Photographs, cameras and poses as scanning programs and RGB-D sets write them: Polycam's raw folder, Record3D's, and
-folders of colour pictures with a text file of each pose, as ScanNet and 7-Scenes have them."""
+"""Photographs of scanning programs and RGB-D sets: Polycam's raw folder, Record3D's, and folders of color images with a
+text file per pose (ScanNet, 7-Scenes)."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ import numpy.typing as npt
 from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
+from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import rescaled
-from bitymi_ns.plugin.data.poses import rotations
-from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, size_of
+from bitymi_ns.plugin.data.pose_checks import rotations
+from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
 from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.trust import json_of
 
 Row = tuple[Path, npt.NDArray[np.float64], tuple[float, ...], tuple[int, int] | None]
-"""A photograph, its pose [4, 4] with nerfstudio's axes, fx, fy, cx, cy, and the size these are for; None = its own."""
+"""Image file, pose [4, 4] in nerfstudio's axes, (fx, fy, cx, cy), and the size these are for; None = the file's."""
 Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""From ARKit's world, in which y is up, to one in which z is."""
+"""ARKit's world, in which y is up, to one with z up."""
 
 
-def scanned(found: Found, look: bool) -> list[Photograph]:
-    """The photographs of such a capture, with cameras and poses, in the order of their names.
+def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
+    """Read the photographs of such a capture, with cameras and poses, in the order of their names.
 
     Args:
         found: of the format polycam, record3d or pose-files.
-        look: the photographs are needed; else they may be missing.
+        need_photos: False = photographs may be missing.
 
     Raises:
         InputError: a file is damaged, or photographs are missing.
@@ -49,15 +50,15 @@ def scanned(found: Found, look: bool) -> list[Photograph]:
     if len(rows) < 2:
         fail(f"{found.path}, read as {found.format}, has {len(rows)} photographs with poses: a scene needs many.")
     missing = [path for path, *_ in rows if not path.is_file()]
-    if look and missing:
+    if need_photos and missing:
         fail(f"{len(missing)} of {len(rows)} photographs of {found.path} are missing: {listed(missing)}.")
     files = [path for path, *_ in rows]
     parts = rotations(np.stack([pose[:3, :3] for _, pose, *_ in rows]), [file.name for file in files], str(found.path))
     result = []
-    for (path, pose, pinhole, stated), turn in zip(rows, parts, strict=True):
+    for (path, pose, pinhole, stated), rotation in zip(rows, parts, strict=True):
         pose = pose.copy()
-        pose[:3, :3] = turn
-        size = size_of(path) or stated or (1, 1)
+        pose[:3, :3] = rotation
+        size = image_size(path) or stated or (1, 1)
         if stated is not None and stated != size:
             if abs(stated[0] / stated[1] / (size[0] / size[1]) - 1.0) > 0.02:
                 fail(
@@ -70,7 +71,7 @@ def scanned(found: Found, look: bool) -> list[Photograph]:
 
 
 def _polycam(folder: Path) -> list[Row]:
-    """Its cameras as it corrected them, where it did, with the pictures that belong to these."""
+    """Read Polycam's cameras, the corrected ones and their images where there are such."""
     keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     images, cameras = next((keyframes / i, keyframes / c) for i, c in POLYCAM if (keyframes / c).is_dir())
     rows: list[Row] = []
@@ -82,39 +83,38 @@ def _polycam(folder: Path) -> list[Row]:
             (file for file in images.glob(f"{path.stem}.*") if is_photograph(file)), images / f"{path.stem}.jpg"
         )
         size = (int(values["width"]), int(values["height"]))
-        rows.append((file, Y_UP @ pose, _numbers(values, ("fx", "fy", "cx", "cy")), size))
+        rows.append((file, Y_UP @ pose, tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy")), size))
     return rows
 
 
 def _record3d(folder: Path) -> list[Row]:
-    """Its metadata file: a camera for all, or one for each, and poses as quaternions xyzw and positions."""
+    """Read Record3D's metadata: one camera or one per image, and poses as quaternions xyzw and positions."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     path = folder / "metadata" if (folder / "metadata").is_file() else folder / "metadata.json"
     values = json_of(path.read_bytes())
     K, size = [float(x) for x in values["K"]], (int(values["w"]), int(values["h"]))
     own: Sequence[Any] = values.get("perFrameIntrinsicCoeffs") or ()
-    place = next((folder / name for name in ("rgb", "rgbd", "images") if (folder / name).is_dir()), folder)
-    files = {file.stem: file for file in place.iterdir() if is_photograph(file)}
+    images = next((folder / name for name in ("rgb", "rgbd", "images") if (folder / name).is_dir()), folder)
+    files = {file.stem: file for file in images.iterdir() if is_photograph(file)}
     rows: list[Row] = []
     for i, each in enumerate(values["poses"]):
         numbers = [float(x) for x in each]
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:7]
         pinhole = tuple(float(x) for x in own[i][:4]) if i < len(own) else (K[0], K[4], K[6], K[7])
-        if str(i) in files:  # it leaves pictures out where it is told to
+        if str(i) in files:  # Record3D can export every n-th image
             rows.append((files[str(i)], Y_UP @ pose, pinhole, size))
     return rows
 
 
 def _pose_files(folder: Path) -> list[Row]:
-    """Pictures in `color` or `rgb` with 4 x 4 matrices, camera to world with OpenCV's axes, of the same names in
-    `pose`; or both in one folder, as NAME.color.png and NAME.pose.txt. A matrix that is not finite says
-    that there is none."""
+    """Read images in `color` or `rgb` and 4 x 4 matrices, camera to world with OpenCV axes, of the same names in
+    `pose`; or both in one folder, as NAME.color.png and NAME.pose.txt. A matrix that is not finite means no pose."""
     poses = folder / "pose" if (folder / "pose").is_dir() else folder
-    place = next((folder / name for name in ("color", "rgb", "images") if (folder / name).is_dir()), folder)
+    images = next((folder / name for name in ("color", "rgb", "images") if (folder / name).is_dir()), folder)
     pinhole = _intrinsics(folder)
-    files = {file.stem.removesuffix(".color"): file for file in place.iterdir() if is_photograph(file)}
+    files = {file.stem.removesuffix(".color"): file for file in images.iterdir() if is_photograph(file)}
     rows: list[Row] = []
     lost = []
     for path in sorted(poses.glob("*.txt"), key=lambda path: natural(path.name)):
@@ -132,7 +132,7 @@ def _pose_files(folder: Path) -> list[Row]:
 
 
 def _intrinsics(folder: Path) -> tuple[float, ...]:
-    """fx, fy, cx, cy of all photographs, from the first file there is: a matrix, or these four numbers."""
+    """Read fx, fy, cx, cy of all photographs from the first of the usual files: a matrix, or these four numbers."""
     names = ("intrinsic/intrinsic_color.txt", "intrinsics_color.txt", "intrinsic_color.txt", "intrinsics.txt",
              "intrinsic.txt", "camera-intrinsics.txt", "calibration.txt", "../camera-intrinsics.txt")  # fmt: skip
     path = next((folder / name for name in names if (folder / name).is_file()), None)
@@ -146,7 +146,3 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
         return float(values[0, 0]), float(values[1, 1]), float(values[0, 2]), float(values[1, 2])
     fx, fy, cx, cy = values.ravel()[:4].tolist()
     return fx, fy, cx, cy
-
-
-def _numbers(values: dict[str, Any], names: Sequence[str]) -> tuple[float, ...]:
-    return tuple(float(values[name]) for name in names)

@@ -1,35 +1,75 @@
-"""Poses of photographs and videos that have none yet."""
+"""Poses of photographs and videos by structure from motion, and the copy of them that a training run keeps: whatever
+becomes of the photographs, the run goes on with the poses it was trained with."""
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import asdict, replace
+import shutil
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
-from bitymi_ns.capture.cache import read_from
+from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.recognise import Found, passed_over
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.plugin.data import kept_poses
-from bitymi_ns.plugin.data.colmap_model import read_model
-from bitymi_ns.plugin.data.colmap_views import Origin, Source, masks_of_capture, source_in
-from bitymi_ns.plugin.data.kept_poses import KeptPoses
+from bitymi_ns.plugin.data.colmap_model import Model, read_model
+from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
+from bitymi_ns.plugin.data.images import THREADS, image_size
 from bitymi_ns.plugin.errors import fail, listed, say, warn
+from bitymi_ns.trust import Refused, json_of, leads_inside
+
+MODEL = Path("sparse/0")
+IMAGES = "images"
+ORIGIN = "origin.json"
+"""File that states of what the model is. A folder without it holds no poses, but at most a report."""
 
 
-def source_of(found: Found, masks_path: Path | None, reduction: int, settings: SfmSettings) -> Source:
-    """The COLMAP model of a folder of photographs or of a video, found now or by an earlier run.
+@dataclass(frozen=True)
+class KeptPoses:
+    """Poses in the folder of a run.
+
+    Attributes:
+        folder: it holds MODEL, the report, and IMAGES where those were made for the training.
+        origin: input of structure from motion; its photographs are IMAGES where it names no folder.
+        left_out: photographs without a pose, and why.
+    """
+
+    folder: Path
+    origin: Origin
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def model(self) -> Path:
+        """Folder of the COLMAP model."""
+        return self.folder / MODEL
+
+    def images(self, capture: Path) -> Path:
+        """Folder to which the names in the model are relative, for a capture in this folder."""
+        return self.folder / IMAGES if self.origin.photographs is None else capture / self.origin.photographs
+
+    def found(self, data: Path) -> Found:
+        """What to read at `data`, folder or file, whatever else lies beside it by now."""
+        folder = data if data.is_dir() else data.parent
+        return Found(self.origin.kind, folder / self.origin.path, folder)
+
+
+def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings) -> Source:
+    """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run.
 
     Args:
         found: photographs, or a video.
-        masks_path: folder of masks, seen from the capture; None = it is found.
-        reduction: train on photographs that are so many times smaller.
-        settings: how the poses are found.
+        masks_path: folder of masks, relative to the capture; None = find it.
+        downscale: train on photographs that are smaller by this factor.
+        settings: of structure from motion.
 
     Raises:
         InputError: no poses can be found; says what to photograph differently.
     """
-    from bitymi_ns.capture import CaptureError, SfmOptions, find_poses  # late: it is much, and seldom needed
+    from bitymi_ns.capture import CaptureError, SfmOptions, find_poses  # slow to import, and seldom needed
     from bitymi_ns.progress import rich_progress
 
     masks = _masks(found, masks_path)
@@ -39,46 +79,149 @@ def source_of(found: Found, masks_path: Path | None, reduction: int, settings: S
     try:
         with rich_progress() as progress:
             poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress, warn)
-        read_from(poses.report.parent)
+        keep_work_folder(poses.report.parent)
     except CaptureError as error:
         fail(str(error), error)
     say(
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
     )
-    masks = _masks(found, masks_path, reduction)
-    source = source_in(poses.model, poses.images, masks, reduction, poses.left_out)
-    made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the folder of the work
+    masks = _masks(found, masks_path, downscale)
+    source = make_source(poses.model, poses.images, masks, downscale, poses.left_out)
+    made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the work folder
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
     origin = Origin(found.format, os.path.relpath(found.path, found.folder), photographs, settings)
     return replace(source, report=poses.report, origin=origin)
 
 
-def source_of_run(found: Found, kept: KeptPoses, masks_path: Path | None, reduction: int, look: bool) -> Source:
-    """The COLMAP model that a run was trained with, which nothing that happened to the photographs since changes.
+def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscale: int, need_photos: bool) -> Source:
+    """Return the COLMAP model that a run was trained with; see `find_sfm_source`.
 
     Args:
-        found: photographs, or a video; see `KeptPoses.found`.
-        kept: the poses of the run.
-        masks_path, reduction: see `source_of`.
-        look: the photographs are needed; else they may be missing.
+        found: see `KeptPoses.found`.
+        kept: poses of the run.
+        masks_path, downscale: see `find_sfm_source`.
+        need_photos: False = photographs may be missing.
 
     Raises:
         InputError: photographs of the model are missing, or have another size than they had.
     """
-    images = kept.images(found.folder)
-    masks = _masks(found, masks_path, reduction)
-    source = source_in(kept.model, images, masks, reduction, kept.left_out)
-    if look:
-        kept_poses.check(source, kept.folder)
+    masks = _masks(found, masks_path, downscale)
+    source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)
+    if need_photos:
+        _check_photographs(source, kept.folder)
     count = len(read_model(source.folder).images)
     say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
     return replace(source, report=kept.folder, origin=kept.origin)
 
 
-def _masks(found: Found, given: Path | None, reduction: int = 1) -> Path | None:
-    """The folder of the masks, which upright copies of the photographs share; a video has none."""
-    if found.format == "video":
+def _masks(found: Found, stated: Path | None, downscale: int = 1) -> Path | None:
+    """Folder of the masks, which upright copies of the photographs share; a video has none."""
+    return None if found.format == "video" else find_masks(photo_folder(found.path), found.folder, stated, downscale)
+
+
+def has_kept_poses(folder: Path) -> bool:
+    """Test if a run keeps its poses in this folder; runs of earlier versions keep the report alone."""
+    return (folder / ORIGIN).is_file()
+
+
+def read_kept_poses(folder: Path) -> KeptPoses | None:
+    """Read the poses that a run keeps in this folder; None = none.
+
+    Raises:
+        InputError: ORIGIN cannot be read.
+    """
+    path = folder / ORIGIN
+    if not path.is_file():
         return None
-    return masks_of_capture(photo_folder(found.path), found.folder, given, reduction)
+    try:
+        values: dict[str, Any] = json_of(path.read_text("utf8"))
+        entries, left_out = dict(values["origin"]), dict(values["left_out"])
+        if entries.get("settings") is not None:  # runs of earlier versions do not state them
+            entries["settings"] = SfmSettings(**entries["settings"])
+        origin = Origin(**entries)
+        if origin.kind not in ("photographs", "video"):
+            raise ValueError(f"it is of {origin.kind}")
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        fail(
+            f"{path}, which says of what the poses of the run were found, cannot be read ({error}). Put the folder "
+            f"{folder} back as it was, or train again.",
+            error,
+        )
+    return KeptPoses(folder, origin, left_out)
+
+
+def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
+    """Return the settings of the poses kept in a folder; warn of requested settings, other than defaults, that are not
+    used."""
+    kept = read_kept_poses(folder)
+    settings = None if kept is None else kept.origin.settings
+    unused = []
+    for each in fields(SfmSettings):
+        value = getattr(requested, each.name)
+        if value not in (each.default, getattr(settings, each.name, each.default)):
+            unused.append(f"--sfm.{each.name.replace('_', '-')} {value}")
+    if unused:
+        warn(
+            f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
+            f"was trained with, in {folder}, because what it has learned fits no others. To have poses found anew, "
+            "start a new run: leave out --load-dir and --load-checkpoint."
+        )
+    return settings or requested
+
+
+def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
+    """Copy a model into an existing folder, with the photographs where those are copies or frames that can go.
+
+    Photographs are hard links where possible; symbolic links stay symbolic links.
+
+    Raises:
+        OSError: something cannot be written, or a name in the model leads out of its folder.
+    """
+    shutil.copytree(source.folder, folder / MODEL)
+    if origin.photographs is None:
+        for image in read_model(source.folder).images:
+            if not leads_inside(image.name):
+                raise Refused(f"{source.folder} names {image.name!r}, which leads out of its folder", folder)
+            _link(source.photographs / image.name, folder / IMAGES / image.name)
+    values = {"origin": asdict(origin), "left_out": dict(source.left_out)}
+    (folder / ORIGIN).write_text(json.dumps(values, indent=2, ensure_ascii=False) + "\n", "utf8")
+
+
+def _link(file: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if file.is_symlink():
+        target.symlink_to(os.path.realpath(file))
+        return
+    try:
+        os.link(file, target)
+    except OSError:  # another disk, or a file system without links
+        shutil.copyfile(file, target)
+
+
+def _check_photographs(source: Source, kept: Path) -> None:
+    """Fail where photographs of kept poses are missing, or have another size than their cameras."""
+    model = read_model(source.folder)
+    files = source.files(model)
+    missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
+    changed = [] if source.copies is not None else _other_sizes(model, files)
+    what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
+    what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
+    if what:
+        fail(
+            f"of the {len(files)} photographs that the run was trained with, {' and '.join(what)}, so its poses in "
+            f"{kept} cannot be used. Put these photographs back as they were, or train again."
+        )
+
+
+def _other_sizes(model: Model, files: list[Path]) -> list[str]:
+    """Photographs with another size than their cameras, with both sizes; unreadable ones do not count."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        sizes = list(pool.map(image_size, files))
+    changed = []
+    for image, file, size in zip(model.images, files, sizes, strict=True):
+        camera = model.cameras[image.camera_id]
+        if size is not None and size != (camera.width, camera.height):
+            changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
+    return changed

@@ -1,4 +1,4 @@
-"""Which photographs of a capture are held out of training, for evaluation."""
+"""Splits of a capture into training and held-out photographs: by rule, or by names."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ import numpy as np
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filename, get_train_eval_split_fraction
 
 from bitymi_ns.files import encoding_of
-from bitymi_ns.plugin.data.names import folded, without_ending
+from bitymi_ns.plugin.data.names import folded, without_extension
 from bitymi_ns.plugin.errors import fail, listed
 
 Mode = Literal["fraction", "filename", "interval", "all"]
+NameLists = dict[str, list[str]]
+"""Names of photographs by split: train, val, test."""
 
 
 class Split(NamedTuple):
-    """Numbers of the photographs on each side, ascending, and by what rule."""
+    """Ascending indices of the photographs on each side, and the rule in words."""
 
     train: list[int]
     held_out: list[int]
     rule: str
 
-    def told(self, names: Sequence[Path]) -> str:
-        """A line on what is held out of these."""
+    def describe(self, names: Sequence[Path]) -> str:
+        """Describe the split of these photographs in a line."""
         if not self.held_out:
             return f"All {len(self.train)} photographs are trained on: none is held out for evaluation."
         if self.rule == "all":
@@ -36,19 +38,19 @@ class Split(NamedTuple):
 
 
 def ordinal(number: int) -> str:
-    """1st, 2nd, 3rd, 4th and so on."""
-    ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
-    return f"{number}{ending}"
+    """Format 1st, 2nd, 3rd, 4th and so on."""
+    suffix = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{suffix}"
 
 
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
-    """The split of photographs in this order by nerfstudio's rules."""
-    numbers = list(range(len(names)))
+    """Split photographs in this order by nerfstudio's rules."""
+    indices = list(range(len(names)))
     if mode == "interval":
-        which = f"every {ordinal(interval)} by name"
-        return Split([i for i in numbers if i % interval], [i for i in numbers if i % interval == 0], which)
+        rule = f"every {ordinal(interval)} by name"
+        return Split([i for i in indices if i % interval], indices[::interval], rule)
     if mode == "all":
-        return Split(numbers, numbers, "all")
+        return Split(indices, indices, "all")
     if mode == "fraction":
         train, held_out = get_train_eval_split_fraction(list(names), fraction)
         rule = f"evenly spaced ones (--train-split-fraction {fraction:g})"
@@ -61,43 +63,55 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
     return Split(np.asarray(train, int).tolist(), np.asarray(held_out, int).tolist(), rule)
 
 
-def by_names(names: Sequence[Path], wanted: Sequence[str], where: str) -> Split:
+def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
     """Hold out the photographs of these names.
 
     Args:
         names: of all photographs, with their folders.
-        wanted: names, each with as many of its folders as tell it from others.
-        where: they were given, for messages.
+        wanted: names, each with as many folders as make it unambiguous.
+        source: of the wanted names, for messages.
 
     Raises:
         InputError: one of them is the name of no photograph, or of several.
     """
-    held_out = set(find(names, wanted, where))
-    return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {where}")
+    held_out = set(find(names, wanted, source))
+    return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
 
 
-def find(names: Sequence[Path], wanted: Sequence[str], where: str, anywhere: bool = False) -> list[int]:
-    """The numbers of the photographs of these names, which may differ in case, the form of Unicode, or their ending.
+def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
+    """Split by the capture's own lists of names; names in "val" and "test" are held out."""
+    source = "the capture's own lists"
+
+    def indices(split: str) -> set[int]:  # downscaled photographs lie in another folder than the lists say
+        return set(find(names, lists.get(split, []), source, any_folder=True))
+
+    held_out = indices("val") | indices("test")
+    train = indices("train") if "train" in lists else set(range(len(names))) - held_out
+    return Split(sorted(train), sorted(held_out), f"by {source}")
+
+
+def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
+    """Find the indices of photographs by names that may differ in case, Unicode form, or extension.
 
     Args:
-        names, wanted, where: see `by_names`.
-        anywhere: wanted names may have leading folders that the photographs do not lie in.
+        names, wanted, source: see `by_names`.
+        any_folder: wanted names may have leading folders that the photographs do not lie in.
     """
     forms: list[Callable[[str], tuple[str, ...]]] = [
         lambda name: PurePath(name.replace("\\", "/")).parts,
         folded,
-        lambda name: without_ending(folded(name) or ("",)),
+        lambda name: without_extension(folded(name) or ("",)),
     ]
     whole = [[form(str(name)) for name in names] for form in forms]
-    numbers: list[dict[str, list[int]]] = [defaultdict(list) for _ in forms]
-    for table, keys in zip(numbers, whole, strict=True):
+    tables: list[dict[str, list[int]]] = [defaultdict(list) for _ in forms]
+    for table, keys in zip(tables, whole, strict=True):
         for i, key in enumerate(keys):
             table[key[-1]].append(i)
 
-    def fitting_names(name: str) -> list[int]:
-        for form, table, keys in zip(forms, numbers, whole, strict=True):
+    def fit(name: str) -> list[int]:
+        for form, table, keys in zip(forms, tables, whole, strict=True):
             parts = form(name)
-            for start in range(len(parts) if anywhere else min(1, len(parts))):
+            for start in range(len(parts) if any_folder else min(1, len(parts))):
                 tail = parts[start:]
                 fitting = [i for i in table.get(tail[-1], []) if keys[i][-len(tail) :] == tail]
                 if fitting:
@@ -106,27 +120,27 @@ def find(names: Sequence[Path], wanted: Sequence[str], where: str, anywhere: boo
 
     unknown, found = [], []
     for name in wanted:
-        fitting = fitting_names(name)
+        fitting = fit(name)
         if len(fitting) > 1:
             fail(
-                f"{where}: {name} is the name of {len(fitting)} photographs, {listed([names[i] for i in fitting])}. "
+                f"{source}: {name} is the name of {len(fitting)} photographs, {listed([names[i] for i in fitting])}. "
                 "Give its folder, too."
             )
         found += fitting
         unknown += [] if fitting else [name]
     if unknown:
         fail(
-            f"{where}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {listed(unknown)}. "
+            f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {listed(unknown)}. "
             f"Its photographs are {listed([name.name for name in names])}."
         )
     return found
 
 
-def read_names(given: Sequence[str]) -> tuple[str, ...]:
-    """Names as they were given, or those in a text file, one per line, where its name was given instead."""
-    if len(given) != 1 or not given[0].lower().endswith((".txt", ".lst", ".list")):
-        return tuple(given)
-    path = Path(os.path.expanduser(given[0]))
+def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
+    """Return the names, or those in a text file, one per line, where its name stands for them."""
+    if len(names_or_file) != 1 or not names_or_file[0].lower().endswith((".txt", ".lst", ".list")):
+        return tuple(names_or_file)
+    path = Path(os.path.expanduser(names_or_file[0]))
     try:
         lines = path.read_text(encoding_of(path)).splitlines()
     except (OSError, UnicodeDecodeError) as error:

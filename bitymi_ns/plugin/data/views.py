@@ -1,8 +1,8 @@
-"""The views of a capture as training has them: photographs with cameras and poses, whichever files state these, become
-pinhole pictures in nerfstudio's frame."""
+"""Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,19 +17,22 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
-from bitymi_ns.plugin.data.images import THREADS, of_header
-from bitymi_ns.plugin.data.lens import Lens, Pinhole, lens, rescaled
-from bitymi_ns.plugin.data.ply import Points
-from bitymi_ns.plugin.data.poses import check_spread, is_far_off, oriented
+from bitymi_ns.plugin.data.images import THREADS, image_size
+from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, make_lens, rescaled
+from bitymi_ns.plugin.data.point_files import Points
+from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin, orient
 from bitymi_ns.plugin.errors import fail, say
 
+Pose = npt.NDArray[np.float64]
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""[4, 4] from a camera with OpenCV's axes to one with nerfstudio's, which are OpenGL's, and back."""
-USUAL_RATIO, LARGEST_RATIO = 2.5, 25.0
-"""Distance of cameras from their middle, in half sides of the scene's box: of NeRF-Synthetic, and from which on a
-capture is in another unit."""
-ALONE = "without photographs"
-"""Entry of the metadata of views whose photographs are gone."""
+"""[4, 4] between camera frames with OpenCV axes and with nerfstudio's (OpenGL)."""
+USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
+"""Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
+capture is taken to be in another unit."""
+NO_PHOTOS = "without photographs"
+"""Metadata key of views whose photographs are gone."""
+LONGEST_SIDE = 1600
+"""Default longest side of a training photograph, pixels; as in papers on such captures."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +40,24 @@ class Photograph:
     """A photograph with its camera.
 
     Attributes:
-        file: that is read.
-        camera: in pixels of the photograph before any reduction.
+        file: image file.
+        camera: in pixels of the photograph before any downscaling.
         pose: [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward).
-        whose: the camera, for messages.
-        mask: its file; None = there is none.
-        smaller: the file is that of a copy that is reduced already.
+        label: names the camera in messages.
+        mask: mask file; None = none.
+        downscaled: `file` is a copy that is downscaled already.
     """
 
     file: Path
     camera: ModelCamera
-    pose: npt.NDArray[np.float64]
-    whose: str
+    pose: Pose
+    label: str
     mask: Path | None = None
-    smaller: bool = False
+    downscaled: bool = False
 
 
 @dataclass(frozen=True)
-class Place:
+class FrameOptions:
     """How a capture's frame becomes that of training; as in nerfstudio's parsers."""
 
     scale_factor: float = 1.0
@@ -64,134 +67,127 @@ class Place:
     scene_scale: float = 1.0
 
 
-def in_proportion(place: Place, photographs: Sequence[Photograph], where: str) -> Place:
-    """The place for a capture that is not scaled by its cameras, with a scale at which these do not lie far outside of
-    the box of the scene: in millimetres they would, and random points would all be in a spot of the pictures.
+def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
+    """Reduce the scale of a capture whose cameras lie far outside of the scene box.
+
+    In millimetres they would, and random points would all fall on one spot of the pictures.
 
     Args:
-        place: the usual one of the format.
+        frame: default of the format, without auto_scale_poses.
         photographs: of the capture.
-        where: their poses are from, for the message.
+        source: of their poses, for the message.
     """
     centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    ratio = spread * place.scale_factor / place.scene_scale
-    if ratio <= LARGEST_RATIO:
-        return place
-    scale = place.scale_factor * USUAL_RATIO / ratio
+    ratio = spread * frame.scale_factor / frame.scene_scale
+    if ratio <= MAX_SPREAD:
+        return frame
+    scale = frame.scale_factor * USUAL_SPREAD / ratio
     say(
-        f"The cameras of {where} lie {spread:,.4g} units from their middle, where those of this format usually lie "
-        f"{USUAL_RATIO * place.scene_scale / place.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
+        f"The cameras of {source} lie {spread:,.4g} units from their middle, where those of this format usually lie "
+        f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
         "state that."
     )
-    return replace(place, scale_factor=scale)
+    return replace(frame, scale_factor=scale)
 
 
 class Views(DataparserOutputs):
-    """What a parser of nerfstudio gives, of which `dataparser_transform` is in float64: a capture may lie millions of
-    units from its origin."""
+    """DataparserOutputs with a float64 dataparser_transform: a capture may lie millions of units from its origin."""
 
     def transform_poses_to_original_space(self, poses: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
-        """nerfstudio's own, in float64."""
+        """Call nerfstudio's method in float64."""
         return super().transform_poses_to_original_space(poses.double(), *args, **kwargs)
 
 
-def views_of_capture(
+def make_views(
     photographs: Sequence[Photograph],
-    place: Place,
+    frame: FrameOptions,
     points: Points | None,
-    where: str,
-    reduction: int = 1,
-    look: bool = True,
-    announce: bool = True,
-    before: npt.NDArray[np.float64] | None = None,
-    before_scale: float = 1.0,
+    source: str,
+    downscale: int = 1,
+    need_photos: bool = True,
+    applied: Pose | None = None,
+    applied_scale: float = 1.0,
     alpha_color: torch.Tensor | None = None,
 ) -> Views:
-    """All views of a capture, in the order of the photographs; the lenses are in the metadata.
+    """Build the views of a capture, in the order of the photographs; metadata["lenses"] has a `Lens` per view.
 
     Args:
         photographs: at least two.
-        place: what is done with their frame.
-        points: in the frame of the poses; None = there are none.
-        where: the poses are from, for messages.
-        reduction: use photographs that are so many times smaller.
-        look: look into photographs, which decide the size of reduced ones.
-        announce: say what is lost.
-        before: [4, 4] that was applied to the capture already; the transform of the result is from before that.
-        before_scale: the same for a scale.
+        frame: how to orient, center and scale them.
+        points: in the frame of the poses; None = none.
+        source: of the poses, for messages.
+        downscale: use photographs that are smaller by this factor.
+        need_photos: open downscaled copies for their size; else they may be missing.
+        applied: [4, 4] that was applied to the capture already, before `photographs` state it.
+        applied_scale: the same for a scale.
         alpha_color: behind transparent pixels.
 
     Raises:
         InputError: a camera or a photograph cannot be used.
     """
     if len(photographs) == 1:
-        fail(f"{where} has one image only. A scene cannot be learned from one view: add photographs.")
-    lenses = lenses_of(photographs, reduction, look, announce)
+        fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
+    lenses = make_lenses(photographs, downscale, need_photos)
     poses = np.stack([photograph.pose for photograph in photographs])
-    if place.auto_scale_poses:
-        check_spread(poses[:, :3, 3], where)
-    transform, scale = in_training_frame(poses, place, where, announce)
-    there = transform @ poses
-    there[:, :3, 3] *= scale
+    if frame.auto_scale_poses:
+        check_spread(poses[:, :3, 3], source)
+    transform, scale = training_frame(poses, frame, source)
+    moved = transform @ poses
+    moved[:, :3, 3] *= scale
     metadata: dict[str, Any] = {"lenses": lenses}
     if points is not None and len(points.xyz):
-        xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * before_scale
+        xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
     masks = [photograph.mask for photograph in photographs if photograph.mask is not None]
-    side = place.scene_scale
+    side = frame.scene_scale
     return Views(
         image_filenames=[photograph.file for photograph in photographs],
-        cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(there.astype(np.float32))),
+        cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(moved.astype(np.float32))),
         alpha_color=alpha_color,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
         mask_filenames=masks or None,
-        dataparser_scale=scale * before_scale,
-        dataparser_transform=torch.from_numpy(transform if before is None else transform @ before),
+        dataparser_scale=scale * applied_scale,
+        dataparser_transform=torch.from_numpy(transform if applied is None else transform @ applied),
         metadata=metadata,
     )
 
 
-def in_training_frame(
-    poses: npt.NDArray[np.float64], place: Place, where: str, announce: bool = True
-) -> tuple[npt.NDArray[np.float64], float]:
-    """The transform [3, 4] that turns and centres a capture, and the factor that scales it after that.
+def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
+    """Compute the transform [3, 4] that orients and centers a capture, and the scale that follows it.
 
-    Both are nerfstudio's, but the capture is centred in float64 first: positions in UTM or ECEF coordinates have seven
-    digits before the point, which is all that float32 has.
+    Both are nerfstudio's, but the capture is centered in float64 first: UTM or ECEF positions have seven digits before
+    the point, which is all that float32 has.
 
     Args:
         poses: [N, 4, 4] camera to world.
-        place: what is done with them.
-        where: they are from, for messages.
-        announce: say where a capture is centred that was not to be.
+        frame: options.
+        source: of the poses, for messages.
     """
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
-    found = oriented(torch.from_numpy(local.astype(np.float32)), place.orientation_method, place.center_method)[1]
-    transform = found.double().numpy()[:3].copy()
+    transform = orient(torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method)
+    transform = transform.double().numpy()[:3].copy()
     u, _, v = np.linalg.svd(transform[:, :3])  # far from the origin, the rounding of a rotation is a displacement
     transform[:, :3] = u @ v
-    kept = place.center_method == "none"
-    if kept and is_far_off(poses[:, :3, 3]):
-        kept = False
-        if announce:
-            say(
-                f"The cameras of {where} lie {np.linalg.norm(middle):,.0f} units from the origin, where float32 would "
-                "blur the scene: their middle becomes the origin. Bundles state where that is."
-            )
-    if not kept:
+    far = frame.center_method == "none" and far_from_origin(poses[:, :3, 3])
+    if far:
+        say(
+            f"The cameras of {source} lie {np.linalg.norm(middle):,.0f} units from the origin, where float32 would "
+            "blur the scene: their middle becomes the origin. Bundles state where that is."
+        )
+    if far or frame.center_method != "none":
         transform[:, 3] -= transform[:, :3] @ middle
-    scale = place.scale_factor
-    if place.auto_scale_poses:
+    scale = frame.scale_factor
+    if frame.auto_scale_poses:
         scale /= float(np.abs((transform @ poses)[:, :3, 3]).max())
     return transform, scale
 
 
 def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras:
-    """nerfstudio's cameras of these, with poses [N, 3 or 4, 4] camera to world."""
+    """Make nerfstudio's cameras of pinholes and poses [N, 3 or 4, 4] camera to world."""
 
     def column(name: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.tensor([getattr(pinhole, name) for pinhole in pinholes], dtype=dtype)
@@ -204,42 +200,112 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
     )
 
 
-def lenses_of(photographs: Sequence[Photograph], reduction: int, look: bool, announce: bool) -> list[Lens]:
-    """The lens of each photograph; see `views_of_capture`."""
+def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[Lens]:
+    """Make the lens of each photograph, equal ones once; see `make_views`."""
     sizes: list[tuple[int, int] | None] = [None] * len(photographs)
-    smaller = [i for i, photograph in enumerate(photographs) if photograph.smaller]
-    if smaller and look:
+    copies = [i for i, photograph in enumerate(photographs) if photograph.downscaled]
+    if copies and need_photos:
         with ThreadPoolExecutor(THREADS) as pool:
-            for i, size in zip(smaller, pool.map(size_of, [photographs[i].file for i in smaller]), strict=True):
+            for i, size in zip(copies, pool.map(image_size, [photographs[i].file for i in copies]), strict=True):
                 sizes[i] = size
     made: dict[tuple[Any, ...], Lens] = {}
-    result, told = [], []
+    lenses, messages = [], []
     for photograph, size in zip(photographs, sizes, strict=True):
         camera = photograph.camera
         full = (camera.width, camera.height)
-        small = (max(1, round(full[0] / reduction)), max(1, round(full[1] / reduction)))
+        small = full if downscale == 1 else (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
         if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
             fail(
                 f"the image {photograph.file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x "
-                f"{full[1]}, of which 1/{reduction} is {small[0]} x {small[1]}. Make the folder "
+                f"{full[1]}, of which 1/{downscale} is {small[0]} x {small[1]}. Make the folder "
                 f"{photograph.file.parent} anew, or leave --downscale-factor out."
             )
         used = size or small
-        key = (camera, used, photograph.smaller)
+        key = (camera, used, photograph.downscaled)
         if key not in made:
-            stored = used if photograph.smaller else full
+            stored = used if photograph.downscaled else full
             params = rescaled(camera.model, camera.params, full, used)
-            made[key], sentences = lens(camera.model, params, *used, stored, photograph.whose)
-            told += sentences
-        result.append(made[key])
-    if announce:
-        for sentence in told[:3]:
-            say(f"{sentence[0].upper()}{sentence[1:]}")
-        if len(told) > 3:
-            say(f"So are those of {len(told) - 3} more cameras.")
-    return result
+            made[key], lost = make_lens(camera.model, params, *used, stored, photograph.label)
+            messages += lost
+        lenses.append(made[key])
+    for message in messages[:3]:
+        say(f"{message[0].upper()}{message[1:]}")
+    if len(messages) > 3:
+        say(f"So are those of {len(messages) - 3} more cameras.")
+    return lenses
 
 
-def size_of(path: Path) -> tuple[int, int] | None:
-    """Width and height of a photograph; None where there is none to read."""
-    return of_header(path, lambda image: image.size, None)
+def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
+    """Give the outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras in place of distorted ones."""
+    if "lenses" in outputs.metadata or NO_PHOTOS in outputs.metadata:
+        return outputs
+    cameras = outputs.cameras
+    if cameras.camera_to_worlds.ndim != 3:  # nerfstudio's Cameras lose the dimension of a single view
+        fail(
+            "nerfstudio's reader of this format fails on a split with a single photograph. Hold out more of them, for "
+            "example with `--eval-mode interval --eval-interval 4` after the name of the reader."
+        )
+    distortion = cameras.distortion_params
+    photographs = []
+    for i, file in enumerate(outputs.image_filenames):
+        values = [0.0] * 6 if distortion is None else distortion[i].tolist()
+        model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])), values, f"of {file}")
+        pinhole = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
+        camera = ModelCamera(model, int(cameras.width[i]), int(cameras.height[i]), (*pinhole, *coefficients))
+        photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
+    lenses = make_lenses(photographs)
+    return dataclasses.replace(
+        outputs,
+        cameras=pinhole_cameras([lens.pinhole for lens in lenses], cameras.camera_to_worlds),
+        metadata={**outputs.metadata, "lenses": lenses},
+    )
+
+
+def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
+    """Downscale views with more than `longest` pixels along a side (0 = no limit), by their lenses.
+
+    Raises:
+        InputError: `longest` is negative.
+    """
+    if longest < 0:
+        fail(
+            f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 to use photographs as "
+            "they are."
+        )
+    lenses: list[Lens] = outputs.metadata.get("lenses", [])
+    sizes = [(lens.pinhole.width, lens.pinhole.height) for lens in lenses]
+    large = [size for size in sizes if longest and max(size) > longest]
+    if not large:
+        return outputs
+    small = {lens: lens.downscaled(longest / max(size)) if longest < max(size) else lens
+             for lens, size in dict(zip(lenses, sizes, strict=True)).items()}  # fmt: skip
+    lenses = [small[lens] for lens in lenses]
+    if verbose:
+        width, height = max(large, key=max)
+        say(
+            f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
+            f"{width} x {height}): they are reduced to that as they are read. --pipeline.datamanager.longest-side 0 "
+            "uses them as they are."
+        )
+    return dataclasses.replace(
+        outputs,
+        cameras=pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds),
+        metadata={**outputs.metadata, "lenses": lenses},
+    )
+
+
+def select_views(outputs: DataparserOutputs, indices: Sequence[int]) -> DataparserOutputs:
+    """Return a subset of the views, with all that belongs to them."""
+    count = len(outputs.image_filenames)
+    masks = outputs.mask_filenames
+    metadata = {
+        key: [value[i] for i in indices] if isinstance(value, list) and len(value) == count else value
+        for key, value in outputs.metadata.items()
+    }
+    return dataclasses.replace(
+        outputs,
+        image_filenames=[outputs.image_filenames[i] for i in indices],
+        mask_filenames=None if masks is None else [masks[i] for i in indices],
+        cameras=outputs.cameras[torch.tensor(indices, dtype=torch.long)],
+        metadata=metadata,
+    )

@@ -23,14 +23,14 @@ from PIL import Image
 from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
-from bitymi_ns.bundle.folder import CONFIG
 from bitymi_ns.bundle.manifest import MANIFEST, dump
+from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.files import reason, write_file
-from bitymi_ns.interchange import Frame, Kind, check_extras, described, place_of, write_extras
+from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.plugin.export.cameras import camera_files
@@ -109,7 +109,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             with bundle_place(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
-                    check_extras(self.extras, place_of(self.output_dir), self.overwrite)
+                    check_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
                 if self.check_room:
                     check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
                 self._run(bake_options)
@@ -172,7 +172,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
-        cameras = datamanager.undistorted_train_cameras()
+        cameras = datamanager.train_dataset.cameras
         views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
         first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
         shown = preview(model, first, "JPEG" if self._is_compact else "PNG")
@@ -233,7 +233,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
         """Beside the bundle, which is complete already; says what was written."""
-        folder = place_of(self.output_dir)
+        folder = extras_folder(self.output_dir)
         with rich_progress() as progress:
             written = write_extras(
                 bundle,
@@ -246,7 +246,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 progress=progress,
             )
         for each in written.values():
-            say(f"In {folder}: {described(each)}")
+            say(f"In {folder}: {summary_line(each)}")
 
 
 def default_export() -> ExportAtlas:

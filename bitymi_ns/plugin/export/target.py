@@ -7,8 +7,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.folder import check_target
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text
 from bitymi_ns.plugin.errors import fail, warn

@@ -9,7 +9,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.bake.verify import check_field, check_view_color
-from bitymi_ns.bundle import Bundle, Check, check_place
+from bitymi_ns.bundle import Bundle, Check, check_world
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.errors import fail
 from bitymi_ns.plugin.export.command import held_out_psnr, load_trained, world_of
@@ -32,7 +32,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
         _, pipeline = load_trained(config, step)
     model, datamanager = pipeline.model, pipeline.datamanager
-    cameras = datamanager.undistorted_train_cameras()
+    cameras = datamanager.train_dataset.cameras
     train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
     checks = [check_view_color(bundle, model.scene.surfels, train)]
     if isinstance(model.scene.field, HashField):
@@ -46,7 +46,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         detail += "" if stated is None else f" (stated {stated:.2f})"
         detail += f"; against the photographs {photos:+.3f} dB"
         checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
-    return [*checks, check_place(bundle.info.world, world_of(datamanager))]
+    return [*checks, check_world(bundle.info.world, world_of(datamanager))]
 
 
 def find_run(run: Path) -> tuple[Path, int | None]:

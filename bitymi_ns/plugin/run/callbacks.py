@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.data.exif import stops_of
-from bitymi_ns.plugin.data.fingerprint import capture_print, warn_of_another
+from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
+from bitymi_ns.plugin.data.images import exposure_stops
 from bitymi_ns.plugin.errors import fail, listed, say, warn
 from bitymi_ns.plugin.run.curve import FILE, TrainingCurve, points
 from bitymi_ns.plugin.run.memory import state_training
@@ -73,7 +73,7 @@ class TrainingRun:
             metadata["train_pixels"],
             metadata["first_surfels"],
             covered_share(self.datamanager.train_views),
-            stops_of(self.datamanager.train_dataset.image_filenames),
+            exposure_stops(self.datamanager.train_dataset.image_filenames),
         )
         optimizers = attributes.optimizers.optimizers
         try:
@@ -82,13 +82,13 @@ class TrainingRun:
         except ValueError as error:
             fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
         attributes.optimizers.before_step = self.training.combine
-        self.capture = capture_print(self.datamanager.train_dataset)
+        self.capture = capture_fingerprint(self.datamanager.train_dataset)
         self._random_state: Tensor | None = None
         if resume_state:
             self.training.load_state_dict(resume_state)
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none
-                warn_of_another(resume_state["capture"], self.capture)
+                warn_of_other_capture(resume_state["capture"], self.capture)
         self.curve_steps = points(self.total, curve_points)
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(

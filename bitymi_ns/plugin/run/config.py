@@ -16,11 +16,11 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns.files import reason, write_file
-from bitymi_ns.plugin.data import kept_poses
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.bundle_config import find_bundle, stub_checkpoint_dir
@@ -173,7 +173,7 @@ class BitymiTrainerConfig(TrainerConfig):
             if path is not None:
                 owner.data = Path(os.path.expanduser(path)).absolute()
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
-            datamanager.dataparser.settle()
+            datamanager.dataparser.resolve_names()
 
     def _take_poses_of_resumed(self) -> None:
         """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
@@ -182,15 +182,15 @@ class BitymiTrainerConfig(TrainerConfig):
             self._take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
             dataparser = self.pipeline.datamanager.dataparser
             poses = getattr(dataparser, "poses", None)
-            if poses is not None and kept_poses.are_in(Path(poses)):
-                dataparser.sfm = kept_poses.settings_in(Path(poses), dataparser.sfm)
+            if poses is not None and has_kept_poses(Path(poses)):
+                dataparser.sfm = kept_settings(Path(poses), dataparser.sfm)
         elif isinstance(self.pipeline.datamanager.dataparser, BitymiDataParserConfig):
             self.pipeline.datamanager.dataparser.poses = None
 
     def _take_poses_of(self, run: Path) -> None:
         """Have the data read with the poses in this run's folder, where it keeps any."""
         dataparser = self.pipeline.datamanager.dataparser
-        if isinstance(dataparser, BitymiDataParserConfig) and kept_poses.are_in(run / run_folder.POSES):
+        if isinstance(dataparser, BitymiDataParserConfig) and has_kept_poses(run / run_folder.POSES):
             dataparser.poses = run / run_folder.POSES
 
     def is_viewer_enabled(self) -> bool:

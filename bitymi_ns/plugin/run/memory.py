@@ -16,7 +16,7 @@ from bitymi_ns.bake.view_color_rate import choice_bytes
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from bitymi_ns.plugin.data.photographs import PHOTOGRAPH_BYTES
+from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES
 from bitymi_ns.plugin.errors import say, warn
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from bitymi_ns import files
 from bitymi_ns.capture.report import FILES
-from bitymi_ns.plugin.data import kept_poses
 from bitymi_ns.plugin.data.colmap_views import Source
+from bitymi_ns.plugin.data.sfm_poses import write_kept_poses
 from bitymi_ns.plugin.errors import fail, warn
 from bitymi_ns.trust import check_no_links
 
@@ -81,7 +81,7 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
             for file in there:
                 shutil.copyfile(file, new / file.name)
             if source is not None and origin is not None:
-                kept_poses.write(new, source, origin)
+                write_kept_poses(new, source, origin)
     except OSError as error:
         loss = "" if origin is None else " Nor are the poses: leave the photographs as they are while you use the run."
         warn(f"How the poses were found is not kept with the run: {files.reason(error, folder)}.{loss}")

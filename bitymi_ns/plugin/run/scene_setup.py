@@ -9,7 +9,7 @@ import torch
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
-from bitymi_ns.plugin.data.point_cloud import reporting_time
+from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene

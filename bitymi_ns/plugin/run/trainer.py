@@ -77,7 +77,7 @@ class BitymiTrainer(Trainer):
             raise SystemExit(INTERRUPTED) from None
         parser = self.pipeline.datamanager.dataparser
         run_folder.keep_poses_report(
-            self.base_dir, getattr(parser, "poses_report", None), getattr(parser, "found", None)
+            self.base_dir, getattr(parser, "poses_report", None), getattr(parser, "sfm_source", None)
         )
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)

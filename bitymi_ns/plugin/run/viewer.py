@@ -36,7 +36,7 @@ def _ours_for(config: Any, start: Any) -> Any:
             for name in ("train_dataset", "eval_dataset"):
                 dataset = getattr(getattr(pipeline, "datamanager", None), name, None)
                 if dataset is not None:
-                    dataset.shows_blanks = True
+                    dataset.gray_images = True
         if shown.viewer.websocket_host == ViewerConfig().websocket_host and not _host_given():
             shown.viewer.websocket_host = LOOPBACK
         CONSOLE.print("Ctrl-C ends the viewer.")

@@ -14,7 +14,7 @@ import pytest
 from bitymi_ns.bundle import World
 from bitymi_ns.bundle.manifest import describe, dump
 from bitymi_ns.codec.quantise import Format
-from bitymi_ns.measure.bench import Bundle, Matrix, Row, SceneSpec
+from bitymi_ns.measure.bench.matrix import Bundle, Matrix, Row, SceneSpec
 
 FAKE = """#!{python} -SE
 import json, os, pathlib, sys, time
@@ -132,7 +132,7 @@ def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
     folder = tmp_path / "bin"
     folder.mkdir()
     found = Fakes(folder)
-    monkeypatch.setattr("bitymi_ns.measure.bench.commands.tool", lambda name: str(folder / name))
+    monkeypatch.setattr("bitymi_ns.measure.bench.engine.tool", lambda name: str(folder / name))
     return found
 
 

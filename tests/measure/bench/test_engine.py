@@ -13,9 +13,11 @@ import pytest
 
 from bitymi_ns.cli import main
 from bitymi_ns.files import Lock
-from bitymi_ns.measure.bench import BenchError, CommandFailed, Matrix, Row, Stage, engine, open_cells, run_chains
+from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
-from bitymi_ns.measure.bench.process import run_measured, tool
+from bitymi_ns.measure.bench.engine import open_cells, run_chains, time_left
+from bitymi_ns.measure.bench.matrix import Matrix, Row, Stage
+from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, tool
 
 
 def lines(work: Path) -> list[dict]:
@@ -61,7 +63,7 @@ def test_finished_cells_are_skipped(fakes, matrix: Matrix, tmp_path: Path) -> No
     assert fakes.calls() == []
 
 
-@pytest.mark.parametrize("at", range(6))
+@pytest.mark.parametrize("at", [0, 2, 5])
 def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     work, chain = tmp_path / "work", matrix.chains()[0]
     calls = iter(range(99))
@@ -157,7 +159,7 @@ def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_p
 
 def test_two_benchmarks_do_not_work_on_one_run(fakes, matrix: Matrix, tmp_path: Path) -> None:
     work, chain = tmp_path / "work", matrix.chains()[0]
-    with engine.locked(work, chain[0]):
+    with engine.locked(work, chain[0].run):
         (failure,) = run_chains(work, [chain])
     assert f"process {os.getpid()} is at work there" in failure and fakes.calls() == []
 
@@ -198,7 +200,7 @@ def test_empty_matrix_and_missing_tools(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_no_file_is_named_that_is_not_there(
-    fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    fakes, matrix: Matrix, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     work = tmp_path / "work"
     words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(work)]
@@ -206,13 +208,6 @@ def test_no_file_is_named_that_is_not_there(
     assert main(words) == 1
     told = capsys.readouterr().err
     assert "No cell was finished." in told and "cells.jsonl" not in told
-
-    def interrupted(*arguments: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("bitymi_ns.measure.bench.cli.run_chains", interrupted)
-    assert main(words) == 130
-    assert "interrupted; no cell was finished. The same command goes on" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--work", "--output"])
@@ -230,3 +225,14 @@ def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> No
     runs = matrix.runs()
     assert len({run.folder for run in runs}) == 4
     assert open_cells(Path("/nowhere")).get(Stage(runs[0], "train").key) is None
+
+
+def test_the_time_left_is_that_of_the_cells_most_alike(matrix: Matrix, tmp_path: Path) -> None:
+    cells = Cells(tmp_path / "cells.jsonl")
+    fox, _, lego, _ = matrix.runs()
+    assert time_left([Stage(fox, "train")], cells) == ""
+    cells.add(Stage(lego, "train").key, {}, {"seconds": 600.0})
+    assert time_left([Stage(fox, "train")], cells) == ", about 10 min left"
+    cells.add(Stage(fox, "train").key, {}, {"seconds": 1800.0})
+    assert time_left([Stage(fox, "train")] * 4, cells) == ", about 2.0 h left"
+    assert time_left([Stage(fox, "train"), Stage(fox, "eval")], cells) == ""

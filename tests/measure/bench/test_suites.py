@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns import cli
-from bitymi_ns.measure.bench import BenchError
-from bitymi_ns.measure.bench.suites import format_bundles, local_scenes, read_plan, standard_scenes, suites
+from bitymi_ns.measure.bench.matrix import format_bundles, local_scenes, read_plan, standard_scenes, suites
+from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 
 
@@ -50,7 +50,7 @@ def test_other_suites(tmp_path: Path) -> None:
     train, truck = standard_scenes(suites()["tanksandtemples"], make_suite(tmp_path / "a", "tanksandtemples"))
     assert "--downscale-factor 1" in " ".join(train.parser) and truck.name == "truck"
     scenes = standard_scenes(suites()["nerf-synthetic"], make_suite(tmp_path / "b", "nerf-synthetic"))
-    assert len(scenes) == 8 and scenes[0].parser == ("blender-data",) and scenes[0].hold_out == 0
+    assert len(scenes) == 8 and scenes[0].parser == ("blender-data",)
 
 
 def test_a_folder_of_another_layout_is_named(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
     (lego / "transforms_train.json").write_text("{}")
     (lego / "hull_pc.ply").write_text("")
     first, second = local_scenes([capture("fox"), lego])
-    assert first.parser == () and first.hold_out == 8
+    assert first.parser == ()
     assert second.parser == ("blender-data", "--ply-path", "hull_pc.ply")
     with pytest.raises(BenchError, match="is not a capture"):
         local_scenes([tmp_path / "captures" / "fox" / "images"])
@@ -77,11 +77,11 @@ def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
         local_scenes([])
 
 
-@pytest.mark.parametrize("name", ["ablation", "overdraw", "paper", "resolution"])
+@pytest.mark.parametrize("name", ["ablation", "overdraw", "resolution"])
 def test_plans_name_methods_that_there_are(name: str) -> None:
     rows, bundles = read_plan(name)
     assert {row.method for row in rows} <= set(preset_names()) and len({row.name for row in rows}) == len(rows) > 2
-    assert bundles is None if name == "paper" else len(bundles) == (name == "overdraw")
+    assert bundles is not None and len(bundles) == (name == "overdraw")
 
 
 def test_the_atlas_plan_compares_rules_of_one_run() -> None:
@@ -101,13 +101,15 @@ def test_a_plan_of_ones_own(tmp_path: Path) -> None:
     ("text", "reason"),
     [
         ("rows: [", "is not valid YAML"),
-        ("rows: {}", "'rows' must map names"),
-        ("rows: {a: bitymi}", "row a: it must be"),
-        ("rows: {a: {method: bitymi, option: []}}", "row a: it must be"),
-        ("rows: {a: {method: bitymi, options: --x}}", "options must be a list"),
-        ("rows: {a: {method: bitymi}}\nbundle: {}", "unknown entry bundle"),
-        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "a bundle's name"),
-        ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "'bundles' must map names"),
+        ("rows: {}", "rows: Dictionary should have at least 1 item"),
+        ("rows: {a: bitymi}", r"rows, a: .*a plan has rows, NAME: \{method: NAME"),
+        ("rows: {a: {method: bitymi, option: []}}", "rows, a, option: Extra"),
+        ("rows: {a: {method: bitymi, options: --x}}", "rows, a, options: .*valid list"),
+        ("rows: {a: {method: ../x}}", "row a: "),
+        ("rows: {a: {method: bitymi}}\nbundle: {}", "bundle: Extra"),
+        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "bundles, ../x"),
+        ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "bundles: .*valid dictionary"),
+        ("3", "the file: "),
     ],
 )
 def test_a_malformed_plan_says_where(tmp_path: Path, text: str, reason: str) -> None:
@@ -128,46 +130,29 @@ def run(*words: object) -> int:
     return cli.main(["bench", *map(str, words)])
 
 
-def test_the_command_prints_the_table_and_skips_what_is_done(
+def test_the_command_prints_the_tables_and_skips_what_is_done(
     fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["local", "--data", capture("fox"), "--steps", 10, "--formats", "bc7", "--pictures", 0]
+    words = ["local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7", "--pictures", 0]
     words += ["--work", tmp_path / "w", "--output", tmp_path / "table.md", "--extra=--a.b 1"]
+    fakes.fail("--format uint8")
+    assert run(*words) == 1
+    captured = capsys.readouterr()
+    assert "| bitymi, bc7 | 20.99 | 0.800 | 0.100 |" in captured.out and "−0.010 |" in captured.out
+    assert "- Failed: fox, bitymi: export (uint8) failed" in captured.out and "status 3" in captured.err
+    assert (tmp_path / "table.md").read_text() in captured.out and "--a.b 1" in fakes.calls()[0]
+    fakes.fail()
     assert run(*words) == 0
-    out = capsys.readouterr().out
-    assert "| fox | bitymi | bc7 | 20.99 | 0.8000 | 0.1000 |" in out and "-0.010 |" in out
-    assert (tmp_path / "table.md").read_text() in out
-    assert "--a.b 1" in fakes.calls()[0]
-    assert run(*words) == 0
-    assert fakes.calls() == [] and "4 of 4 cells are finished" in capsys.readouterr().err
-
-
-def test_several_bundles_are_compared(
-    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7", "--pictures", 0)
-    assert run(*words, "--work", tmp_path / "w") == 0
-    out = capsys.readouterr().out
-    assert "| fox | bitymi | bc7 | 100 | 16 | 5,000 | 1.000 | -0.010 | 50.00 | 0.0000 | 4.0 |" in out
+    assert len(fakes.calls()) == 2 and "4 of 6 cells are finished" in capsys.readouterr().err
 
 
 def test_a_plan_by_the_command(
     fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("local", "--data", capture("fox"), "--steps", 10, "--plan", "ablation", "--pictures", 0)
+    (tmp_path / "p.yaml").write_text("rows: {a: {method: bitymi}, b: {method: bitymi, options: [--x]}}\nbundles: {}")
+    words = ("local", "--data", capture("fox"), "--steps", 10, "--plan", tmp_path / "p.yaml", "--pictures", 0)
     assert run(*words, "--work", tmp_path / "w") == 0
-    out = capsys.readouterr().out
-    assert "| fox | falloff 0.001 | trained |" in out and len(fakes.calls()) == 20
-
-
-def test_failures_end_with_status_1(
-    fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fakes.fail("ns-export")
-    words = ("local", "--data", capture("fox"), "--steps", 10, "--formats", "bc7", "--pictures", 0)
-    assert run(*words, "--work", tmp_path / "w") == 1
-    captured = capsys.readouterr()
-    assert "- Failed: fox, bitymi: export (bc7) failed" in captured.out and "status 3" in captured.err
+    assert "| b | 21.00 |" in capsys.readouterr().out and len(fakes.calls()) == 4
 
 
 def test_ctrl_c_says_how_to_go_on(
@@ -178,7 +163,7 @@ def test_ctrl_c_says_how_to_go_on(
 
     monkeypatch.setattr("bitymi_ns.measure.bench.engine.run_measured", interrupted)
     assert run("local", "--data", capture("fox"), "--steps", 10, "--work", tmp_path / "w") == 130
-    assert "interrupted; no cell was finished. The same command goes on" in capsys.readouterr().err
+    assert "interrupted; no cell was finished. Run the same command to continue" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -189,7 +174,6 @@ def test_ctrl_c_says_how_to_go_on(
         (("mipnerf360", "--data", "/a", "/b"), "--data is one folder"),
         (("local", "--data", "/a", "--scenes", "x"), "--scenes chooses"),
         (("local", "--data", "/a", "--steps", "0"), "--steps must be"),
-        (("local", "--data", "/a", "--jobs", "2"), "are for --cluster"),
         (("local", "--data", "/a", "--pictures", "-1"), "--pictures must not"),
     ],
 )

@@ -1,14 +1,18 @@
-"""Results as a few short runs would leave them: two scenes, two methods, three atlas formats."""
+"""Results as short runs leave them (two scenes, two methods, three atlas formats), and a benchmark's work folder."""
 
 from __future__ import annotations
 
 import json
 import math
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 from PIL import Image
+
+from bitymi_ns.measure.report import build
 
 # scene, method: PSNR, SSIM, FLIP, surfels, milliseconds of the trained renderer
 RUNS = {
@@ -96,10 +100,99 @@ def write_results(root: Path) -> Path:
     return root
 
 
-@pytest.fixture
-def results(tmp_path: Path) -> Path:
-    """A folder with four runs, sixteen evaluations and rendered views."""
-    return write_results(tmp_path / "results")
+POSES: dict[str, Any] = {
+    "source": "/photos/garden", "given": 42, "registered": 39, "reprojection_error": 0.7312, "track_length": 4.256,
+    "points": 12_345, "parallax_degrees": 11.04, "metres_per_unit": 1.0, "gps_error": 2.34,
+    "left_out": {"IMG <1>.jpg": "no other photograph shows the same", **{f"{i:03d}.jpg": "blurred" for i in range(99)}},
+    "notes": {"IMG_3.jpg": "too dark"}, "seconds": {"finding features": 12.34, "all": 56.78},
+}  # fmt: skip
+"""report.json of found poses."""
+
+
+def write_poses(folder: Path, **changes: Any) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "report.json").write_text(json.dumps({**POSES, **changes}))
+    Image.new("RGB", (120, 60), "white").save(folder / "cameras.png")
+    return folder / "report.json"
+
+
+def cell(kind: str, value: dict[str, Any], bundle: str = "", **key: Any) -> dict[str, Any]:
+    """A line of cells.jsonl."""
+    settings = {
+        "cell": kind, "suite": "local", "row": "bitymi", "scene": "fox", "data": "/data/fox", "parser": [],
+        "method": "bitymi", "options": [], "steps": 100, "seed": 0, **key,
+    }  # fmt: skip
+    if bundle:
+        settings |= {"bundle": bundle, "export": ["--format", bundle]}
+    return {"key": settings, "value": value, "made": {"machine": "Abacus, 10 beads", "seconds": 3.0}}
+
+
+def figures(psnr: float, ms: float, **more: float) -> dict[str, Any]:
+    return {"results": {"psnr": psnr, "ssim": 0.8, "flip": 0.1, "surfels": 5000.0, "render_ms": ms, **more}}
+
+
+def knob(value: Any, exact: bool = False, mean: float = 0.5) -> dict[str, Any]:
+    return {
+        "knob": "format", "value": value, "renderer": "baked", "exact": exact, "default": value == "bc7",
+        "max_steps": 0.0 if exact else 4 * mean, "mean_steps": 0.0 if exact else mean, "psnr_exact": 60.0,
+        "psnr": 25.0, "ms": 4.0, "cpu_ms": 8.0, "bytes": 1_000_000, "against": "texels; exact: floats",
+    }  # fmt: skip
+
+
+def write_lines(path: Path, lines: list[dict[str, Any]]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return path
+
+
+def write_work(folder: Path) -> Path:
+    """A work folder: two seeds of one row, baked, with pictures and knobs."""
+    cells = []
+    for seed, shift in ((0, 0.0), (1, 0.2)):
+        curve = folder / "runs" / str(seed) / "training_curve.jsonl"
+        write_lines(curve, [{"step": s, "seconds": s / 10, "psnr": 20 + s / 50} for s in (50, 100)])
+        train = {"steps": 100, "seconds": 10.0 + seed, "cpu_seconds": 20.0, "surfels": 5000}
+        cells.append(cell("train", {**train, "curve": f"runs/{seed}/training_curve.jsonl"}, seed=seed))
+        cells.append(cell("eval", figures(25.0 + shift, 30.0), seed=seed))
+        cells.append(cell("export", {"bytes": 3_000_000, "format": "bc7"}, "bc7", seed=seed))
+        cells.append(cell("eval", figures(24.9 + shift, 10.0, atlas_bytes=2e6), "bc7", seed=seed))
+    pictures = folder / "pictures"
+    pictures.mkdir()
+    Image.new("RGB", (1600, 900), (200, 10, 10)).save(pictures / "v.png")
+    files = {"photo": "v.png", "final": "gone.png"}
+    view = {"view": 4, "rank": 1, "of": 7, "metrics": {"psnr": 21.5, "flip": 0.2}, "files": files}
+    listed = {"bitymi_pictures": 1, "scene": "fox", "method": "bitymi", "captions": {"photo": "the photo"}}
+    (pictures / "pictures.json").write_text(json.dumps({**listed, "views": [view]}))
+    cells.append(cell("pictures", {"folder": "pictures", "views": 1}))
+    cells.append(cell("knobs", {"points": [knob("float32", True), knob("fp16", mean=0.1), knob("bc7")]}))
+    write_lines(folder / "cells.jsonl", cells)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with four runs, sixteen evaluations, rendered views, poses of one capture, broken files. Not to be
+    changed."""
+    root = write_results(tmp_path_factory.mktemp("report") / "results")
+    for run in root.glob("outputs/*/bitymi/*"):
+        write_poses(run / "poses")
+    (root / "evals" / "fox" / "broken.json").write_text('{"results": {"psnr": 2')
+    (root / "renders" / "fox" / "trained" / "eval_img_0099.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
+    return root
+
+
+@pytest.fixture(scope="session")
+def page(results: Path) -> str:
+    """The report of `results`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(matplotlib.rcParams, "text.usetex", True)  # as a matplotlibrc in the current folder may ask
+        return build([results], results.with_name("report"), title="Two <scenes>").read_text("utf8")
+
+
+@pytest.fixture(scope="session")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A benchmark's work folder. Not to be changed."""
+    return write_work(tmp_path_factory.mktemp("bench") / "work")
 
 
 @pytest.fixture

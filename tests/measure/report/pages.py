@@ -7,8 +7,8 @@ from typing import Any
 from bitymi_ns.measure.report.page import Content, to_page
 
 EMPTY: dict[str, Any] = {
-    "title": "", "intro": "", "summary": [], "quality": [], "training": None, "everything": None, "poses": [],
-    "plots": [], "knobs": [], "paper": [], "views": [], "worst": [], "gallery": [], "notes": [],
+    "title": "", "intro": "", "summary": [], "views": [], "quality": [], "training": None, "poses": [], "sections": [],
+    "knobs": [], "worst": [], "notes": [],
 }  # fmt: skip
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
-from bitymi_ns.measure.report.collect import collect
-from bitymi_ns.measure.report.records import ReportError, evaluation_from, read_json, read_jsonl, trained_parent
+from bitymi_ns.measure.report.read import collect, parse_json, read_jsonl
+from bitymi_ns.measure.report.records import ReportError, evaluation_from, over_seeds, psnr_delta, trained_parent
+from tests.measure.report.conftest import cell, figures, write_lines
 
 
 def make(scene="fox", method="bitymi", checkpoint="", source="a/eval.json", **results):
@@ -19,7 +21,7 @@ def make(scene="fox", method="bitymi", checkpoint="", source="a/eval.json", **re
 def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
     path = tmp_path / "eval.json"
     path.write_text('{"results": {"psnr": 20.5, "psnr_std": NaN, "lpips": Infinity, "note": "x", "flag": true}}')
-    row = evaluation_from(read_json(path), path)
+    row = evaluation_from(parse_json(path.read_text(), "it"), path)
     assert row.results == {"psnr": 20.5}
     assert row.scene == tmp_path.name and row.method == "unnamed method"
 
@@ -71,7 +73,7 @@ def test_curve_keeps_the_last_line_of_a_repeated_step_and_leaves_out_a_cut_last_
     evaluations, (curve,), notes = read_jsonl(path)
     assert not evaluations
     assert curve.series("step", "psnr") == ([0.0, 100.0], [9.0, 15.0])
-    assert curve.last("step") == 200 and curve.best("psnr") == 15.0 and curve.last("seconds") is None
+    assert curve.last("step") == 200 and curve.last("seconds") is None
     assert len(notes) == 1 and "cut off" in notes[0]
 
 
@@ -95,8 +97,8 @@ def test_results_folder(results: Path, tmp_path: Path):
     assert {(c.scene, c.label) for c in records.curves} == {
         (scene, method) for scene in ("fox", "snowmiku") for method in ("bitymi", "bitymi-quality")
     }
-    assert len(records.images) == 28
-    assert not records.notes
+    assert len(records.images) == 29 and len(records.poses) == 2
+    assert len(records.notes) == 1
 
 
 def test_curve_is_named_by_the_run_folders_without_an_evaluation(results: Path, tmp_path: Path):
@@ -127,3 +129,70 @@ def test_link_that_leads_back_does_not_loop(eval_json, tmp_path: Path):
     eval_json("in/e.json", psnr=2.0)
     (tmp_path / "in" / "again").symlink_to(tmp_path / "in")
     assert len(collect([tmp_path / "in"], tmp_path / "report").evaluations) == 1
+
+
+# cells of a benchmark
+
+
+def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(work, tmp_path / "work"))
+    (copy / "evals").mkdir()
+    (copy / "evals" / "trained.json").write_text('{"results": {"psnr": 1.0}}')
+    records = collect([tmp_path], tmp_path / "report")
+    assert [e.results["psnr"] for e in records.evaluations] == pytest.approx([25.0, 24.9, 25.2, 25.1])
+    assert [e.label for e in records.evaluations[:2]] == ["bitymi, seed 0", "bitymi, bc7, seed 0"]
+    assert records.evaluations[1].results["bundle_bytes"] == 3e6
+    assert records.evaluations[3].results["train_seconds"] == 11.0
+    assert [c.label for c in records.curves] == ["bitymi, seed 0", "bitymi, seed 1"]
+    assert len(records.knobs) == 3 and len(records.worst) == 1 and records.machines == ["Abacus, 10 beads"]
+    trained, baked = over_seeds(records.evaluations)
+    assert trained.label == "bitymi (2 seeds)" and trained.results["psnr"] == pytest.approx(25.1)
+    assert baked.results["psnr_seeds"] == pytest.approx(0.1414, abs=1e-3)
+    assert baked.label == "bitymi, bc7 (2 seeds)"
+
+
+def test_a_bundle_of_one_seed_is_compared_with_that_seed(work: Path, tmp_path: Path) -> None:
+    rows = collect([work], tmp_path / "report").evaluations
+    only = [row for row in rows if not row.baked or row.seed == 0]
+    merged = over_seeds(only)
+    assert len(only) == 3 and [row.baked for row in merged] == [False, True]
+    before, after = (row.results["psnr"] for row in only if row.seed == 0)
+    assert psnr_delta(merged[1], merged) == pytest.approx(after - before)
+
+
+def test_of_equal_keys_the_last_line_counts(tmp_path: Path) -> None:
+    path = write_lines(tmp_path / "cells.jsonl", [cell("eval", figures(p, 9.0), row=f"row {p}") for p in (20, 21)])
+    (row,) = collect([path], tmp_path / "report").evaluations
+    assert row.results["psnr"] == 21 and row.method == "row 21"
+
+
+def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
+    cells = [cell("eval", figures(20, 9.0), steps=s) for s in (100, 1200, None)]
+    path = write_lines(tmp_path / "cells.jsonl", cells)
+    labels = [e.method for e in collect([path], tmp_path / "report").evaluations]
+    assert labels == ["bitymi, 100 steps", "bitymi, 1,200 steps", "bitymi, own length"]
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("{}", r"line 2, is not a cell of a benchmark"),
+        ('{"key": {"cell": "eval"}, "value": {}}', r"line 2: the eval cell lacks .*psnr"),
+        ('{"key": {"cell": "knobs"}, "value": {}}', r"line 2: the knobs cell lacks 'points'"),
+        ('{"key": {"cell": "pictures"}, "value": {}}', r"line 2: the pictures cell lacks 'folder'"),
+        ("nonsense", r"line 2, is not valid JSON"),
+    ],
+)
+def test_malformed_lines_are_named(tmp_path: Path, line: str, reason: str) -> None:
+    good = json.dumps(cell("eval", figures(20.0, 5.0)))
+    (tmp_path / "cells.jsonl").write_text(f"{good}\n{line}\n{good}\n")
+    with pytest.raises(ReportError, match=reason):
+        collect([tmp_path / "cells.jsonl"], tmp_path / "report")
+
+
+@pytest.mark.parametrize("change", [{"views": [{}]}, {"views": 3}, {"captions": None}])
+def test_malformed_pictures_are_named(work: Path, tmp_path: Path, change: dict) -> None:
+    listed = json.loads((work / "pictures" / "pictures.json").read_text())
+    (tmp_path / "pictures.json").write_text(json.dumps({**listed, **change}))
+    with pytest.raises(ReportError, match=r"pictures\.json does not list its views"):
+        collect([tmp_path / "pictures.json"], tmp_path / "report")

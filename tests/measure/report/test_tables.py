@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bitymi_ns.measure.report.records import Records, evaluation_from
+from bitymi_ns.measure.report.records import evaluation_from
 from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, summary, to_markdown
 from tests.measure.report.pages import page_of
 
@@ -17,7 +17,7 @@ def make(scene="fox", method="bitymi", source="a/eval.json", **results):
 
 
 def test_columns_that_no_row_fills_are_left_out():
-    (table,) = quality_tables(Records([make(psnr=20.0, ssim=0.9)]))
+    (table,) = quality_tables([make(psnr=20.0, ssim=0.9)])
     assert table.header == ("Method", "PSNR ↑", "SSIM ↑")
 
 
@@ -26,7 +26,7 @@ def test_layout_before_and_after_baking():
         make(psnr=27.40, flip=0.12, render_ms=50.0, surfels=12345, atlas_bytes=0),
         make(psnr=27.38, flip=0.12, render_ms=10.0, surfels=12345, atlas_bytes=2_500_000, method="bitymi-bundle"),
     ]
-    (table,) = quality_tables(Records(rows))
+    (table,) = quality_tables(rows)
     assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Points ↓", "ms ↓", "FPS ↑", "Atlas MB ↓", "ΔPSNR")
     before, trained, after, baked = table.rows
     assert before.section and after.section
@@ -37,13 +37,13 @@ def test_layout_before_and_after_baking():
 
 def test_missing_values_are_dashes_and_never_best():
     rows = [make(psnr=20.0, lpips=float("nan")), make(method="other", psnr=21.0, lpips=0.2)]
-    (table,) = quality_tables(Records(rows))
+    (table,) = quality_tables(rows)
     assert table.rows[1].cells[2] == "–" and 2 not in table.rows[1].best
 
 
 def test_means_only_over_what_covers_the_same_scenes():
     rows = [make(scene=s, psnr=p) for s, p in (("a", 20.0), ("b", 22.0))] + [make(scene="a", method="x", psnr=40.0)]
-    *scenes, mean = quality_tables(Records(rows))
+    *scenes, mean = quality_tables(rows)
     assert [t.title for t in scenes] == ["a", "b"]
     assert mean.title == "Mean of 2 scenes" and "a, b" in mean.note
     assert [row.cells for row in mean.rows if not row.section] == [("bitymi", "21.00")]
@@ -54,7 +54,7 @@ def test_summary_says_what_baking_changed():
         make(psnr=27.0, render_ms=50.0),
         make(psnr=26.99, render_ms=10.0, atlas_bytes=3_000_000, method="bitymi-bundle"),
     ]
-    (line,) = summary(Records(rows))
+    (line,) = summary(rows)
     assert "27.00 dB trained, 26.99 dB baked (−0.010)" in line
     assert "50.0 ms to 10.0 ms per view (5.0× as fast)" in line and "3.00 MB" in line
 
@@ -69,7 +69,7 @@ def test_significant(value: float, text: str):
 def test_names_cannot_break_the_table():
     table = Table("t", ("Method", "A"), (Row(("<script>a|b</script>", "1"), frozenset({1})),))
     title = table.rows[0].cells[0]
-    page = page_of(title=title, summary=[title], quality=[table], training=table, everything=table, paper=[table])
+    page = page_of(title=title, summary=[title], quality=[table], training=table, knobs=[table], poses=[([table], ())])
     assert "<script>" not in page and page.count("<th>&lt;script&gt;a|b&lt;/script&gt;</th>") == 4
     assert page.count("<td><b>1</b></td>") == 4 and "<title>&lt;script&gt;a|b&lt;/script&gt;</title>" in page
     assert to_markdown(table).splitlines()[2] == "| <script>a\\|b</script> | **1** |"

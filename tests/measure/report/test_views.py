@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.measure.report.views import ERROR_SCALE, compare_views, heat
+from bitymi_ns.measure.report.pictures import ERROR_SCALE, compare_views, heat
 from tests.measure.report.pages import page_of
 
 
@@ -27,8 +27,9 @@ def write(folder: Path, name: str, errors: list[float], tint: float = 0.0) -> li
 def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path: Path) -> None:
     trained = write(tmp_path, "trained", [0.1, 0.3, 0.2, 0.05, 0.15])
     baked = write(tmp_path, "baked", [0.1, 0.3, 0.2, 0.01, 0.15])
-    (compared,), others, notes = compare_views([*baked, *trained])
-    assert (others, notes, compared.title) == ([], [], "trained, baked")
+    notes: list[str] = []
+    (compared,) = compare_views([*baked, *trained], notes)
+    assert (notes, compared.title) == ([], "trained, baked")
     titles = [view.title for view in compared.views]
     assert titles == ["Worst view of 5: number 1", "Median view of 5: number 4", "Best view of 5: number 3"]
     for view in compared.views:
@@ -44,13 +45,13 @@ def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path
 
 
 def test_one_folder_has_its_error_beside_the_render(tmp_path: Path) -> None:
-    (compared,), _, _ = compare_views(write(tmp_path, "renders", [0.1, 0.2]))
+    (compared,) = compare_views(write(tmp_path, "renders", [0.1, 0.2]), [])
     html = page_of(views=[compared])
     assert len(re.findall(r"<div>\s*<figure>", html)) == 2 * 3  # two views are worst and best
 
 
 def test_renders_of_other_photographs_are_apart(tmp_path: Path) -> None:
-    sets, _, _ = compare_views([*write(tmp_path, "a", [0.1, 0.2]), *write(tmp_path, "b", [0.1, 0.2], tint=0.1)])
+    sets = compare_views([*write(tmp_path, "a", [0.1, 0.2]), *write(tmp_path, "b", [0.1, 0.2], tint=0.1)], [])
     assert [compared.title for compared in sets] == ["a", "b"]
     assert "<h3>a: Worst view" in page_of(views=sets) and "<h3>a: " not in page_of(views=sets[:1])
 
@@ -62,7 +63,8 @@ def test_a_picture_that_cannot_be_used_is_noted(tmp_path: Path, spoil: str) -> N
         paths[0].write_bytes(paths[0].read_bytes()[:40])
     else:
         Image.new("RGB", (9, 6)).save(paths[0])
-    (compared,), _, notes = compare_views(paths)
+    notes: list[str] = []
+    (compared,) = compare_views(paths, notes)
     assert len(compared.views) == 2 and len(notes) == 1 and str(paths[0]) in notes[0]
 
 

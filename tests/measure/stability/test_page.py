@@ -9,8 +9,7 @@ import pytest
 
 from bitymi_ns import cli
 from bitymi_ns.measure.stability import page
-from bitymi_ns.measure.stability.backends import BACKENDS
-from bitymi_ns.measure.stability.errors import Errors
+from bitymi_ns.measure.stability.errors import BACKENDS, Errors
 from bitymi_ns.measure.stability.scenes import random_scene
 
 

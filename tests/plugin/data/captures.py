@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.utils import colmap_parsing_utils as reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -19,8 +19,7 @@ from bitymi_ns.plugin.errors import InputError
 
 def load(data: Path, **dataparser: Any) -> BitymiDataManager:
     """The data manager of a capture in nerfstudio's format, every eighth view held out."""
-    options = {"eval_mode": "interval", "eval_interval": 8, "load_3D_points": True, **dataparser}
-    return load_with(data, NerfstudioDataParserConfig(**options))
+    return load_with(data, BitymiDataParserConfig(format="nerfstudio", **dataparser))
 
 
 def load_with(data: Path, dataparser: Any) -> BitymiDataManager:
@@ -42,7 +41,7 @@ def expect(message: str) -> Any:
     return pytest.raises(InputError, match=message)
 
 
-def said(capsys: pytest.CaptureFixture[str]) -> str:
+def printed(capsys: pytest.CaptureFixture[str]) -> str:
     """What was printed, on one line."""
     return " ".join(capsys.readouterr().out.split())
 
@@ -60,6 +59,14 @@ def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
         lines.append(f"{numbers} {Path(frame['file_path']).name}\n\n")
     (folder / "images.txt").write_text("".join(lines))
     (folder / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5 1 0 2 0\n2 0.1 0 0.5 200 10 10 0.5 1 0 2 0\n")
+
+
+def as_binary(model: Path) -> None:
+    """Write a text model anew in binary form."""
+    for what in ("cameras", "images", "points3D"):
+        read, write = getattr(reader, f"read_{what}_text"), getattr(reader, f"write_{what}_binary")
+        write(read(model / f"{what}.txt"), model / f"{what}.bin")
+        (model / f"{what}.txt").unlink()
 
 
 def mixed_project(folder: Path) -> Path:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bitymi_ns.plugin.data.colmap_model import read_model
-from tests.plugin.data.captures import expect, images_of, load_any, said
-from tests.plugin.data.test_colmap import as_binary
+from tests.plugin.data.captures import as_binary, expect, images_of, load_any, printed
 
 
 def points(project: Path, *rows: str) -> Path:
@@ -53,7 +52,7 @@ def test_second_lines_with_points(project: Path) -> None:
 )
 def test_colours_by_which_white_they_fit(project: Path, colours: tuple[str, str], expected: list[list[int]]) -> None:
     model = read_model(points(project, f"0 0 0.5 {colours[0]} 0.5", f"0.1 0 0.5 {colours[1]} 0.5"))
-    assert model.rgb.tolist() == expected and not model.without_colours
+    assert model.rgb.tolist() == expected and not model.without_colors
 
 
 @pytest.mark.parametrize(
@@ -67,12 +66,12 @@ def test_points_without_colours_get_them_of_the_photographs(
     metadata = load_any(project).train_dataset.metadata
     assert np.allclose(read_model(folder).xyz, [[0, 0, 0.5], [0.1, 0, 0.4]])
     assert metadata["points3D_rgb"].shape == (2, 3) and metadata["points3D_rgb"].any()
-    assert f"The points of {folder} get the colours of the photographs" in (text := said(capsys)) and why in text
+    assert f"The points of {folder} get the colors of the photographs" in (text := printed(capsys)) and why in text
 
 
 def test_points_of_two_kinds(project: Path) -> None:
     folder = points(project, "0 0 0.5 200 10 10", "0.1 0 0.5")
-    with expect("points3D.txt has a line that cannot be read .*three coordinates and three colours"):
+    with expect("points3D.txt has a line that cannot be read .*three coordinates and three colors"):
         read_model(folder)
 
 
@@ -83,14 +82,14 @@ def test_two_forms_that_differ(project: Path, capsys: pytest.CaptureFixture[str]
     for name, text in texts.items():
         (folder / name).write_text(text)
     read_model(folder)
-    assert "two models" not in said(capsys)
+    assert "two models" not in printed(capsys)
     (folder / "images.txt").write_text("\n".join(texts["images.txt"].split("\n")[:8]))
     (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
     assert len(read_model(folder).images) == 4
     assert (
         f"{folder} holds two models: 4 images in text and 12 in binary form and other cameras in text than in binary "
         "form. The text is read. To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
-    ) in said(capsys)
+    ) in printed(capsys)
 
 
 def test_a_single_file_in_text_is_of_another_model(project: Path) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.plugin.data.ply import read_points
-from tests.plugin.data.captures import colmap_model, load_any, said
+from bitymi_ns.plugin.data.point_files import read_points
+from tests.plugin.data.captures import colmap_model, load_any, printed
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 Pose = np.ndarray
@@ -49,7 +49,7 @@ def test_of_a_transforms_json(
 
     edit(capture, change)
     load_any(capture)
-    text = said(capsys)
+    text = printed(capsys)
     assert f"another convention: {message}" in text and WRONG in text
 
 
@@ -80,7 +80,7 @@ def test_of_a_colmap_model(
         lines.append(f"{' '.join(map(str, [number, *pose, camera, name]))}\n\n")
     model.write_text("".join(lines))
     load_any(model.parents[2])
-    text = said(capsys)
+    text = printed(capsys)
     assert f"another convention: {message}" in text and WRONG in text
 
 
@@ -92,9 +92,9 @@ def test_right_ones_are_nothing_to_speak_of(capture: Path, colours: bool, capsys
         header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
         (capture / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z}\n" for x, y, z in xyz))
     load_any(capture)
-    assert "convention" not in said(capsys)
+    assert "convention" not in printed(capsys)
 
 
 def test_right_ones_of_a_colmap_model(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     load_any(model.parents[2])
-    assert "convention" not in said(capsys)
+    assert "convention" not in printed(capsys)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
@@ -18,8 +21,7 @@ from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.train.views import View
-from tests.plugin.data.captures import expect, images_of, load_any, load_with, mixed_project, said
-from tests.plugin.data.test_colmap import as_binary
+from tests.plugin.data.captures import as_binary, expect, images_of, load_any, mixed_project, printed
 from tests.plugin.data.test_lens import MODELS, camera_of
 
 
@@ -43,7 +45,8 @@ def test_poses_and_points_are_those_of_nerfstudios_parser(
 ) -> None:
     if binary:
         as_binary(project / "sparse/0")
-    stock = load_with(project, ColmapDataParserConfig(colmap_path=Path("sparse/0")))
+    stock = ColmapDataParserConfig(data=project, colmap_path=Path("sparse/0"), downscale_factor=1).setup()
+    theirs = {"train": stock.get_dataparser_outputs("train"), "val": stock.get_dataparser_outputs("val")}
     (project / "sparse/0").rename(project / "model")
     (project / "sparse").rmdir()
     (project / place).mkdir(parents=True, exist_ok=True)
@@ -55,14 +58,13 @@ def test_poses_and_points_are_those_of_nerfstudios_parser(
     folder = str(project / place)
     assert (
         f"Reading COLMAP model {folder} (12 photographs, 1 PINHOLE camera, 2 points), photographs {project}/images."
-    ) in said(capsys)
-    for split in ("train_dataset", "eval_dataset"):
-        a, b = getattr(one, split), getattr(stock, split)
+    ) in printed(capsys)
+    for a, b in ((one.train_dataset, theirs["train"]), (one.eval_dataset, theirs["val"])):
         assert a.image_filenames == b.image_filenames
         assert torch.allclose(a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, rtol=0, atol=2e-6)
         for column in ("fx", "fy", "cx", "cy", "width", "height"):
             assert torch.equal(getattr(a.cameras, column), getattr(b.cameras, column)), column
-    a, b = one.train_dataparser_outputs, stock.train_dataparser_outputs
+    a, b = one.train_dataparser_outputs, theirs["train"]
     assert a.dataparser_scale == pytest.approx(b.dataparser_scale, rel=1e-5)
     assert torch.allclose(a.dataparser_transform, b.dataparser_transform.double(), rtol=0, atol=2e-6)
     assert torch.allclose(a.metadata["points3D_xyz"], b.metadata["points3D_xyz"], rtol=0, atol=2e-6)
@@ -89,7 +91,7 @@ def mixed(tmp_path: Path) -> Path:
 
 def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     manager = load_any(mixed)
-    text = said(capsys)
+    text = printed(capsys)
     assert "(9 photographs, 1 OPENCV_FISHEYE and 1 PINHOLE and 1 SIMPLE_RADIAL cameras, 99 points)" in text
     assert "Camera 3 of " in text and "is OPENCV_FISHEYE: its photographs are used as pinhole pictures of 10" in text
     sizes = set()
@@ -146,13 +148,18 @@ def test_undistorted_as_nerfstudio_does_it(project: Path) -> None:
     """The same scene point has the same colour in both pictures; they differ in how much they crop alone."""
     edit(project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", "OPENCV 48 36 40 41 23 19 0.08 -0.01 0.002 -0.001"))
     ours = load_any(project).train_views[3]
-    stock = load_with(project, ColmapDataParserConfig(colmap_path=Path("sparse/0"))).train_views[3]
-    a, b = ours.camera, stock.camera
+    path = load_any(project).train_dataset.image_filenames[3]
+    K = np.array([[40.0, 0.0, 23.0], [0.0, 41.0, 19.0], [0.0, 0.0, 1.0]])
+    camera = Cameras(torch.eye(4)[None, :3], 40.0, 41.0, 23.0, 19.0, 48, 36)[0]
+    batch = {"image": torch.from_numpy(np.array(Image.open(path).convert("RGB")))}
+    distortion = np.array([0.08, -0.01, 0.0, 0.0, 0.002, -0.001])
+    K, image, _ = _undistort_image(camera, distortion, batch, batch["image"].numpy(), K)
+    a, b = ours.camera, replace(ours.camera, K=torch.from_numpy(K))
     x, y = np.meshgrid(np.arange(8, 40, 2) + 0.5, np.arange(8, 28, 2) + 0.5)
     rays = np.stack([(x - float(a.K[0, 2])) / float(a.K[0, 0]), (y - float(a.K[1, 2])) / float(a.K[1, 1])], -1)
     there = rays * [float(b.K[0, 0]), float(b.K[1, 1])] + [float(b.K[0, 2]), float(b.K[1, 2])] - 0.5
     one = ours.image.numpy()[y.astype(int), x.astype(int)].astype(float)
-    other = cv2.remap(stock.image.numpy(), there.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
+    other = cv2.remap(image, there.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
     assert np.median(np.abs(one - other)) < 2.0 and np.abs(one - other).mean() < 5.0
 
 
@@ -195,7 +202,7 @@ def test_photographs_are_reduced_where_no_folder_has_smaller_ones(
     project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     manager = load_any(project, downscale_factor=2)
-    assert f"photographs {project}/images, reduced 2 times as they are read" in said(capsys)
+    assert f"photographs {project}/images, reduced 2 times as they are read" in printed(capsys)
     assert manager.cached_train[0]["image"].shape == (18, 24, 3)
     assert float(manager.train_dataset.cameras.fx[0]) == 20.0
 
@@ -237,7 +244,9 @@ def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytes
     for name in ("extra b.png", "extra a.png"):
         Image.new("RGB", (48, 36)).save(project / "images" / name)
     assert len(load_any(project).train_dataset) == 10
-    assert "2 of 14 photographs have no pose in the model and are left out: extra a.png, extra b.png." in said(capsys)
+    assert "2 of 14 photographs have no pose in the model and are left out: extra a.png, extra b.png." in printed(
+        capsys
+    )
 
 
 def test_photographs_of_the_model_that_are_not_there(project: Path) -> None:
@@ -307,7 +316,7 @@ def test_binary_files_that_are_not_whole(project: Path, name: str, change: Any) 
 def test_a_model_without_points_starts_from_random_ones(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (project / "sparse/0/points3D.txt").unlink()
     assert "points3D_xyz" not in load_any(project).train_dataparser_outputs.metadata
-    text = said(capsys)
+    text = printed(capsys)
     assert text.count("No points can be triangulated: not in this test. Training starts from random points.") == 1
     assert "splatfacto" not in text
 

@@ -13,7 +13,7 @@ import yaml
 from PIL import Image
 
 from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
-from tests.plugin.data.captures import expect, load_any, load_with, said
+from tests.plugin.data.captures import expect, load_any, load_with, printed
 from tests.plugin.data.test_dataparser import parsed
 
 
@@ -65,7 +65,7 @@ def test_photographs_and_videos_are_given_to_the_finding_of_poses(
         Image.new("RGB", (8, 8)).save(given / "a.png")
     manager = load_any(given)
     assert finder == [given] and len(manager.train_dataset) == 10
-    text = said(capsys)
+    text = printed(capsys)
     assert "matching" in text
     assert f"Poses of 12 of 13 photographs of {given}, to 0.50 pixels" in text
     assert "have no pose in the model and are left out: frame_00099.png (blurred)." in text

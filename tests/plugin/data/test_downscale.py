@@ -14,9 +14,8 @@ pytest.importorskip("nerfstudio")
 
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.downscale import reduced_size
 from bitymi_ns.plugin.data.images import read_image
-from bitymi_ns.plugin.data.lens import lens
+from bitymi_ns.plugin.data.lens import make_lens
 from tests.plugin.conftest import edit_transforms
 from tests.plugin.data.captures import expect
 
@@ -25,15 +24,6 @@ def load(capture: Path, longest_side: int) -> BitymiDataManager:
     parser = BitymiDataParserConfig()
     config = BitymiDataManagerConfig(data=capture, dataparser=parser, longest_side=longest_side)
     return config.setup(device="cpu", test_mode="val")
-
-
-@pytest.mark.parametrize(
-    ("size", "longest", "expected"),
-    [((4032, 3024), 1600, (1600, 1200)), ((3024, 4032), 1600, (1200, 1600)), ((1600, 9), 1600, (1600, 9)),
-     ((1000, 1), 10, (10, 1))],
-)  # fmt: skip
-def test_the_longer_side_decides(size: tuple[int, int], longest: int, expected: tuple[int, int]) -> None:
-    assert reduced_size(size, longest) == expected
 
 
 def test_cameras_and_pictures_are_reduced_together(capture: Path, capsys: pytest.CaptureFixture) -> None:
@@ -106,12 +96,12 @@ def test_a_negative_side_is_refused(capture: Path) -> None:
 
 
 def test_a_lens_is_reduced_with_its_photographs() -> None:
-    whole, _ = lens("SIMPLE_RADIAL", (800.0, 480.0, 360.0, 0.1), 960, 720, (960, 720), "camera 1")
-    half = whole.reduced(0.5)
+    whole, _ = make_lens("SIMPLE_RADIAL", (800.0, 480.0, 360.0, 0.1), 960, 720, (960, 720), "camera 1")
+    half = whole.downscaled(0.5)
     assert half.size == (480, 360) and half.stored == (960, 720)
     assert half.pinhole.view == pytest.approx(whole.pinhole.view, abs=0.2)
     grey = Image.fromarray(np.tile(np.linspace(0, 255, 960).astype(np.uint8), (720, 1))).convert("RGB")
-    a, b = (np.asarray(each.picture(grey)).astype(float) for each in (whole, half))
+    a, b = (np.asarray(each.undistort(grey)).astype(float) for each in (whole, half))
     a = a[: 2 * (len(a) // 2), : 2 * (a.shape[1] // 2)]
     a = a.reshape(len(a) // 2, 2, a.shape[1] // 2, 2, 3).mean((1, 3))
     h, w = min(len(a), len(b)), min(a.shape[1], b.shape[1])

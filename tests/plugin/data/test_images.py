@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from bitymi_ns.plugin.data import duplicates
+from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.data.images import Note, note, read_image, read_mask
-from tests.plugin.data.captures import expect, images_of, load, said
+from bitymi_ns.plugin.data.images import ImageSummary, read_image, read_mask, summarize
+from tests.plugin.data.captures import expect, images_of, load, load_with, printed
 from tests.profiles import DISPLAY_P3
 
 
@@ -132,7 +133,7 @@ def test_masks_without_a_pixel(capture: Path, edit: Any, capsys: pytest.CaptureF
     assert (len(manager.train_dataset), len(manager.eval_dataset)) == (9, 1)
     assert "frame_00005" not in "".join(map(str, manager.train_dataset.image_filenames))
     assert len(manager.cached_train) == 9 and manager.cached_eval[0]["mask"].all()
-    message = said(capsys)
+    message = printed(capsys)
     assert "The masks of 1 of 10 training photographs exclude every pixel" in message
     assert "The masks of 1 of 2 held-out photographs exclude every pixel" in message and "frame_00005.png" in message
 
@@ -153,7 +154,9 @@ def test_a_mask_for_some_frames_only(capture: Path, edit: Any) -> None:
 def test_the_colour_for_what_masks_exclude(capture: Path, edit: Any) -> None:
     add_masks(capture, edit, lambda i: True)
     Image.fromarray(np.uint8(np.arange(48) % 2 * 255)[None].repeat(36, 0)).save(capture / "masks/frame_00002.png")
-    image = load(capture, mask_color=(1.0, 0.0, 0.5)).cached_train[0]["image"]
+    image = load_with(
+        capture, NerfstudioDataParserConfig(mask_color=(1.0, 0.0, 0.5), eval_mode="interval")
+    ).cached_train[0]["image"]
     assert image.dtype == torch.uint8 and image[0, 0].tolist() == [255, 0, 128]
     original = np.asarray(Image.open(images_of(capture)[1]))
     assert np.array_equal(image[:, 1::2].numpy(), original[:, 1::2])
@@ -173,8 +176,8 @@ def test_photographs_that_show_nothing(capture: Path, capsys: pytest.CaptureFixt
     clear.putalpha(0)
     clear.save(paths[3])
     checked(capture)
-    message = said(capsys)
-    assert "1 show nothing, of one colour throughout" in message and paths[2].name in message
+    message = printed(capsys)
+    assert "1 show nothing, of one color throughout" in message and paths[2].name in message
     assert "1 show nothing, transparent everywhere" in message and paths[3].name in message
     for path in paths:
         clear.save(path)
@@ -184,23 +187,23 @@ def test_photographs_that_show_nothing(capture: Path, capsys: pytest.CaptureFixt
 
 def test_what_is_remembered_of_a_photograph(picture: np.ndarray) -> None:
     large = np.zeros((500, 400, 3), np.uint8)
-    assert note(large).empty == "of one colour throughout"
+    assert summarize(large).empty == "of one color throughout"
     large[1, 1] = 1  # between the pixels that are looked at first
-    assert note(large).empty == ""
-    assert note(picture) == Note("", note(picture.copy()).fingerprint)
-    assert note(picture).fingerprint != note(255 - picture).fingerprint
+    assert summarize(large).empty == ""
+    assert summarize(picture) == ImageSummary("", summarize(picture.copy()).fingerprint)
+    assert summarize(picture).fingerprint != summarize(255 - picture).fingerprint
 
 
 def test_the_same_photograph_on_both_sides(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = images_of(capture)
     shutil.copy(paths[0], paths[3])
     load(capture)
-    message = said(capsys)
+    message = printed(capsys)
     assert "1 of 2 held-out photographs are training photographs, too" in message
     assert f"{paths[0]} = {paths[3]}" in message and "remove the duplicates" in message
     Image.open(paths[8]).save(paths[5], compress_level=0)  # other bytes, the same pixels
     checked(capture)
-    message = said(capsys)
+    message = printed(capsys)
     assert f"{paths[8]} = {paths[5]}" in message and message.count(f"{paths[0]} = {paths[3]}") == 1
 
 
@@ -208,9 +211,9 @@ def test_a_frame_that_is_listed_twice(capture: Path, edit: Any, capsys: pytest.C
     edit(capture, lambda meta: meta["frames"].insert(1, dict(meta["frames"][0])))
     load(capture)
     first = images_of(capture)[0]
-    assert f"{first} = {first}" in said(capsys)
+    assert f"{first} = {first}" in printed(capsys)
     load(capture, eval_mode="all")
-    assert "held-out photographs are" not in said(capsys)
+    assert "held-out photographs are" not in printed(capsys)
 
 
 def test_only_files_of_equal_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,9 +221,9 @@ def test_only_files_of_equal_size_are_read(tmp_path: Path, monkeypatch: pytest.M
     for path, data in zip(paths, (b"one", b"other", b"two", b"one"), strict=True):
         path.write_bytes(data)
     read: list[str] = []
-    digest = duplicates._digest
-    monkeypatch.setattr(duplicates, "_digest", lambda path: read.append(path.name) or digest(path))
-    assert duplicates.same_files(paths[:2], paths[2:]) == [(0, 1)]
+    digest = images._digest
+    monkeypatch.setattr(images, "_digest", lambda path: read.append(path.name) or digest(path))
+    assert images.duplicate_files(paths[:2], paths[2:]) == [(0, 1)]
     assert sorted(read) == ["a", "c", "d"]
 
 
@@ -234,7 +237,7 @@ def test_turned_photographs(capture: Path, edit: Any, capsys: pytest.CaptureFixt
     paths = images_of(capture)
     with_orientation(paths[3], Image.open(paths[3]), 3)
     load(capture)
-    message = said(capsys)
+    message = printed(capsys)
     assert f"{paths[3]} has an EXIF tag that asks viewers to turn" in message and "mogrify -auto-orient" in message
     with_orientation(paths[3], Image.open(paths[3]).rotate(90, expand=True), 6)
     with expect(f"{paths[3].name} is stored turned by a quarter: it has 36 x 48 .* camera is for 48 x 36.*EXIF tag"):
@@ -255,14 +258,14 @@ def declared(path: Path, width: int, height: int) -> None:
 def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
     path = images_of(capture)[index]
     declared(path, 16320, 12240)  # of a phone's sensor of 200 million pixels
-    manager = load(capture)
+    manager = load(capture, points="random")
     assert len(manager.train_dataset) == 10
     declared(path, 60000, 60000)
     with expect(f"{path.name} has more than 1,000,000,000 pixels. Make it smaller"):
         load(capture)
 
 
-def test_colours_are_those_of_screens(tmp_path: Path) -> None:
+def test_colors_are_those_of_screens(tmp_path: Path) -> None:
     Image.new("RGB", (8, 8), (200, 100, 80)).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
     red, green, _ = read_image(tmp_path / "a.png").getpixel((2, 2))
     assert red > 205 and green < 100

@@ -18,7 +18,7 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.sample.capture import camera_path, render
 from bitymi_ns.sample.room import Room
-from tests.plugin.data.captures import load_any, said
+from tests.plugin.data.captures import load_any, printed
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)
@@ -60,7 +60,7 @@ def test_points_are_triangulated_once(
     there = ((points / scale - transform[:, 3]) @ transform[:, :3]).numpy() * [1, -1 if mirrored else 1, 1]
     assert len(there) > 30 and ((there > [-3.1, -2.6, -0.1]) & (there < [3.1, 2.6, 2.7])).all(1).mean() > 0.8
     assert outputs.metadata["points3D_rgb"].float().std() > 10
-    text = said(capsys)
+    text = printed(capsys)
     assert "has no points: they are triangulated from the photographs, once" in text and "splatfacto" not in text
     assert list((capture / ".bitymi").glob("points-*/points"))
 
@@ -90,7 +90,7 @@ def test_what_cannot_be_triangulated(
     for i in range(6):
         Image.new("RGB", SIZE, (40 * i, 0, 0)).save(capture / f"images/{i}.png")
     assert "points3D_xyz" not in load_any(capture).train_dataparser_outputs.metadata
-    assert "only 0 points can be triangulated from the given poses" in (text := said(capsys))
+    assert "only 0 points can be triangulated from the given poses" in (text := printed(capsys))
     assert "Training starts from random points." in text
 
 
@@ -141,17 +141,17 @@ def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form
     assert len(asked) == before + 1
 
 
-def test_points_without_colours_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_points_without_colors_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     header = read_header(capture / "sparse_pc.ply")
     rows = read_rows(capture / "sparse_pc.ply", header, "vertex")
-    with_colours = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
+    with_colors = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
     lines = "\n".join(f"{row['x']} {row['y']} {row['z']}" for row in rows)
     properties = "".join(f"property float {c}\n" for c in "xyz")
     (capture / "sparse_pc.ply").write_text(
         f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}end_header\n{lines}\n"
     )
     found = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
-    assert (found - with_colours).abs().mean() < 0.5 * (128.0 - with_colours).abs().mean()
-    assert "get the colours of the photographs that see them: its points have none." in said(capsys)
+    assert (found - with_colors).abs().mean() < 0.5 * (128.0 - with_colors).abs().mean()
+    assert "get the colors of the photographs that see them: its points have none." in printed(capsys)
     config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())
     assert len(config.setup(device="cpu", test_mode="test").train_dataparser_outputs.metadata["points3D_rgb"]) == 0

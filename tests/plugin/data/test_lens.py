@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bitymi_ns.plugin.data.images import read_image
-from bitymi_ns.plugin.data.lens import WIDEST, Lens, lens
-from tests.plugin.data.captures import expect, said
+from bitymi_ns.plugin.data.lens import MAX_VIEW_ANGLE, Lens, make_lens
+from tests.plugin.data.captures import expect, printed
 
 SIZE = (96, 72)
 MODELS = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
@@ -34,15 +34,15 @@ def picture(one: Lens) -> np.ndarray:
     width, height = one.stored
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     image = np.stack([x, y, 0 * x], -1) * 255.0
-    return np.asarray(one.picture(Image.fromarray(np.round(image).astype(np.uint8)))).astype(float)
+    return np.asarray(one.undistort(Image.fromarray(np.round(image).astype(np.uint8)))).astype(float)
 
 
 @pytest.mark.parametrize("f", [30.0, 60.0, 120.0])
 @pytest.mark.parametrize("model", MODELS)
 def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) -> None:
-    one, _ = lens(model, camera_of(model, f), *SIZE, SIZE, "camera 1")
+    one, _ = make_lens(model, camera_of(model, f), *SIZE, SIZE, "camera 1")
     to = one.pinhole
-    assert max(to.view) <= WIDEST + 0.01 or not one.distorts
+    assert max(to.view) <= MAX_VIEW_ANGLE + 0.01 or not one.distorts
     x, y = np.meshgrid(np.arange(to.width) + 0.5, np.arange(to.height) + 0.5)
     rays = np.stack([(x - to.cx) / to.fx, (y - to.cy) / to.fy, np.ones_like(x)], -1).reshape(-1, 3)
     camera = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(one.params))
@@ -58,7 +58,7 @@ def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) 
 def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) -> None:
     """Their edge touches that of the photograph, within a few pixels, unless they are as wide as allowed."""
     params = (f, center * SIZE[0], 0.5 * SIZE[1], k)
-    one, _ = lens("SIMPLE_RADIAL", params, *SIZE, SIZE, "camera 1")
+    one, _ = make_lens("SIMPLE_RADIAL", params, *SIZE, SIZE, "camera 1")
     to = one.pinhole
     x, y = np.meshgrid([0.0, to.width], [0.0, to.height])
     x, y = np.append(x, [to.cx, to.cx, 0.0, to.width]), np.append(y, [0.0, to.height, to.cy, to.cy])
@@ -66,53 +66,53 @@ def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) 
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=list(params))
     seen = camera.img_from_cam(rays)
     margin = min(seen.min(), (np.array(SIZE) - seen).min())
-    assert -0.01 < margin < 2.5 or max(to.view) > WIDEST - 3.0
+    assert -0.01 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0
 
 
 def test_a_pinhole_is_left_as_it_is() -> None:
     for model in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"):
-        one, told = lens(model, camera_of(model, 80.0, first=0.0), *SIZE, SIZE, "camera 1")
+        one, told = make_lens(model, camera_of(model, 80.0, first=0.0), *SIZE, SIZE, "camera 1")
         assert not one.distorts and told == [] and (one.pinhole.width, one.pinhole.height) == SIZE
         image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (72, 96, 4), np.uint8))
-        assert one.picture(image) is image
+        assert one.undistort(image) is image
 
 
 def test_a_fisheye_needs_no_coefficients() -> None:
-    one, told = lens("SIMPLE_FISHEYE", (30.0, 48.0, 36.0), *SIZE, SIZE, "camera 1 of x")
-    assert one.distorts and max(one.pinhole.view) == pytest.approx(WIDEST, abs=1.5)
+    one, told = make_lens("SIMPLE_FISHEYE", (30.0, 48.0, 36.0), *SIZE, SIZE, "camera 1 of x")
+    assert one.distorts and max(one.pinhole.view) == pytest.approx(MAX_VIEW_ANGLE, abs=1.5)
     assert "camera 1 of x is SIMPLE_FISHEYE: its photographs are used as pinhole pictures of 1" in told[0]
 
 
 def test_a_fisheye_that_sees_behind_itself() -> None:
-    one, _ = lens("OPENCV_FISHEYE", (20.0, 20.0, 48.0, 36.0, 0.01, 0.0, 0.0, 0.0), *SIZE, SIZE, "camera 1")
+    one, _ = make_lens("OPENCV_FISHEYE", (20.0, 20.0, 48.0, 36.0, 0.01, 0.0, 0.0, 0.0), *SIZE, SIZE, "camera 1")
     across, down = one.pinhole.view
-    assert 100.0 < across <= WIDEST and 100.0 < down <= WIDEST
-    assert one.pinhole.width == pytest.approx(2 * 20.0 * math.tan(math.radians(WIDEST / 2)), abs=1.5)
+    assert 100.0 < across <= MAX_VIEW_ANGLE and 100.0 < down <= MAX_VIEW_ANGLE
+    assert one.pinhole.width == pytest.approx(2 * 20.0 * math.tan(math.radians(MAX_VIEW_ANGLE / 2)), abs=1.5)
 
 
 def test_masks_go_with_their_photographs() -> None:
-    one, _ = lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, (192, 144), "camera 1")
+    one, _ = make_lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, (192, 144), "camera 1")
     mask = np.zeros((144, 192), bool)
     mask[:, 96:] = True
-    out = np.asarray(one.mask(Image.fromarray(mask), Path("m.png")))
+    out = np.asarray(one.undistort_mask(Image.fromarray(mask), Path("m.png")))
     assert out.dtype == bool and out.shape == (one.pinhole.height, one.pinhole.width)
     assert not out[:, : out.shape[1] // 2 - 1].any() and out[:, out.shape[1] // 2 + 1 :].all()
 
 
 def test_larger_photographs_are_averaged_down() -> None:
-    one, _ = lens("PINHOLE", (80.0, 80.0, 48.0, 36.0), *SIZE, (192, 144), "camera 1")
+    one, _ = make_lens("PINHOLE", (80.0, 80.0, 48.0, 36.0), *SIZE, (192, 144), "camera 1")
     stripes = np.tile(np.array([0, 255], np.uint8), (144, 96))[..., None].repeat(3, -1)
-    out = np.asarray(one.picture(Image.fromarray(stripes)))
+    out = np.asarray(one.undistort(Image.fromarray(stripes)))
     assert out.shape == (72, 96, 3) and np.abs(out.astype(int) - 127).max() <= 1
 
 
 def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
-    one, _ = lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, SIZE, "camera 1")
+    one, _ = make_lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, SIZE, "camera 1")
     Image.new("RGB", (10, 20)).save(tmp_path / "b.png")
     with expect("b.png has 10 x 20 pixels, but its camera is for 96 x 72"):
         read_image(tmp_path / "b.png", one.stored, one.size)
     with expect("m.png has 10 x 20 pixels, but its camera is for 96 x 72"):
-        one.mask(Image.new("1", (10, 20)), Path("m.png"))
+        one.undistort_mask(Image.new("1", (10, 20)), Path("m.png"))
 
 
 @pytest.mark.parametrize(
@@ -128,9 +128,9 @@ def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
 )
 def test_cameras_that_cannot_be_used(model: str, params: tuple[float, ...], message: str) -> None:
     with expect(message):
-        lens(model, params, *SIZE, SIZE, "camera 1")
+        make_lens(model, params, *SIZE, SIZE, "camera 1")
 
 
 def test_little_that_is_left_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, -6.0), *SIZE, SIZE, "camera 1")
-    assert "of camera 1. The lens distortion may be wrong" in said(capsys)
+    make_lens("SIMPLE_RADIAL", (80.0, 48.0, 36.0, -6.0), *SIZE, SIZE, "camera 1")
+    assert "of camera 1. The lens distortion may be wrong" in printed(capsys)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import time
 import weakref
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from bitymi_ns.plugin.data import datamanager as module
-from bitymi_ns.plugin.data import photographs
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
-from bitymi_ns.plugin.data.dataset import BitymiDataset
-from bitymi_ns.plugin.data.photographs import AT_ONCE, RECENT
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
 from bitymi_ns.plugin.errors import InputError
 from bitymi_ns.sample import generate
 
@@ -33,8 +30,9 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def load(capture: Path) -> BitymiDataManager:
-    parser = NerfstudioDataParserConfig(eval_mode="interval", eval_interval=8)
-    return BitymiDataManagerConfig(data=capture, dataparser=parser).setup(device="cpu", test_mode="val")
+    return BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig()).setup(
+        device="cpu", test_mode="val"
+    )
 
 
 @pytest.fixture
@@ -75,20 +73,6 @@ def test_only_so_many_pictures_are_held(many: Path, alive: Any, monkeypatch: pyt
     assert look_at_all(load(many), pictures) <= 6 + 2 * RECENT + 1
 
 
-def test_reading_does_not_run_ahead_of_what_is_kept(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 6 * PICTURE)
-    pictures, _ = alive
-    held = []
-
-    def slowly(*args: Any) -> None:
-        time.sleep(0.01)
-        held.append(len(pictures))
-
-    monkeypatch.setattr(photographs, "_set_camera", slowly)
-    _ = load(many).cached_train
-    assert len(held) == TRAIN and max(held) <= 6 + 2 * AT_ONCE
-
-
 def test_a_small_capture_is_read_once(many: Path, alive: Any) -> None:
     pictures, reads = alive
     assert look_at_all(load(many), pictures) == len(reads) == TRAIN + HELD_OUT
@@ -113,7 +97,7 @@ def test_pixels_and_cameras_are_the_same(
         assert torch.equal(one.get_intrinsics_matrices(), other.get_intrinsics_matrices())
         assert (int(one.width), int(one.height)) == (int(other.width), int(other.height))
         assert read.train_view(index)[1]["image"].shape[:2] == (int(other.height), int(other.width))
-    assert not read.train_cameras.distortion_params.any()
+    assert read.train_dataset.cameras.distortion_params is None
 
 
 def test_one_step_reads_its_photograph_once(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:

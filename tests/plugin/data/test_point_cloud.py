@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.plugin.data import point_cloud
-from bitymi_ns.plugin.data.ply import colours
-from bitymi_ns.plugin.data.point_cloud import what_is_wrong_with
+from bitymi_ns.plugin.data import point_files
+from bitymi_ns.plugin.data.point_files import ply_fault, read_points
 from bitymi_ns.plugin.run.scene_setup import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from tests.plugin.data.captures import load, said
+from tests.plugin.data.captures import load, printed
 
 HEADER = (
     "ply\nformat {}\ncomment by hand\nelement vertex {}\n"
@@ -30,16 +29,16 @@ def write(path: Path, body: bytes, format: str = BINARY, count: object = 3, furt
 
 def test_whole_clouds(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    assert what_is_wrong_with(write(path, bytes(45))) is None
-    assert what_is_wrong_with(write(path, b"", count=0)) is None
-    assert what_is_wrong_with(write(path, b"1.5 2 3 4\n3 4 5 nan\n\n5 6 7 8", "ascii 1.0")) is None
+    assert ply_fault(write(path, bytes(45))) is None
+    assert ply_fault(write(path, b"", count=0)) is None
+    assert ply_fault(write(path, b"1.5 2 3 4\n3 4 5 nan\n\n5 6 7 8", "ascii 1.0")) is None
     faces = "element face 1\nproperty list uchar int vertex_indices\n"
-    assert what_is_wrong_with(write(path, bytes(45 + 13), further=faces)) is None
+    assert ply_fault(write(path, bytes(45 + 13), further=faces)) is None
 
 
 @pytest.mark.parametrize(("body", "format", "there"), [(bytes(44), BINARY, 2), (b"1 2 3 4\n5 6 7 8\n", "ascii 1.0", 2)])
 def test_clouds_that_are_cut_off(tmp_path: Path, body: bytes, format: str, there: int) -> None:
-    assert what_is_wrong_with(write(tmp_path / "a.ply", body, format)) == f"is cut off: it has {there} of 3 points"
+    assert ply_fault(write(tmp_path / "a.ply", body, format)) == f"is cut off: it has {there} of 3 points"
 
 
 @pytest.mark.parametrize(
@@ -55,7 +54,7 @@ def test_clouds_that_are_cut_off(tmp_path: Path, body: bytes, format: str, there
 )
 def test_a_line_in_the_middle_that_is_no_point(tmp_path: Path, line: str, message: str) -> None:
     body = f"1 2 3 4\n\n{line}\n1 2 3 4\n"
-    assert what_is_wrong_with(write(tmp_path / "a.ply", body.encode(), "ascii 1.0")) == message
+    assert ply_fault(write(tmp_path / "a.ply", body.encode(), "ascii 1.0")) == message
 
 
 def test_points_behind_another_element(tmp_path: Path) -> None:
@@ -63,29 +62,29 @@ def test_points_behind_another_element(tmp_path: Path) -> None:
     whole = HEADER.replace("element vertex", "element camera 2\nproperty float f\nelement vertex")
     for format, body in ((BINARY, bytes(8 + 45)), ("ascii 1.0", b"1\n2\n" + 3 * b"1 2 3 4\n")):
         path.write_bytes(whole.format(format, 3, "").encode() + body)
-        assert what_is_wrong_with(path) is None
+        assert ply_fault(path) is None
         path.write_bytes(path.read_bytes()[:-8])
-        assert what_is_wrong_with(path) == "is cut off: it has 2 of 3 points"
+        assert ply_fault(path) == "is cut off: it has 2 of 3 points"
 
 
 def test_points_without_a_coordinate(tmp_path: Path) -> None:
     path = write(tmp_path / "a.ply", bytes(45))
     path.write_bytes(path.read_bytes().replace(b" z\n", b" q\n"))
-    assert what_is_wrong_with(path) == "gives no z of its points (property float z)"
+    assert ply_fault(path) == "gives no z of its points (property float z)"
 
 
 def test_rows_of_unknown_length_are_left_to_the_reader(tmp_path: Path) -> None:
-    assert what_is_wrong_with(write(tmp_path / "a.ply", b"", further="property list uchar int tags\n")) is None
+    assert ply_fault(write(tmp_path / "a.ply", b"", further="property list uchar int tags\n")) is None
 
 
 def test_other_files(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     for data in (b"", b"ply", b"hello", b"ply\nend_header"):
         path.write_bytes(data)
-        assert what_is_wrong_with(path) == "is not a PLY file"
-    assert "no points" in str(what_is_wrong_with(write(path, b"", count="many")))
-    assert "the count 'many' of the element vertex is not a number" in str(what_is_wrong_with(path))
-    assert "cannot be read" in str(what_is_wrong_with(tmp_path))
+        assert ply_fault(path) == "is not a PLY file"
+    assert "no points" in str(ply_fault(write(path, b"", count="many")))
+    assert "the count 'many' of the element vertex is not a number" in str(ply_fault(path))
+    assert "cannot be read" in str(ply_fault(tmp_path))
 
 
 def test_making_surfels_of_many_points_is_announced_and_timed(
@@ -98,7 +97,7 @@ def test_making_surfels_of_many_points_is_announced_and_timed(
         return " ".join(capsys.readouterr().out.split())
 
     assert printed() == ""
-    monkeypatch.setattr(point_cloud, "MANY_POINTS", 60)
+    monkeypatch.setattr(point_files, "MANY_POINTS", 60)
     message = printed()
     assert "Making surfels of 60 points. This may take minutes." in message
     assert "Making surfels of 60 points took" in message
@@ -110,8 +109,8 @@ def test_a_handful_of_points_is_doubted(capsys: pytest.CaptureFixture[str]) -> N
     assert "has only 1 different points to start from" in " ".join(capsys.readouterr().out.split())
 
 
-def coloured(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
-    """A cloud of which only the colours matter, [N, 3]."""
+def colored(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
+    """A cloud of which only the colors matter, [N, 3]."""
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(format)
     names = [f"property float {name}\n" for name in "xyz"] + [
         f"property {kind} {n}\n" for n in ("red", "green", "blue")
@@ -128,24 +127,16 @@ def coloured(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
 
 @pytest.mark.parametrize("format", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize(("kind", "white"), [("float", 1), ("double", 1), ("float", 255), ("ushort", 65535)])
-def test_colours_that_are_no_bytes(tmp_path: Path, format: str, kind: str, white: int) -> None:
+def test_colors_that_are_no_bytes(tmp_path: Path, format: str, kind: str, white: int) -> None:
     bytes_of = np.uint8([[0, 128, 255], [7, 66, 200]])
     values = bytes_of * (white / 255) if kind != "ushort" else bytes_of.astype(int) * 257
-    assert np.array_equal(colours(coloured(tmp_path / "a.ply", kind, values, format)), bytes_of)
+    points, without = read_points(colored(tmp_path / "a.ply", kind, values, format))
+    assert np.array_equal(points.rgb, bytes_of) and not without
 
 
-def test_colours_that_are_left_to_the_reader(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    assert colours(coloured(path, "uchar", np.uint8([[1, 2, 3]]), "binary_little_endian")) is None
-    assert colours(write(path, bytes(45))) is None
-    assert "lie between -1 and 2000" in str(colours(coloured(path, "float", np.float32([[-1, 0, 2000]]), "ascii")))
-
-
-def test_a_capture_keeps_the_colours_of_its_points(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bytes_of = np.random.default_rng(0).integers(0, 256, (60, 3), dtype=np.uint8)
-    cloud = capture / "sparse_pc.ply"
-    coloured(cloud, "float", bytes_of / np.float64(255), "ascii")
-    assert np.array_equal(load(capture).train_dataparser_outputs.metadata["points3D_rgb"].numpy(), bytes_of)
-    coloured(cloud, "float", bytes_of * 9.0, "ascii")
-    assert len(load(capture).train_dataparser_outputs.metadata["points3D_rgb"]) == 0
-    assert "sparse_pc.ply start without colours: its colours lie between 0 and" in said(capsys)
+def test_colors_of_unknown_scale(tmp_path: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points, without = read_points(write(tmp_path / "a.ply", bytes(45)))
+    assert len(points.rgb) == 0 and without == "its points have none"
+    colored(capture / "sparse_pc.ply", "float", np.float32([[-1, 0, 2000]] * 9), "ascii")
+    load(capture)
+    assert "get the colors of the photographs that see them: its colors lie between -1 and 2000" in printed(capsys)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import bitymi_ns.capture
-from bitymi_ns.bundle import check_files, check_place
+from bitymi_ns.bundle import check_files, check_world
 from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
@@ -89,9 +89,9 @@ def test_heights_and_distances_are_those_of_the_world(
     np.testing.assert_allclose(heights - heights[0], known[:, 2] - known[0, 2], atol=1e-4)
     spans = np.linalg.norm(places - places[0], axis=1) * world.metres_per_unit
     np.testing.assert_allclose(spans, np.linalg.norm(known - known[0], axis=1), atol=1e-4)
-    assert check_place(world, world_of(manager)).ok
+    assert check_world(world, world_of(manager)).ok
     for wrong in ({"up": (0.0, 0.6, 0.8)}, {"metres_per_unit": 1.01 * world.metres_per_unit}, {"scale": 7.0}):
-        assert not check_place(world.but(**wrong), world_of(manager)).ok
+        assert not check_world(world.but(**wrong), world_of(manager)).ok
 
 
 def test_every_camera_is_turned_with_its_capture(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:

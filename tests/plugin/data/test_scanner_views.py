@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.plugin.data.captures import expect, load_any, said
+from tests.plugin.data.captures import expect, load_any, printed
 
 Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """From a world with z up to ARKit's."""
@@ -110,7 +110,7 @@ def test_scans_are_read_with_their_poses(
         np.testing.assert_allclose(here, scale * there, atol=1e-4)
     assert np.allclose(other.cameras.fx, one.cameras.fx, atol=1e-3) and np.allclose(other.cameras.cy, one.cameras.cy)
     assert b[:, 2, 1].mean() > 0.5  # z is up
-    assert "12 photographs with their poses" in (text := said(capsys))
+    assert "12 photographs with their poses" in (text := printed(capsys))
     assert "depth maps" in text or "depth map" in text
 
 
@@ -148,7 +148,7 @@ def test_a_pose_that_was_lost(capture: Path, tmp_path: Path, capsys: pytest.Capt
     folder = scannet(capture, tmp_path / "set")
     np.savetxt(folder / "pose/4.txt", np.full((4, 4), -np.inf))
     assert len(load_any(folder, eval_mode="all").train_dataset) == 11
-    assert "1 photographs of" in said(capsys)
+    assert "1 photographs of" in printed(capsys)
 
 
 def test_pictures_of_another_shape(capture: Path, tmp_path: Path) -> None:

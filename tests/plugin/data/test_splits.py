@@ -14,7 +14,7 @@ TWINS = [Path("/c/left/a.jpg"), Path("/c/left/b c.jpg"), Path("/c/right/a.jpg"),
 def test_every_eighth_by_name() -> None:
     split = splits.by_mode(NAMES, "interval", 8, 0.9)
     assert split.held_out == [0, 8, 16] and sorted(split.train + split.held_out) == list(range(20))
-    assert split.told(NAMES) == (
+    assert split.describe(NAMES) == (
         "Held out for evaluation: 3 of 20 photographs, every 8th by name (00.jpg, 08.jpg and 1 more)."
     )
 
@@ -23,7 +23,7 @@ def test_ordinals() -> None:
     numbers = (1, 2, 3, 4, 10, 11, 12, 13, 20, 21, 22, 23, 101, 111, 112, 1013)
     text = "1st 2nd 3rd 4th 10th 11th 12th 13th 20th 21st 22nd 23rd 101st 111th 112th 1013th"
     assert " ".join(map(splits.ordinal, numbers)) == text
-    assert "every 21st by name" in splits.by_mode(NAMES, "interval", 21, 0.9).told(NAMES)
+    assert "every 21st by name" in splits.by_mode(NAMES, "interval", 21, 0.9).describe(NAMES)
 
 
 def test_the_other_rules() -> None:
@@ -61,7 +61,7 @@ def test_names_from_a_file(tmp_path: Path) -> None:
 
 
 def test_nothing_held_out_is_said() -> None:
-    assert "none is held out" in splits.Split([0, 1], [], "by lists").told(NAMES[:2])
+    assert "none is held out" in splits.Split([0, 1], [], "by lists").describe(NAMES[:2])
 
 
 def test_names_in_another_case_or_with_another_ending() -> None:
@@ -72,7 +72,7 @@ def test_names_in_another_case_or_with_another_ending() -> None:
 
 def test_names_of_another_machine() -> None:
     names = ["D:\\scan\\left\\a.jpg", "/home/me/scan/right/a.jpg", "b c.jpg"]
-    assert splits.find(TWINS, names, "the lists", anywhere=True) == [0, 2, 1]
+    assert splits.find(TWINS, names, "the lists", any_folder=True) == [0, 2, 1]
     with expect("2 of 3 names are of no photograph"):  # a name that a user gives is meant as it is
         splits.find(TWINS, names, "--eval-names")
 

@@ -1,0 +1,284 @@
+"""Shared by the kernel benchmarks: timing on the device, the card's measured limits, scenes like trained ones."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from common import say
+from torch import Tensor
+from torch.nn.functional import l1_loss
+
+from bitymi_ns import ops
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.scene.scene import Scene
+from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.texels import blank_texels
+from bitymi_ns.train.views import View
+
+SITES = 7
+LOG2_TABLE = 17
+FAILURES: list[str] = []
+T = TypeVar("T")
+CROSSING = 0.016
+"""Share of the surfels that cross the camera's plane out of view."""
+PIXEL_SCALE = 0.9
+"""Median scale of a surfel over the side of its share of the image."""
+CLOCK = 2.0e9
+"""Cycles per second, at most about what cards run at: how long `torch.cuda._sleep` spins."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of a benchmark.
+
+    Attributes:
+        device: of the kernels; the CPU = their emulation, to try a script without a card.
+        warm_up, runs: of every timing.
+        surfels: sizes of the synthetic scenes.
+        sizes: image sizes, width and height.
+        copy_bytes: bytes per second of a device-to-device copy, read and written bytes counted.
+        bundles: folders of baked scenes to draw as well.
+        peers: time gsplat, too.
+    """
+
+    device: torch.device
+    warm_up: int
+    runs: int
+    surfels: Sequence[int] = ()
+    sizes: Sequence[tuple[int, int]] = ()
+    copy_bytes: float = 0.0
+    bundles: Sequence[Path] = ()
+    peers: bool = True
+
+
+def attempt(what: str, run: Callable[[], T]) -> T | None:
+    """Run a part of a section; None where it failed, which is noted in FAILURES."""
+    try:
+        return run()
+    except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
+        text = f"{what}: {type(error).__name__}: {' '.join(str(error).split())[:400]}"
+        say(text)
+        FAILURES.append(text)
+        return None
+
+
+def failures() -> str:
+    """The parts that failed so far, as a list in Markdown."""
+    return "".join(f"\n\n- Failed: {text}" for text in FAILURES)
+
+
+def milliseconds(run: Callable[[], object], options: Options) -> float:
+    """Median device time of a call: calls are queued behind a spin of the device that lasts longer than the host needs
+    to queue them, so that launches are not measured. A call that waits for the device is timed with its waits."""
+    for _ in range(options.warm_up):
+        run()
+    if options.device.type != "cuda":
+        return 1e3 * statistics.median(_seconds(run) for _ in range(options.runs))
+    torch.cuda.synchronize()
+    host = _seconds(run)
+    torch.cuda.synchronize()
+    calls = max(1, min(16, options.runs, round(2e-3 / max(host, 1e-6))))
+    samples = max(5, math.ceil(options.runs / calls))
+    spin = int(min(0.02, 2.0 * calls * host + 1e-4) * CLOCK)
+    times = []
+    for _ in range(samples):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda._sleep(spin)
+        start.record()
+        for _ in range(calls):
+            run()
+        end.record()
+        torch.cuda.synchronize()
+        times.append(start.elapsed_time(end) / calls)
+    return statistics.median(times)
+
+
+def with_launches(run: Callable[[], object], options: Options) -> float:
+    """Median milliseconds of a call for a program that waits for each."""
+    for _ in range(options.warm_up):
+        run()
+
+    def complete() -> None:
+        run()
+        if options.device.type == "cuda":
+            torch.cuda.synchronize()
+
+    return 1e3 * statistics.median(_seconds(complete) for _ in range(options.runs))
+
+
+def _seconds(run: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def copy_bandwidth(device: torch.device) -> float:
+    """Bytes per second that a copy within the device reads and writes."""
+    cuda = device.type == "cuda"
+    a = torch.empty(1 << (30 if cuda else 24), dtype=torch.uint8, device=device)
+    b = torch.empty_like(a)
+    ms = milliseconds(lambda: b.copy_(a), Options(device, 3, 20))
+    return 2 * a.numel() / (1e-3 * ms)
+
+
+def peak_memory(run: Callable[[], object], device: torch.device) -> int:
+    """Most bytes allocated at once during a call; 0 without a card."""
+    if device.type != "cuda":
+        return 0
+    torch.cuda.reset_peak_memory_stats(device)
+    run()
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device)
+
+
+def backward(outputs: Tensor | Sequence[Tensor], inputs: Sequence[Tensor]) -> Callable[[], object]:
+    """A backward pass on a graph that is kept, with fixed random gradients."""
+    outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+    gradients = [torch.randn_like(output) for output in outputs]
+    return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
+
+
+def arithmetic_rate(options: Options) -> float:
+    """Floating-point operations a second of a large matrix product in full single precision."""
+    n = 8192 if options.device.type == "cuda" else 64
+    a, b = (torch.rand(n, n, device=options.device) for _ in range(2))
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = False
+    ms = milliseconds(lambda: a @ b, Options(options.device, 3, 10))
+    torch.backends.cuda.matmul.allow_tf32 = before
+    return 2 * n**3 / (1e-3 * ms)
+
+
+def without_graph(run: Callable[[], object]) -> Callable[[], object]:
+    """A call that records nothing for a backward pass."""
+
+    def call() -> object:
+        with torch.no_grad():
+            return run()
+
+    return call
+
+
+def deterministic(run: Callable[[], object], warn_only: bool = False) -> Callable[[], object]:
+    """A call with sums that do not depend on the order; `warn_only` where torch's own operations have none such."""
+
+    def call() -> object:
+        torch.use_deterministic_algorithms(True, warn_only=warn_only)
+        try:
+            return run()
+        finally:
+            torch.use_deterministic_algorithms(False)
+
+    return call
+
+
+def photo_loss(photo: Tensor) -> Callable[[Tensor], Tensor]:
+    """0.8 L1 + 0.2 (1 - SSIM) of an image [height, width, 3]."""
+    return lambda rgb: 0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))
+
+
+def training_step(
+    render: Callable[[], Tensor], loss: Callable[[Tensor], Tensor], parameters: list[Tensor]
+) -> Callable[[], object]:
+    """Render, loss, backward and Adam, of the parameters."""
+    # a rate of zero: the work of a step, but the scene stays what it is
+    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
+
+    def run() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        loss(render()).backward()
+        optimizer.step()
+
+    return run
+
+
+def trained_like(
+    n: int, width: int, height: int, device: torch.device, view_color: str = "sv", texture: bool = True
+) -> tuple[Scene, Camera]:
+    """A scene with the statistics of trained ones and its camera; the same every time.
+
+    Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
+    deviation 0.85, the mean log scale in pixels 0.7, opacity and kernel exponent are logistic-normal (medians 0.45 and
+    2.4); about 23 fragments per pixel are blended, whatever n. A fifth of the surfels lies outside the view; as many as
+    in trained scenes (`CROSSING`) are discs beside the camera that cross its plane.
+    """
+    g = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g)
+
+    focal = 0.9 * width
+    K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+    z = 2.0 * torch.exp(1.4 * uniform(n))  # 2 to 8
+    margin = 0.5 * (math.sqrt(1.25) - 1)
+    x, y = ((uniform(n) * (1 + 2 * margin) - margin) * size for size in (width, height))
+    means = torch.stack([(x - K[0, 2]) / focal * z, (y - K[1, 2]) / focal * z, z], dim=-1)
+    pixels = PIXEL_SCALE * math.sqrt(width * height / n)
+    size = torch.log(pixels * z / focal) + 0.7 * normal(n)
+    aspect = 0.425 * normal(n)
+    surfels = {
+        "means": means,
+        "quats": normal(n, 4),
+        "log_scales": torch.stack([size + aspect, size - aspect], dim=-1),
+        "opacity_logits": 1.3 * normal(n) - 0.2,
+        "beta_raw": normal(n) + 0.45,
+    }
+    beside = n - round(CROSSING * n)
+    _move_beside_the_camera({name: value[beside:] for name, value in surfels.items()}, g)
+    if view_color == "sv":
+        surfels |= {"sv_sites": normal(n, SITES, 3), "sv_log_tau": torch.zeros(n, SITES)}
+        surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
+    else:
+        surfels |= {"sh_dc": normal(n, 3), "sh_rest": 0.1 * normal(n, 15, 3)}
+    texture_kind = "hash" if texture else "none"
+    config = SceneConfig(view_color=view_color, sv_sites=SITES, texture=texture_kind, near=0.2)
+    field = None
+    if texture:
+        field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, LOG2_TABLE, g)
+        with torch.no_grad():
+            field.field_w3.copy_(0.1 * normal(*field.field_w3.shape))  # starts at zero
+    scene = Scene(config, surfels, field).to(device)
+    return scene, Camera(torch.eye(4), K, width, height).to(device)
+
+
+def _move_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> None:
+    """Move surfels in place so that they cross the camera's plane out of view.
+
+    As in a room of 12,900 surfels: median depth 0.09 where surfels have 1.0 (here 4), 12 depths off the axis, the
+    larger scale 0.9 depths, three times the smaller.
+    """
+    n = len(surfels["means"])
+    z = 0.35 * torch.exp(0.3 * torch.randn(n, generator=g)).clamp(min=0.75)  # behind `near`
+    lateral = 12 * torch.exp(0.8 * torch.randn(n, generator=g)).clamp(min=0.25)
+    turn = 2 * math.pi * torch.rand(n, generator=g)
+    surfels["means"].copy_(z[:, None] * torch.stack([lateral * turn.cos(), lateral * turn.sin(), torch.ones(n)], dim=1))
+    size = torch.log(0.9 * z) + 0.3 * torch.randn(n, generator=g)
+    surfels["log_scales"].copy_(torch.stack([size, size - 1.1], dim=1))
+    forward = torch.tensor([1.0, 0.0, -1.0, 0.0])  # turns the first axis to the camera's
+    surfels["quats"].copy_(forward + 0.2 * torch.randn(n, 4, generator=g))
+
+
+def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[Scene, Camera]:
+    """The same with a tile for every surfel, as fine as that camera sees it, and random texels, which backward passes
+    move by a rate of zero: the work of a step, but they stay what they are."""
+    scene, camera = trained_like(n, width, height, device, texture=False)
+    scene.config.texture = "texels"
+    field = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
+    g = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        field.texels.copy_(0.1 * torch.randn(field.texels.shape, generator=g))
+    field.descent = ops.TexelDescent(field.share, 0.0)
+    scene.field = field
+    return scene, camera

@@ -1,0 +1,185 @@
+"""A baked scene before it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.tiles import Tiles
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import AtlasCost, Statistics
+from bitymi_ns.codec.packing import Packing, pack
+from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
+from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
+from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.baked import BakedScene
+
+
+@dataclass
+class Baked:
+    """A baked scene, before it is written.
+
+    Attributes:
+        scene: the surfels that are kept, N of them on the CPU, without an atlas; their view colours are lean
+            (`ops.view_color.LEAN`) where they were reduced.
+        rows: [N] int64, their rows in the scene.
+        packing: where the tiles lie; `scene.tiles` are the same memory.
+        texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
+        atlas: the encoded atlas, None without texture.
+        options: what it was baked with.
+        uncoded: [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`.
+        in_front: [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1.
+        codes: the integers that the surfels, and once they are coded the texels, stand for; None = they are stored as
+            they are.
+        statistics: what was left out, what it cost, and the error of the quantisation.
+    """
+
+    scene: BakedScene
+    rows: Tensor
+    packing: Packing
+    texels: Tensor | None
+    atlas: EncodedAtlas | None
+    options: BakeOptions
+    statistics: Statistics = field(default_factory=Statistics)
+    codes: SceneCodes | None = None
+    uncoded: Tensor | None = None
+    in_front: Tensor | None = None
+
+    def with_statistics(self, **changes: Any) -> Baked:
+        """The same bake with other statistics."""
+        return replace(self, statistics=self.statistics.but(**changes))
+
+    @property
+    def mean_residual(self) -> Tensor:
+        """[N, 3] mean of every tile; the residual of a surfel without a tile."""
+        assert self.scene.mean_residual is not None
+        return self.scene.mean_residual
+
+    @property
+    def extent(self) -> Tensor:
+        """[N] half side of every tile in scale units."""
+        assert self.scene.extent is not None
+        return self.scene.extent
+
+    def with_mean_residual(self, mean_residual: Tensor) -> Baked:
+        """The same bake with other means [N, 3]."""
+        return replace(self, scene=replace(self.scene, mean_residual=mean_residual))
+
+    @property
+    def tiles(self) -> Tiles:
+        """Of every surfel."""
+        return Tiles(self.packing, self.texels, self.extent, self.mean_residual)
+
+    def unquantised(self) -> BakedScene:
+        """The scene with its texels as 32-bit floats."""
+        if self.texels is None:
+            return self.scene
+        rgba = torch.cat([self.texels, torch.ones_like(self.texels[..., :1])], -1).contiguous()
+        return replace(self.scene, atlas=rgba)
+
+    def stored(self) -> BakedScene:
+        """The scene with its texels as a bundle has them."""
+        if self.atlas is None:
+            return self.scene
+        atlas = self.atlas
+        pages = torch.from_numpy(decode_pages(atlas.payload, atlas.format, atlas.width, atlas.height))
+        pages = pages if pages.dtype == torch.uint8 else pages.float()
+        return replace(self.scene, atlas=pages, offset=atlas.range.offset, scale=atlas.range.scale)
+
+    def with_surfels(self, surfels: Mapping[str, Tensor]) -> Baked:
+        """The same bake with other parameters of its N surfels; tiles and texels are as they are."""
+        given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
+        return replace(self, scene=replace(self.scene, surfels=given))
+
+    def with_tiles(self, tiles: Tiles) -> Baked:
+        """The same bake with other tiles of its N surfels. The atlas is to be `encoded`."""
+        scene = replace(
+            self.scene,
+            tiles=torch.from_numpy(tiles.packing.tiles),
+            extent=tiles.extent,
+            mean_residual=tiles.mean_residual,
+        )
+        return replace(self, scene=scene, packing=tiles.packing, texels=tiles.texels, atlas=None)
+
+    def only(self, kept: Tensor) -> Baked:
+        """The bake of some of its surfels, `kept` [N] bool: their tiles, packed anew, with their texels. The atlas is
+        to be `encoded`."""
+        if bool(kept.all()):
+            return self
+        surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
+        before = replace(self.packing, tiles=self.packing.tiles[kept.numpy()])
+        packing = pack(before.tiles[:, 3:], self.options.page_width, self.options.page_rows)
+        texels = None
+        if self.texels is not None and packing.texels:
+            texels = paged_texels(listed_texels(self.texels, before, self.mean_residual[kept]), packing)
+        in_front = None if self.in_front is None else self.in_front[kept]
+        some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept], in_front=in_front)
+        return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.mean_residual[kept]))
+
+    def with_texels(self, texels: Tensor) -> Baked:
+        """The same bake with other residual colours (fine-tuned ones, say), to be `encoded`."""
+        if self.texels is None or texels.shape != self.texels.shape:
+            raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
+        texels = texels.detach().float().cpu().contiguous()
+        means = tile_means(texels, self.packing, self.mean_residual)
+        # no error: the field is no longer what the texels are meant to hold
+        statistics = self.statistics.but(atlas=None, error=None, certificate=None)
+        return replace(self.with_mean_residual(means), texels=texels, atlas=None, statistics=statistics)
+
+    def encoded(self, progress: Progress = no_progress) -> Baked:
+        """The same bake with its texels quantised and encoded, where that is not done."""
+        if self.texels is None or self.atlas is not None:
+            return self
+        return self.with_atlas(encoded_pages(self.texels, self.packing, self.options, progress))
+
+    def with_atlas(self, atlas: EncodedAtlas) -> Baked:
+        """The same bake with its texels as they are encoded."""
+        return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas)))
+
+    def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> Baked:
+        """The same bake with the residual colours of codes, which are those of its tiles, and were made of `uncoded`
+        [T, 3]."""
+        assert self.codes is not None
+        texels = paged_texels(codes.texels(), self.packing)
+        value_range = choose_range(
+            texels.numpy(), self.packing, self.options.range, self.options.range_samples, self.options.seed
+        )
+        atlas = replace(encode(texels.numpy(), self.packing, "uint8", value_range), encoder="cosine transform")
+        return replace(
+            self.with_mean_residual(codes.constants),
+            texels=texels,
+            atlas=atlas,
+            statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
+            uncoded=uncoded,
+            codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
+        )
+
+
+def encoded_pages(
+    texels: Tensor,
+    packing: Packing,
+    options: BakeOptions,
+    progress: Progress = no_progress,
+    value_range: Range | None = None,
+) -> EncodedAtlas:
+    """Pages [layers, height, width, 3] as the options say, in a range of values that is not theirs to choose where one
+    is given."""
+    if options.format != "fp16" and value_range is None:
+        value_range = choose_range(texels.numpy(), packing, options.range, options.range_samples, options.seed)
+    return encode(texels.numpy(), packing, options.format, value_range, options.bc7_profile, progress=progress)
+
+
+def atlas_cost(packing: Packing, atlas: EncodedAtlas) -> AtlasCost:
+    """Bytes and quantisation error of an encoded atlas."""
+    return AtlasCost(
+        bytes=atlas.nbytes,
+        pages=(packing.layers, packing.height, packing.width),
+        occupancy=packing.occupancy,
+        psnr=atlas.psnr,
+        clipped_fraction=atlas.clipped_fraction,
+    )

@@ -1,0 +1,93 @@
+"""Errors of stored tiles against the field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.field.plan import Field, Plan
+from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.reduce import read_at
+from bitymi_ns.bake.tile_errors import cells_per_pixel, seen_rms, weighted_rms
+from bitymi_ns.bundle.statistics import Certificate, Percentiles, TileError
+from bitymi_ns.codec.pages import size_classes, texel_index
+from bitymi_ns.codec.quantise import STEPS
+from bitymi_ns.progress import Progress, no_progress
+
+
+@dataclass
+class TileErrors:
+    """Errors in 8-bit steps, each times the largest blending weight that a fragment has there.
+
+    Attributes:
+        rms: [N] root mean square over the visible part of each surfel and the colour channels.
+        largest: [N] largest absolute value.
+        seen: [N] root mean square of what the closest training view sees, which averages over its pixels.
+        shown: [N] bool, whether any fragment of the surfel gets a residual; the errors are 0 elsewhere.
+    """
+
+    rms: Tensor
+    largest: Tensor
+    seen: Tensor
+    shown: Tensor
+
+    def summary(self, tolerance: float) -> TileError:
+        """Percentiles over the surfels that get a residual at all, and the tolerance that was asked for."""
+        unit = "8-bit steps, weighted by the blending weight; stored atlas against field"
+        rms, largest = (
+            Percentiles.of(values[self.shown] if self.shown.any() else torch.zeros(1))
+            for values in (self.rms, self.largest)
+        )
+        return TileError(tolerance=tolerance, unit=unit, rms=rms, largest=largest)
+
+    def certificate(self, tolerance: float) -> Certificate | None:
+        """How many of these surfels are within the tolerance as they are seen; None without one."""
+        return Certificate.of(self.seen[self.shown], tolerance, "field") if tolerance else None
+
+
+@torch.no_grad()
+def tile_errors(
+    field: Field,
+    plan: Plan,
+    tiles: npt.NDArray,
+    mean_residual: Tensor,
+    residuals: npt.NDArray | None,
+    chunk: int = 1 << 18,
+    progress: Progress = no_progress,
+) -> TileErrors:
+    """Compares stored tiles with the field on the grids of the plan.
+
+    Args:
+        field: the residual field.
+        plan: what the tiles have to hold; its extents must be those of the tiles.
+        tiles: [N, 5] int32.
+        mean_residual: [N, 3] the residual of the surfels without a tile.
+        residuals: [layers, height, width, 3] the atlas as a renderer reads it, None without tiles.
+        chunk: points evaluated at once.
+        progress: called with the number of tiles done.
+    """
+    rms, largest, seen = (torch.zeros(len(plan)) for _ in range(3))
+    rectangles = torch.as_tensor(tiles)
+    flat = None if residuals is None else torch.as_tensor(residuals).reshape(-1, 3)
+    done = 0
+    for part in references(field, plan, chunk):
+        rows = part.rows.cpu()
+        rebuilt = mean_residual[rows][:, :, None, None].expand(part.values.shape).clone()
+        if flat is not None:
+            for r_u, r_v, at in size_classes(rectangles[rows]):
+                index = texel_index(rectangles[rows[at]], (r_u, r_v), residuals.shape[2], residuals.shape[1])
+                stored = flat[index].permute(0, 3, 1, 2).contiguous()
+                rebuilt[at] = read_at(stored, part.size)
+        difference = rebuilt.to(part.values) - part.values
+        rms[rows] = weighted_rms(difference, part.weight).cpu()
+        pixels = None if plan.pixels is None else plan.pixels[part.rows]
+        cells = cells_per_pixel(pixels, plan.extent[part.rows], part.size)
+        seen[rows] = seen_rms(difference, part.weight, cells).cpu()
+        weighted = STEPS * difference.abs().amax(1) * part.weight
+        largest[rows] = weighted.flatten(1).amax(1).cpu()
+        done += len(rows)
+        progress("measuring the error", done, len(plan))
+    return TileErrors(rms, largest, seen, plan.extent.cpu() > 0)

@@ -1,0 +1,112 @@
+"""Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.tiles import Shown, weights
+from bitymi_ns.codec.pages import size_classes
+from bitymi_ns.codec.quantise import STEPS
+from bitymi_ns.ops import TexelTiles
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.tile_sizes import max_projected_extent
+from bitymi_ns.train.rotations import tangents
+
+_CONSTANT = (8, 8)
+"""Points at which the weight of a surfel without a tile is looked at."""
+
+
+def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
+    """Root mean square of difference [n, 3, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n]."""
+    count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
+    square = (difference.square().sum(1) * weight.square()).flatten(1).sum(1)
+    return STEPS * (square / count).sqrt()
+
+
+def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
+    """`weighted_rms` of what a view can see: difference times weight is averaged over its pixels first, of `cells`
+    [n, 2]."""
+    return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
+
+
+@torch.no_grad()
+def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
+    """What differences of texels are as the closest training view sees them.
+
+    Args:
+        difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
+        sizes: [N, 2] sides of the tiles; (0, 0) = none.
+        shown: how much of the tiles is seen, N rows.
+        chunk: texels taken at once (a tile is never split).
+
+    Returns:
+        [N] root mean squares in 8-bit steps, each times the largest blending weight that a fragment has there; and [N]
+        bool, whether any fragment of the surfel gets a residual.
+    """
+    errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
+    first = TexelTiles.of_sizes(sizes.clamp(min=1), shown.extent).first
+    bare = torch.nonzero(sizes[:, 0] == 0).squeeze(1)
+    classes = size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1))
+    for r_u, r_v, members in [*classes, (*_CONSTANT, bare)]:
+        for rows in members.split(max(1, chunk // (r_u * r_v))):
+            inside = torch.arange(r_u * r_v) if members is not bare else torch.zeros(r_u * r_v, dtype=torch.long)
+            values = difference[first[rows, None] + inside].view(-1, r_v, r_u, 3).permute(0, 3, 1, 2)
+            weight, extent = weights(shown, rows, (r_u, r_v)), shown.extent[rows]
+            pixels = None if shown.pixels is None else shown.pixels[rows]
+            errors[rows] = seen_rms(values, weight, cells_per_pixel(pixels, extent, (r_u, r_v)))
+            seen[rows] = (weight > 0).flatten(1).any(1)
+    return errors, seen
+
+
+def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
+    """Pixels that a scale unit of every surfel takes along u and v in the view that shows it largest: [N, 2]; 0 where
+    no view looks at it.
+
+    Args:
+        surfels: per-surfel parameters, N rows.
+        cameras: training views.
+        extent: half side in scale units of the square that has to be in the picture.
+        near: nearest drawn depth.
+    """
+    at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
+    return max_projected_extent(*at, cameras, extent, near)[0] / (2.0 * extent)
+
+
+def cells_per_pixel(pixels: Tensor | None, extent: Tensor, size: tuple[int, int]) -> Tensor:
+    """How many cells of a grid over a tile a pixel covers along u and v: [n, 2], from 1 to the side of the grid.
+
+    Args:
+        pixels: [n, 2] of `closest_pixels`; None = not known: a pixel covers one cell.
+        extent: [n] half sides of the tiles, scale units.
+        size: (u, v) cells.
+    """
+    sides = torch.tensor(size, dtype=torch.float32, device=extent.device).expand(len(extent), 2)
+    if pixels is None:
+        return torch.ones_like(sides)
+    covered = sides / (2.0 * extent[:, None] * pixels).clamp(min=1e-9)
+    return torch.minimum(covered.clamp(min=1.0), sides)
+
+
+def averaged(values: Tensor, cells: Tensor) -> Tensor:
+    """Means of values over rectangles about every cell: [n, c, v, u] of the same.
+
+    A rectangle that would reach beyond the grid is moved into it. One of a single cell leaves its value.
+
+    Args:
+        values: [n, c, v, u].
+        cells: [n, 2] sides of the rectangles along u and v, cells, from 1 to the side of the grid.
+    """
+    along_u, along_v = (_windows(values.shape[axis], cells[:, i]) for axis, i in ((3, 0), (2, 1)))
+    across = torch.einsum("nij,ncvj->ncvi", along_u, values)
+    return torch.einsum("nij,ncju->nciu", along_v, across)
+
+
+def _windows(count: int, width: Tensor) -> Tensor:
+    """[n, count, count] the share of every cell in the window of each, of widths [n]."""
+    edge, half = torch.arange(count, device=width.device, dtype=torch.float32), width[:, None] / 2
+    center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
+    low, high = (center - half)[:, :, None], (center + half)[:, :, None]
+    return (torch.minimum(high, edge + 1) - torch.maximum(low, edge)).clamp(min=0) / width[:, None, None]

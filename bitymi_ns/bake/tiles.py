@@ -1,0 +1,121 @@
+"""Tiles of surfels: where they lie, the texels that they hold, and how much an error of a texel counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.codec.packing import Packing, pack
+from bitymi_ns.codec.pages import size_classes, texel_index
+from bitymi_ns.ops.constants import SUPPORT
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Tiles of N surfels on the CPU.
+
+    Attributes:
+        packing: layout of the atlas.
+        texels: [layers, height, width, 3] float32 residual colours, None without any tile.
+        extent: [N] half side in scale units.
+        mean_residual: [N, 3] mean of every tile; the residual of a surfel without one.
+        nonfinite: points at which the field was not finite.
+    """
+
+    packing: Packing
+    texels: Tensor | None
+    extent: Tensor
+    mean_residual: Tensor
+    nonfinite: int = 0
+
+    @classmethod
+    def none(cls, count: int, extent: float) -> Tiles:
+        """No tile for any of `count` surfels."""
+        return cls(pack(torch.zeros(count, 2)), None, torch.full((count,), extent), torch.zeros(count, 3))
+
+
+@dataclass
+class Shown:
+    """Largest visible part and weight of N tiles.
+
+    Attributes:
+        opacity: [N] largest blending weight of the surfel's centre.
+        beta: [N] exponent of the kernel.
+        extent: [N] half side of the tile in scale units, beyond which every fragment is below the weight bound; 0 where
+            all are.
+        weight_bound: fragments of smaller weight get no residual.
+        pixels: [N, 2] pixels per scale unit in the closest view (`tile_errors.closest_pixels`); None = not known.
+    """
+
+    opacity: Tensor
+    beta: Tensor
+    extent: Tensor
+    weight_bound: float
+    pixels: Tensor | None = field(default=None, kw_only=True)
+
+
+@dataclass
+class TileValues:
+    """Target texels of n tiles of one size.
+
+    Attributes:
+        rows: [n] int64 rows of the surfels.
+        size: (u, v) texels.
+        values: [n, 3, v, u] residual colours.
+        weight: [n, v, u] weight of an error.
+        nonfinite: points at which the field was not finite.
+    """
+
+    rows: Tensor
+    size: tuple[int, int]
+    values: Tensor
+    weight: Tensor
+    nonfinite: int
+
+
+def texel_centers(count: int, extent: Tensor) -> Tensor:
+    """Surfel coordinates of texel centres along one axis: (i + 0.5) / count * 2 extent - extent.
+
+    Args:
+        count: texels along the axis.
+        extent: [...] half sides of tiles in scale units (e; 3 covers exactly the support), [1] or broadcast with it.
+
+    Returns:
+        [..., count] of the extents' type.
+    """
+    return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
+
+
+def grid(count: tuple[int, int], extent: Tensor) -> tuple[Tensor, Tensor]:
+    """Surfel coordinates u, v [n, count_v, count_u] of the cell centres of tiles of half sides [n]."""
+    u, v = (texel_centers(c, extent[:, None]) for c in count)
+    return u[:, None, :].expand(-1, count[1], -1), v[:, :, None].expand(-1, -1, count[0])
+
+
+def weights(shown: Shown, rows: Tensor, count: tuple[int, int]) -> Tensor:
+    """[n, count_v, count_u] largest blending weight of a fragment at the points of `grid`; 0 without residual."""
+    u, v = grid(count, shown.extent[rows])
+    rest = 1.0 - (u.square() + v.square()) / SUPPORT**2
+    weight = shown.opacity[rows, None, None] * rest.clamp(min=1e-12) ** shown.beta[rows, None, None]
+    return torch.where((rest > 0) & (weight >= shown.weight_bound), weight, torch.zeros_like(weight))
+
+
+@torch.no_grad()
+def tile_values(texels: Tensor, packing: Packing, shown: Shown, chunk: int = 1 << 18) -> Iterator[TileValues]:
+    """Texels of the tiles, in chunks of tiles of one size.
+
+    Args:
+        texels: [layers, height, width, 3] in the layout of `packing`, on the device of `shown`.
+        packing: N tiles; surfels without one are left out.
+        shown: N rows.
+        chunk: texels taken at once (a tile is never split).
+    """
+    tiles, flat = torch.from_numpy(packing.tiles).to(texels.device), texels.reshape(-1, 3)
+    for r_u, r_v, members in size_classes(tiles):
+        for rows in members.split(max(1, chunk // (r_u * r_v))):
+            at = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)
+            values = flat[at].permute(0, 3, 1, 2).contiguous()
+            yield TileValues(rows, (r_u, r_v), values, weights(shown, rows, (r_u, r_v)), 0)

@@ -1,0 +1,83 @@
+"""Describe what a figure was measured with: machine, versions, commit."""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import os
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
+
+def _output(command: list[str], where: Path | None = None) -> str:
+    """Standard output of a command; empty when it fails."""
+    try:
+        result = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return result.stdout.strip() if result.returncode == 0 else ""
+
+
+@functools.cache
+def commit() -> str:
+    """The checkout's commit, with `+` when the tree differs from it; empty outside a checkout of this project."""
+    where = Path(__file__).resolve().parents[2]
+    if not (where / ".git").exists():
+        return ""
+    return _output(["git", "describe", "--always", "--dirty=+", "--exclude=*"], where)
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def gpus() -> list[str]:
+    """Names of the NVIDIA GPUs that the driver lists."""
+    if shutil.which("nvidia-smi") is None:
+        return []
+    return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide a figure."""
+    found = {"python": platform.python_version()}
+    for name in ("bitymi-ns", "torch", "nerfstudio"):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+@functools.cache
+def processor() -> str:
+    """Model of the processor."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf8").splitlines()
+    except OSError:
+        return model
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+
+
+@functools.cache
+def machine() -> str:
+    """One line about the machine: processor, cores, memory, GPUs, and a limit on threads."""
+    memory = ""
+    try:
+        memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
+    except (OSError, ValueError):
+        pass
+    names = gpus()
+    cards = f", {len(names)} x {names[0]}" if names else ""
+    threads = os.environ.get("OMP_NUM_THREADS")
+    limit = f", OMP_NUM_THREADS={threads}" if threads else ""
+    return f"{processor()}, {cores()} cores{memory}{cards}{limit}"
+
+
+def software() -> str:
+    """One line of versions."""
+    return ", ".join(f"{name} {version}" for name, version in versions().items())

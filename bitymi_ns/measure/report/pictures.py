@@ -1,0 +1,212 @@
+"""Embed pictures in a report: held-out views (photograph, render, error), worst views, cameras of found poses.
+
+`ns-eval --render-output-path FOLDER` writes one image per held-out view, the photograph beside the render. The views
+with the lowest, the median and the highest PSNR are shown. Folders of the same photographs (of a trained scene and of
+its bundle) are compared view by view.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from bitymi_ns.measure.report.read import SIDE_BY_SIDE
+from bitymi_ns.measure.report.records import WorstView, is_bundle_name
+
+ERROR_SCALE = 0.25
+"""Error at which an error map ends: mean absolute difference of the three colours."""
+ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
+MAX_SETS = 4
+"""Sets of photographs that a page shows views of."""
+MAX_WORST = 16
+"""Worst views that a page shows."""
+MAX_WIDTH = 1200
+"""Width in pixels to which wider images are scaled down."""
+MAX_PNG_BYTES = 400_000
+"""Images that are larger as PNG are embedded as JPEG of quality 92."""
+_RANKS = (("Worst view", 0.0), ("Median view", 0.5), ("Best view", 1.0))
+
+Pixels = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An encoded image with its caption and size in pixels."""
+
+    caption: str
+    mime: str
+    data: bytes
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Group:
+    """Pictures under one heading."""
+
+    title: str
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class ComparedView:
+    """A view: its heading, and columns of pictures: the photograph, then for every folder the render and its error."""
+
+    title: str
+    columns: tuple[tuple[Picture, ...], ...]
+
+    @property
+    def stacks(self) -> tuple[tuple[Picture, ...], ...]:
+        """Pictures that stand below each other: the columns; with one folder every picture, its error beside it."""
+        if len(self.columns) > 2:
+            return self.columns
+        return tuple((picture,) for column in self.columns for picture in column)
+
+
+@dataclass(frozen=True)
+class ComparedSet:
+    """The chosen views of one set of photographs."""
+
+    title: str
+    views: tuple[ComparedView, ...]
+
+
+@dataclass(frozen=True)
+class _Render:
+    path: Path
+    psnr: float
+    digest: bytes  # of the photograph
+
+
+def open_image(path: Path) -> Image.Image:
+    """Read an image as RGB, or as RGBA where it has transparency.
+
+    Raises:
+        OSError: the file is not an image that can be read.
+    """
+    try:
+        with Image.open(path, formats=("PNG", "JPEG")) as opened:
+            return opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
+    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:  # what Pillow raises on broken PNG chunks
+        raise OSError(str(error)) from error
+
+
+def encode(image: Image.Image, caption: str) -> Picture:
+    """Scale an image down if it is wide, and encode it."""
+    if image.width > MAX_WIDTH:
+        image = image.resize((MAX_WIDTH, max(1, round(image.height * MAX_WIDTH / image.width))), Image.LANCZOS)
+    buffer, mime = io.BytesIO(), "image/png"
+    image.save(buffer, "PNG")
+    if buffer.tell() > MAX_PNG_BYTES and image.mode == "RGB":
+        buffer, mime = io.BytesIO(), "image/jpeg"
+        image.save(buffer, "JPEG", quality=92, subsampling=0)
+    return Picture(caption, mime, buffer.getvalue(), image.width, image.height)
+
+
+def read_pictures(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[Picture, ...]:
+    """Encode captioned files; those that cannot be read are noted."""
+    pictures = []
+    for caption, path in files:
+        try:
+            pictures.append(encode(open_image(path), caption))
+        except OSError as error:
+            notes.append(f"{path} is not an image that can be read: {error}.")
+    return tuple(pictures)
+
+
+def worst_views(views: list[WorstView], notes: list[str]) -> list[Group]:
+    """Encode the pictures of the worst views, one group per view."""
+    if len(views) > MAX_WORST:
+        notes.append(f"{len(views) - MAX_WORST} more worst views are not shown; the page holds {MAX_WORST}.")
+    groups = [Group(view.title, read_pictures(view.pictures, notes)) for view in views[:MAX_WORST]]
+    return [group for group in groups if group.pictures]
+
+
+def heat(values: Pixels, scale: float) -> Pixels:
+    """Map [H, W] values to colours [H, W, 3]: black at 0, yellow at `scale` and above."""
+    return matplotlib.colormaps["inferno"](np.clip(values / scale, 0.0, 1.0))[..., :3].astype(np.float32)
+
+
+def compare_views(images: Sequence[Path], notes: list[str]) -> list[ComparedSet]:
+    """Choose and encode views among images of photographs beside renders; what cannot be read is noted.
+
+    Views are ranked by the PSNR of their pictures, averaged over the folders; masks are not known here.
+    """
+    folders: dict[Path, dict[int, _Render]] = {}
+    for path in sorted(p.resolve() for p in images):
+        try:
+            match = SIDE_BY_SIDE.match(path.stem)
+            if match is None:
+                raise OSError("its name is not eval_img_ with a number, as ns-eval names a photograph beside a render")
+            photograph, render = _halves(path)
+        except OSError as error:
+            notes.append(f"{path} is not an image that can be shown: {error}.")
+            continue
+        digest = hashlib.sha256(photograph.tobytes()).digest()
+        folders.setdefault(path.parent, {})[int(match["index"])] = _Render(path, _psnr(photograph, render), digest)
+    groups: dict[tuple, list[Path]] = {}
+    for folder, renders in folders.items():
+        groups.setdefault(tuple((index, r.digest) for index, r in renders.items()), []).append(folder)
+    if len(groups) > MAX_SETS:
+        notes.append(f"Views of {len(groups) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
+    names = _titles(list(folders))
+    ordered = [sorted(g, key=lambda f: (is_bundle_name(names[f]), names[f])) for g in groups.values()]
+    return [_compared(group, folders, names) for group in ordered[:MAX_SETS]]
+
+
+def _titles(folders: list[Path]) -> dict[Path, str]:
+    """Folder paths without the components that all share."""
+    if len(folders) < 2:
+        return {folder: folder.name for folder in folders}
+    shared = 0
+    for names in zip(*(folder.parts for folder in folders), strict=False):
+        if len(set(names)) > 1:
+            break
+        shared += 1
+    return {folder: "/".join(folder.parts[shared:]) or folder.name for folder in folders}
+
+
+def _halves(path: Path) -> tuple[Pixels, Pixels]:
+    """Photograph and render, [H, W, 3] in [0, 1]."""
+    pixels = np.asarray(open_image(path).convert("RGB"), np.float32) / 255.0
+    width = pixels.shape[1] // 2
+    if pixels.shape[1] != 2 * width or width == 0:
+        raise OSError(f"its width of {pixels.shape[1]} pixels is not that of two equal pictures")
+    return pixels[:, :width], pixels[:, width:]
+
+
+def _psnr(a: Pixels, b: Pixels) -> float:
+    return 10.0 * math.log10(1.0 / max(1e-10, float(np.mean((a - b) ** 2, dtype=np.float64))))
+
+
+def _compared(group: list[Path], folders: dict[Path, dict[int, _Render]], names: dict[Path, str]) -> ComparedSet:
+    renders = [folders[folder] for folder in group]
+    ranked = sorted(renders[0], key=lambda index: sum(r[index].psnr for r in renders))
+    chosen: dict[int, str] = {}
+    for name, quantile in _RANKS:
+        chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], name)
+    views = []
+    for index, name in chosen.items():
+        columns = []
+        for folder, files in zip(group, renders, strict=True):
+            photograph, render = _halves(files[index].path)
+            if not columns:
+                columns.append((encode(_image(photograph), "photograph"),))
+            error = heat(np.abs(photograph - render).mean(-1), ERROR_SCALE)
+            caption = f"{names[folder]}: {files[index].psnr:.2f} dB"
+            columns.append((encode(_image(render), caption), encode(_image(error), f"error of {names[folder]}")))
+        views.append(ComparedView(f"{name} of {len(ranked)}: number {index}", tuple(columns)))
+    return ComparedSet(", ".join(names[folder] for folder in group), tuple(views))
+
+
+def _image(pixels: Pixels) -> Image.Image:
+    return Image.fromarray((pixels * 255.0).round().astype(np.uint8))

@@ -1,0 +1,365 @@
+"""Read the inputs of a report: ns-eval files, training curves, cells, knobs, pictures and found poses, and folders that
+are searched for these."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bitymi_ns.measure.report.records import (
+    Curve,
+    Evaluation,
+    Records,
+    ReportError,
+    WorstView,
+    curve_from,
+    evaluation_from,
+    finite_numbers,
+    knob_from,
+    link,
+    poses_from,
+)
+
+CELLS, PICTURES = "cells.jsonl", "pictures.json"
+MAX_JSON_BYTES = 4 << 20
+"""Larger JSON files are no evaluation."""
+MAX_JSONL_BYTES = 64 << 20
+MAX_DEPTH = 8
+"""Folders are searched this many levels down."""
+MAX_ENTRIES = 50_000
+"""A search stops after this many files."""
+SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
+"""Stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
+
+_SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
+_LABELS = ("suite", "row")
+_NOT_OF_A_RUN = ("cell", "bundle", "export", "views", *_LABELS)
+_POSES = {"source", "registered", "given", "reprojection_error", "track_length", "left_out", "seconds"}
+_SHOWN = (
+    ("psnr", 2, "dB"),
+    ("cc_psnr", 2, "dB ccPSNR"),
+    ("ssim", 3, "SSIM"),
+    ("flip", 3, "FLIP"),
+    ("lpips", 3, "LPIPS"),
+    ("lpips_vgg", 3, "LPIPS (VGG)"),
+)
+
+
+# text and JSON
+
+
+def parse_json(text: str, where: str) -> Any:
+    """Parse JSON (NaN and Infinity tokens allowed).
+
+    Raises:
+        ReportError: with the file, line, column and reason.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        reason = "it is empty" if not text.strip() else f"{error.msg} at line {error.lineno}, column {error.colno}"
+    except RecursionError:
+        reason = "it is nested too deeply"
+    except ValueError as error:  # an integer with thousands of digits
+        reason = str(error)
+    raise ReportError(f"{where} is not valid JSON: {reason}. Write it again, or leave it out.") from None
+
+
+def read_text(path: Path, limit: int) -> str:
+    """Read a file of at most `limit` bytes.
+
+    Raises:
+        ReportError: it is larger, no text, or cannot be read.
+    """
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            raise ReportError(f"{path} is too large ({size:,} bytes) for an evaluation or a training curve.")
+        return path.read_text("utf8")
+    except UnicodeDecodeError:
+        raise ReportError(f"{path} is not a text file (it is not UTF-8).") from None
+    except OSError as error:
+        raise ReportError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def read_lines(path: Path) -> tuple[list[tuple[int, Any]], list[str]]:
+    """Read the values of a JSONL file with their line numbers, and notes.
+
+    A truncated last line (of a run that was killed while it wrote) is left out with a note.
+
+    Raises:
+        ReportError: an earlier line is broken.
+    """
+    numbered = [(i, s) for i, s in enumerate(read_text(path, MAX_JSONL_BYTES).splitlines(), 1) if s.strip()]
+    values, notes = [], []
+    for position, (number, line) in enumerate(numbered):
+        try:
+            values.append((number, parse_json(line, f"{path}, line {number},")))
+        except ReportError:
+            if position + 1 < len(numbered) or position == 0:
+                raise
+            notes.append(f"{path}: the last line is cut off and was left out.")
+    return values, notes
+
+
+# single records
+
+
+def is_evaluation(data: Any) -> bool:
+    """True for ns-eval's JSON."""
+    return isinstance(data, dict) and isinstance(data.get("results"), dict)
+
+
+def is_knob(data: Any) -> bool:
+    """True for a measured setting of a quality knob."""
+    return isinstance(data, dict) and isinstance(data.get("knob"), str) and "max_steps" in data
+
+
+def is_cell(data: Any) -> bool:
+    """True for a line of a benchmark's cells."""
+    return isinstance(data, dict) and isinstance(data.get("key"), dict) and isinstance(data.get("value"), dict)
+
+
+def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
+    """Read the evaluations, the curve and notes of a JSONL file; all empty when it holds something else."""
+    numbered, notes = read_lines(path)
+    values = [value for _, value in numbered]
+    evaluations = [evaluation_from(value, path) for value in values if is_evaluation(value)]
+    points = [v for v in values if isinstance(v, dict) and "step" in finite_numbers(v) and not is_evaluation(v)]
+    return evaluations, [curve_from(points, path)] if points else [], notes
+
+
+def read_pictures(path: Path, run: str = "") -> list[WorstView]:
+    """Read the worst views that a pictures.json lists; empty when the file is something else.
+
+    Raises:
+        ReportError: it is no valid JSON, or lists its views in another form.
+    """
+    data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
+    if not isinstance(data, dict) or "bitymi_pictures" not in data:
+        return []
+    scene, method = str(data.get("scene") or "unnamed scene"), run or str(data.get("method") or "")
+    views = []
+    try:
+        for view in data["views"]:
+            metrics = finite_numbers(view["metrics"])
+            figures = [f"{metrics[key]:.{digits}f} {text}" for key, digits, text in _SHOWN if key in metrics]
+            rank = "worst" if view["rank"] == 1 else f"number {view['rank']} from below"
+            title = f"{scene}, {method}: view {view['view']}, {rank} of {view['of']}: {', '.join(figures)}"
+            pictures = tuple((data["captions"].get(k, k), path.parent / Path(f).name) for k, f in view["files"].items())
+            views.append(WorstView(title, pictures))
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ReportError(f"{path} does not list its views as bitymi bench pictures does: {error!r}.") from error
+    return views
+
+
+# cells of a benchmark
+
+
+def _identity(key: dict[str, Any], *without: str) -> str:
+    return json.dumps({k: v for k, v in key.items() if k not in without}, sort_keys=True)
+
+
+class _Run:
+    """The cells of one training."""
+
+    def __init__(self, key: dict[str, Any]) -> None:
+        self.key = key
+        self.id = _identity(key, *_NOT_OF_A_RUN)
+        self.series = _identity(key, *_NOT_OF_A_RUN, "seed")
+        self.scene = str(key.get("scene") or "unnamed scene")
+        self.name = str(key.get("row") or key.get("method") or "unnamed method")
+        self.seed = key.get("seed") if isinstance(key.get("seed"), int) else None
+        self.train: dict[str, Any] = {}
+        self.exports: dict[str, dict[str, Any]] = {}
+        self.evaluations: list[tuple[str, dict[str, float]]] = []
+        self.knobs: list[dict[str, Any]] = []
+        self.pictures: str = ""
+
+    def add(self, key: dict[str, Any], value: dict[str, Any]) -> None:
+        kind, bundle = key.get("cell"), str(key.get("bundle") or "")
+        if kind == "train":
+            self.train = value
+        elif kind == "export":
+            self.exports[bundle] = value
+        elif kind == "eval":
+            if not is_evaluation(value) or "psnr" not in value["results"]:
+                raise KeyError("psnr among its results")
+            self.evaluations.append((bundle, finite_numbers(value["results"])))
+        elif kind == "knobs":
+            self.knobs = [point for point in value["points"] if is_knob(point)]
+        elif kind == "pictures":
+            self.pictures = str(value["folder"])
+
+
+def read_cells(numbered: Sequence[tuple[int, Any]], path: Path, records: Records) -> None:
+    """Add the cells of a benchmark, and the curves and pictures that they name, where these are there.
+
+    Of lines with equal keys the last counts.
+
+    Raises:
+        ReportError: a line is no cell, or lacks what its kind must have; the message has its number.
+    """
+    latest: dict[str, tuple[int, dict[str, Any]]] = {}
+    for number, value in numbered:
+        if not is_cell(value):
+            raise ReportError(f"{path}, line {number}, is not a cell of a benchmark: it has no key and value objects.")
+        name = _identity(value["key"], *_LABELS)
+        latest.pop(name, None)
+        latest[name] = (number, value)
+    runs: dict[str, _Run] = {}
+    for number, cell in latest.values():
+        run = _Run(cell["key"])
+        run = runs.setdefault(run.id, run)
+        made = cell.get("made")
+        machine = made.get("machine") if isinstance(made, dict) else None
+        if machine and machine not in records.machines:
+            records.machines.append(str(machine))
+        try:
+            run.add(cell["key"], cell["value"])
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ReportError(f"{path}, line {number}: the {cell['key'].get('cell')} cell lacks {error}.") from error
+    lengths: dict[tuple, list[_Run]] = {}
+    for run in runs.values():
+        lengths.setdefault((run.scene, run.name, run.seed), []).append(run)
+    for group in (group for group in lengths.values() if len(group) > 1):
+        for run in group:  # of the same name: say what else tells them apart
+            steps = run.key.get("steps")
+            run.name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
+    seeds: dict[str, set[int | None]] = {}
+    for run in runs.values():
+        seeds.setdefault(run.series, set()).add(run.seed)
+    for run in runs.values():
+        _add_run(run, len(seeds[run.series]) > 1, path, records)
+
+
+def _add_run(run: _Run, several_seeds: bool, path: Path, records: Records) -> None:
+    seed = f", seed {run.seed}" if several_seeds and run.seed is not None else ""
+    trained = finite_numbers(run.train)
+    times = {f"train_{k}": trained[k] for k in ("seconds", "cpu_seconds", "peak_bytes") if k in trained}
+    for bundle, results in run.evaluations:
+        size = finite_numbers(run.exports.get(bundle, {})).get("bytes")
+        group = f"{run.name}, {bundle}" if bundle else run.name
+        results = {**results, **times, **({} if size is None else {"bundle_bytes": size})}
+        records.evaluations.append(
+            Evaluation(
+                run.scene, run.name, bool(bundle), group + seed, results, "", path, run.id, group, run.series, run.seed
+            )
+        )
+    records.knobs += [knob_from(point, run.scene, run.name + seed) for point in run.knobs]
+    curve = path.parent / str(run.train["curve"]) if run.train.get("curve") else None
+    if curve is not None and curve.is_file():
+        _, curves, notes = read_jsonl(curve)
+        records.curves += [replace(c, scene=run.scene, label=run.name + seed, run=run.id) for c in curves]
+        records.notes += notes
+    listed = path.parent / run.pictures / PICTURES if run.pictures else None
+    if listed is not None and listed.is_file():
+        records.worst += read_pictures(listed, run.name + seed)
+
+
+# files and folders
+
+
+def _walk(folder: Path, skip: Path, notes: list[str]) -> Iterator[Path]:
+    """Files below `folder`, sorted, without hidden folders, links to folders, and `skip` when it lies below.
+
+    Of a benchmark's work folder only its cells: they name everything else that counts.
+    """
+    seen = 0
+    for root, folders, files in os.walk(folder):
+        here = Path(root)
+        if CELLS in files:
+            folders[:] = []
+            yield here / CELLS
+            continue
+        depth = len(here.relative_to(folder).parts)
+        folders[:] = sorted(
+            name
+            for name in folders
+            if depth < MAX_DEPTH and not name.startswith(".") and name not in _SKIPPED and here / name != skip
+        )
+        for name in sorted(files):
+            seen += 1
+            if seen > MAX_ENTRIES:
+                notes.append(f"{folder}: only the first {MAX_ENTRIES:,} files were searched; name a smaller folder.")
+                return
+            yield here / name
+
+
+def _read(path: Path, records: Records) -> bool:
+    """Add the records of one file; False if it has none."""
+    before = sum(map(len, vars(records).values())) - len(records.notes)
+    if path.suffix.lower() == ".png":
+        records.images.append(path)
+    elif path.name == PICTURES:
+        records.worst += read_pictures(path)
+    elif path.suffix.lower() == ".jsonl":
+        numbered, notes = read_lines(path)
+        records.notes += notes
+        if path.name == CELLS or any(is_cell(value) for _, value in numbered):
+            read_cells(numbered, path, records)
+            return bool(numbered)
+        if any(is_knob(value) for _, value in numbered):
+            records.knobs += [knob_from(value) for _, value in numbered if is_knob(value)]
+        else:
+            evaluations, curves, _ = read_jsonl(path)
+            records.evaluations += evaluations
+            records.curves += curves
+    else:
+        data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
+        if isinstance(data, dict) and data.keys() >= _POSES:
+            records.poses.append(poses_from(data, path))
+        elif is_evaluation(data):
+            records.evaluations.append(evaluation_from(data, path))
+    return sum(map(len, vars(records).values())) - len(records.notes) > before
+
+
+def collect(inputs: list[Path], output_dir: Path) -> Records:
+    """Read all inputs.
+
+    Args:
+        inputs: files, and folders to search for files.
+        output_dir: where the report goes; not searched when it lies inside one of the folders.
+
+    Raises:
+        ReportError: a named file is missing, broken, or of no kind that is known; or nothing usable was found.
+    """
+    records = Records()
+    seen: set[Path] = set()
+    # Named files first: their errors are fatal, also when a folder holds the same file.
+    paths = [Path(os.path.expanduser(p)) for p in inputs]
+    for path in sorted(paths, key=lambda p: p.is_dir()):
+        if not path.exists():
+            raise ReportError(f"{path} does not exist. Give ns-eval JSON files, training curves (.jsonl) or folders.")
+        if not path.is_dir():
+            if path.resolve() not in seen and not _read(path, records):
+                raise ReportError(
+                    f"{path} holds neither an evaluation (a JSON object with 'results', as ns-eval writes it) "
+                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench, nor how poses were found."
+                )
+            seen.add(path.resolve())
+            continue
+        for file in _walk(path.resolve(), output_dir.resolve(), records.notes):
+            wanted = file.suffix.lower() in (".json", ".jsonl")
+            wanted = wanted or (file.suffix.lower() == ".png" and SIDE_BY_SIDE.match(file.stem))
+            if not wanted or file.resolve() in seen:
+                continue
+            seen.add(file.resolve())
+            try:
+                _read(file, records)
+            except ReportError as error:
+                records.notes.append(str(error))
+    if not (records.evaluations or records.curves or records.knobs or records.worst or records.poses):
+        where = ", ".join(map(str, paths)) or "no inputs"
+        more = "".join(f"\n  {note}" for note in records.notes)
+        raise ReportError(
+            f"nothing to report in {where}: no ns-eval JSON and no training curve. Run "
+            f"`ns-eval --load-config <config.yml> --output-path eval.json` and name that file or its folder.{more}"
+        )
+    link(records)
+    return records

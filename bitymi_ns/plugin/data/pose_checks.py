@@ -1,0 +1,179 @@
+"""Checks of a capture's poses: rotations (or mirrored ones), positions that belong together, and points in their unit;
+and the rotation and translation that orient a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+
+from bitymi_ns.plugin.errors import fail, listed, warn
+
+EXACT = 1e-3
+"""Matrices this close to a rotation are taken as they are: float32, or four written digits."""
+ROUNDED = 2e-2
+"""Matrices this close to a rotation, up to a common factor, are meant to be one: two written digits."""
+FAR = 100.0
+"""Distance relative to all the others from which a camera may be misplaced."""
+TOO_FAR = 1000.0
+"""Relative distance beside which the other cameras shrink to one point."""
+FAR_FROM_ORIGIN = 100.0
+"""Distance from the origin relative to that from their middle at which float32 blurs cameras."""
+OTHER_UNIT = 150.0
+"""Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
+
+
+def rotations(
+    matrices: npt.NDArray[np.float64], names: Sequence[object], source: str, verbose: bool = True
+) -> npt.NDArray[np.float64]:
+    """Recover rotations from the 3 x 3 parts of poses.
+
+    A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
+    (determinant -1) stay mirrored: captures may be mirrored as a whole.
+
+    Args:
+        matrices: [N, 3, 3], camera to world.
+        names: of the N frames, for messages.
+        source: file or capture, for messages.
+        verbose: report what was changed.
+
+    Returns:
+        [N, 3, 3]; rows that need no change are equal to the input.
+
+    Raises:
+        InputError: a matrix is not finite, zero or sheared.
+    """
+    result = matrices.copy()
+    finite = np.isfinite(matrices).all((1, 2))
+    scale = np.sqrt(np.square(np.where(finite[:, None, None], matrices, 0.0)).sum((1, 2)) / 3.0)
+    usable = finite & (scale > 0.0)
+    unit = np.where(usable[:, None, None], matrices, 1.0) / np.where(usable, scale, 1.0)[:, None, None]
+    error = np.abs(unit.transpose(0, 2, 1) @ unit - np.eye(3)).max((1, 2))
+    for what, wrong in (
+        ("is not finite", ~finite),
+        ("is zero", finite & ~usable),
+        ("is sheared or stretched: its columns are not at right angles and equally long", usable & (error > ROUNDED)),
+    ):
+        if wrong.any():
+            fail(
+                f"{source}: the 3 x 3 part of the pose of {listed([names[i] for i in wrong.nonzero()[0]])} is no "
+                f"rotation, it {what}. Correct the pose or remove the frame."
+            )
+    scaled = np.abs(scale - 1.0) > EXACT
+    result[scaled] = unit[scaled]
+    rounded = error > EXACT
+    u, _, v = np.linalg.svd(unit[rounded])
+    result[rounded] = u @ v
+    if verbose and scaled.any():
+        low, high = scale[scaled].min(), scale[scaled].max()
+        factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
+        warn(
+            f"{source}: rotations are scaled by {factor} in the poses of "
+            f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
+        )
+    only_rounded = rounded & ~scaled
+    if verbose and only_rounded.any():
+        warn(
+            f"{source}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
+            f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
+        )
+    return result
+
+
+def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
+    """Warn of frames that are mirrored where the others are not; rotations [N, 3, 3], names for messages."""
+    mirrored = np.linalg.det(rotations) < 0.0
+    few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
+    if few.any():
+        warn(
+            f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames (the sign of the "
+            "pose's determinant differs). If the photograph is not mirrored, too, the pose is wrong."
+        )
+
+
+def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
+    """Fail where all cameras [N, 3] are at one place."""
+    if not np.ptp(centers, axis=0).any():
+        fail(
+            f"{source}: all cameras are at one place. Depth cannot be learned: take photographs from different places."
+        )
+
+
+def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
+    """Fail or warn at single cameras that are far from all the others; centers [N, 3] finite, names for messages."""
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    order = np.argsort(distances)
+    sorted_distances = distances[order]
+    first = len(order) - max(1, len(order) // 10)  # more than a tenth is a group of its own
+    for k in range(max(1, first), len(order)):
+        near, far = sorted_distances[k - 1], sorted_distances[k]
+        if near <= 0.0 or far < FAR * near:
+            continue
+        message = (
+            f"the camera of {listed([names[i] for i in order[k:]])} is {far / near:,.0f} times as far from the middle "
+            "of the capture as the others."
+        )
+        if far < TOO_FAR * near:
+            warn(f"{message[0].upper()}{message[1:]} If that is a mistake, correct the pose or remove the frame.")
+        else:
+            fail(f"{message} Beside it they are all at one place. Correct the pose or remove the frame.")
+        return
+
+
+def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
+    """Test if cameras [N, 3] are so far from the origin that float32 cannot tell their positions."""
+    middle = centers.mean(0)
+    spread = np.linalg.norm(centers - middle, axis=1).max()
+    return bool(0.0 < FAR_FROM_ORIGIN * spread < np.linalg.norm(middle))
+
+
+def check_point_unit(
+    points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
+) -> None:
+    """Warn where the points seem to be in another unit than the poses.
+
+    They are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to start
+    from. Medians and percentiles are used because clouds and captures have outliers.
+
+    Args:
+        points: [N, 3] of the cloud.
+        centers: [M, 3] camera positions, finite.
+        widths: [M] of the pictures, in focal lengths.
+    """
+    points = points[:: max(1, len(points) // 100_000)]
+    points = points[np.isfinite(points).all(1)]
+    if len(points) == 0:
+        return
+    middle, cloud_middle = np.median(centers, axis=0), np.median(points, axis=0)
+    apart = np.percentile(np.linalg.norm(centers - middle, axis=1), 90)  # a median may be that of a group on a tripod
+    away = np.median(np.linalg.norm(points - middle, axis=1))
+    spread = np.median(np.linalg.norm(points - cloud_middle, axis=1))
+    picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # picture width at the cloud
+    hint = "Give the points in the unit of the poses, or remove the cloud to start from random points."
+    if apart > 0.0 and away > OTHER_UNIT * apart:
+        warn(
+            "The point cloud seems to be in another unit than the poses: half of its points are more than "
+            f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {hint}"
+        )
+    elif 0.0 < spread < picture / OTHER_UNIT:
+        warn(
+            "The point cloud seems to be in another unit than the poses: half of its points lie in a spot that is "
+            f"1/{_rounded(picture / spread)} of a picture's width. {hint}"
+        )
+
+
+def _rounded(ratio: float) -> str:
+    return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"
+
+
+def orient(poses: torch.Tensor, method: Any, center_method: Any) -> torch.Tensor:
+    """Compute the transform [3, 4] by which nerfstudio orients and centers poses [N, 4, 4].
+
+    Its poses are not used: for `pca`, nerfstudio 1.1.5 turns a capture that comes out upside down, but of its cameras
+    the second and the third alone. The transform is right.
+    """
+    return auto_orient_and_center_poses(poses, method, center_method)[1]

@@ -1,0 +1,18 @@
+"""Templates escape what they are given, and miss no value in silence."""
+
+import jinja2
+import pytest
+
+from bitymi_ns.measure.markdown import rendered
+
+
+def test_a_value_that_is_missing_is_an_error() -> None:
+    with pytest.raises(jinja2.UndefinedError, match="content"):
+        rendered("report.html.j2", generator="")
+
+
+def test_markdown_is_not_escaped() -> None:
+    values = dict.fromkeys(("rim", "probes", "accurate", "steps", "allowance", "picture", "sweeps", "nothing"), "<1")
+    tables = dict.fromkeys(("plain", "texels", "pixel"), "| a | b |")
+    page = rendered("stability.md.j2", backend="<a>", cases=tables, **values)
+    assert "backend `<a>`" in page and "## Cases\n\n| a | b |\n" in page

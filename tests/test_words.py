@@ -1,0 +1,120 @@
+"""Prose uses the field's words: documentation, comments, docstrings, messages; docstrings begin with the deed."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.test_docs import tracked, without_blocks
+
+WORDS = (
+    "*.md",
+    "Makefile",
+    "method_configs/*.yaml",
+    "examples/*.py",
+    *(
+        f"bitymi_ns/{name}"
+        for name in ("api.py", "cli.py", "codec/*.py", "interchange/*.py", "measure/*", "sample/*.py")
+    ),
+)
+"""Files whose prose is held to BANNED."""
+DOCSTRINGS = ("examples/*.py", "bitymi_ns/api.py", "bitymi_ns/cli.py", "bitymi_ns/measure/*.py")
+"""Python files whose docstrings begin with what is done."""
+BANNED = {
+    r"\bby lot\b": "at random",
+    r"\bset(?:s|ting)?[- ]aside\b": "validation views; held back",
+    r"(?i:\bworthwhile\b)": "by rate-distortion; lambda",
+    r"\bpacks\b|\bpack of (?:4|16|pixels)|\ba pack at a time": "block4x4; lanes",
+    r"\bLooks\b|\ba look at the|\bviews that are looked (?:at|through)": "evaluation; sampled views",
+    r"\b(?:price of a bit|one price|price and worth|worth of a bit)\b": "lambda",
+    r"\b(?:given|photographed|learned|finding|several|quiet|holdout|looks|places)\.py\b": "the module's subject",
+    r"\bgiven places\b|\bits place in the list\b": "fragment_ids; offset",
+    r"\brules keep it from\b|\bin silence\b|\bwithout a word\b|\bwith a word\b": "messages; silently",
+    r"\bit is said\b|\b(?:that|which|what) is said\b|\bis said to\b": "a message says; reported",
+    r"\bseeing it takes\b": "coverage prior",
+    r"\bbegins? anew\b|\banew\b": "again; starts over",
+    r"\breckon(?:ed|s|ing)?\b": "estimated",
+    r"\bsurfels? (?:that )?speaks?\b|\bspeak to them\b": "affect",
+    r"\bwhat a run's own\b|(?<!-)\bthinned\b": "limits; sampled",
+    r"\blot of surfels\b|\bhouse word": "surfels",
+}
+"""Pattern: what to write instead."""
+QUESTION = re.compile(r"(?:What|Whether|How|Where|Who|Which|When)\b")
+"""A docstring that begins so does not say what the thing does."""
+
+
+def prose(path: Path) -> Iterator[tuple[int, str]]:
+    """Line numbers and prose: Markdown without code, comments and strings of Python, all of other files."""
+    text = path.read_text("utf8")
+    if path.suffix == ".py":
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type in (tokenize.COMMENT, tokenize.STRING) or tokenize.tok_name[token.type] == "FSTRING_MIDDLE":
+                yield token.start[0], " ".join(token.string.split())
+        return
+    if path.suffix == ".md":
+        text = re.sub(r"`[^`\n]*`", "`", without_blocks(text))
+    for paragraph in re.finditer(r"(?:[^\n]+\n?)+", text):
+        yield text.count("\n", 0, paragraph.start()) + 1, " ".join(paragraph[0].split())
+
+
+def found(path: Path) -> list[str]:
+    """Banned words of a file, with line and remedy."""
+    return [
+        f"{path}:{number}: '{match[0]}', say: {instead}"
+        for number, line in prose(path)
+        for pattern, instead in BANNED.items()
+        for match in re.finditer(pattern, line)
+    ]
+
+
+def questions(path: Path) -> list[str]:
+    """Docstrings of a Python file that begin with a question word."""
+    nodes = ast.walk(ast.parse(path.read_text("utf8")))
+    documented = [node for node in nodes if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))]
+    texts = [(getattr(node, "name", path.stem), ast.get_docstring(node) or "") for node in documented]
+    return [f"{path}: {name}: {text.splitlines()[0]}" for name, text in texts if QUESTION.match(text)]
+
+
+FILES = tracked(*WORDS)
+
+
+@pytest.mark.skipif(not FILES, reason="not a git checkout")
+def test_no_banned_words() -> None:
+    assert not [line for path in FILES for line in found(path)]
+
+
+@pytest.mark.skipif(not FILES, reason="not a git checkout")
+def test_docstrings_begin_with_what_is_done() -> None:
+    assert not [line for path in tracked(*DOCSTRINGS) for line in questions(path)]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "count"),
+    [
+        ("a.md", "Points are dropped by\nlot.\n", 1),
+        ("a.md", "Run `by lot`.\n\n```\nset aside\n```\n", 0),
+        ("a.py", '"""Views that are set aside."""\nlooks = 1  # one price\n', 2),
+        ("a.py", "by_lot = packs = 1\n", 0),
+        ("a.py", 'print("nothing is done in silence")\n', 1),
+        ("a.h", "// Atlas packing.\n", 0),
+        ("a.h", "// blended a pack at a time, so packs are lanes\n", 2),
+        ("a.md", "A photograph looks sharp; several packages; a learned texture at the price of time.\n", 0),
+    ],
+)
+def test_banned_words_are_found(tmp_path: Path, name: str, text: str, count: int) -> None:
+    (tmp_path / name).write_text(text)
+    assert len(found(tmp_path / name)) == count
+
+
+def test_questions_are_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.py"
+    path.write_text(
+        '"""What this is."""\n\n\ndef f():\n    """Whether it is so."""\n\n\ndef g():\n    """Draw it."""\n'
+    )
+    assert len(questions(path)) == 2

@@ -26,7 +26,7 @@ from rich.filesize import decimal
 from bitymi_ns.trust import UNFINISHED, Refused, is_left, no_links
 
 Tell = Callable[[str], None]
-"""Gets a message for people about something that goes on without what it should have had."""
+"""Receives a warning for the user."""
 
 
 class Busy(BlockingIOError):
@@ -56,7 +56,7 @@ _REASONS = {
 
 
 def reason(error: OSError, path: Path) -> str:
-    """Why `path` could not be written, and what to do about it; without a full stop."""
+    """Explain why `path` could not be written, and what to do; without a full stop."""
     if isinstance(error, (Busy, Refused)):
         return str(error)
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
@@ -69,7 +69,7 @@ def reason(error: OSError, path: Path) -> str:
 
 @contextmanager
 def explained(path: Path, kind: type[Exception]) -> Iterator[None]:
-    """Turn the system's refusals to write `path` in the block into exceptions of this kind that say why."""
+    """Turn OSErrors in the block into exceptions of this kind that explain why `path` cannot be written."""
     try:
         yield
     except OSError as error:
@@ -176,7 +176,7 @@ class Lock:
 
 
 def _holder(path: Path) -> str:
-    """Who holds a lock, and what to do."""
+    """Describe the holder of a lock, and what to do."""
     try:
         process, host = path.read_text("utf8").split()
     except (OSError, ValueError):  # it has been released just now, or has not been named yet
@@ -205,14 +205,14 @@ def release(path: Path) -> None:
 
 @contextmanager
 def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
-    """Hold the place of a file or folder, and put right what a killed process left of a folder there.
+    """Lock the path of a file or folder, and repair what a killed process left of a folder there.
 
-    Makes missing parents, and removes them again where nothing has come into them. As this writes beside the target, it
-    also shows whether anything can be written there, before the work that is to be written.
+    Makes missing parents, and removes them again where they stay empty. As this writes beside the target, it also fails
+    early where nothing can be written.
 
     Args:
         target: what is to be written in the block; reservations of one thread may be nested.
-        tell: told where the file system has no locks.
+        tell: called where the file system has no locks.
 
     Yields:
         the target with links resolved.
@@ -243,14 +243,14 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
 
 
 def check_writable(target: Path) -> None:
-    """See that a file or folder can be written there, before the work of making it; raises what `reserved` raises."""
+    """Check that a file or folder can be written, before the work of making it; raises as `reserved` does."""
     if not _is_device(target):
         with reserved(target):
             pass
 
 
 def _is_device(path: Path) -> bool:
-    """Whether it is a device or a pipe, such as /dev/stdout."""
+    """Test for a device or a pipe, such as /dev/stdout."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
@@ -259,8 +259,8 @@ def _beside(place: Path) -> tuple[Path, Path]:
 
 
 def _settle(place: Path) -> None:
-    """Undo a replacement that has not come to its end: the place has the later folder if it was whole, else the earlier
-    one, and there is nothing beside it. To be called by the holder of the lock alone."""
+    """Complete or undo an interrupted replacement: the new folder if it was complete, else the old one. The caller
+    holds the lock."""
     new, old = _beside(place)
     _remove(new)
     if is_left(old):
@@ -278,7 +278,7 @@ def _remove(folder: Path) -> None:
 
 @contextmanager
 def staging(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
-    """An empty folder beside the target for what is on its way there; it is gone after the block. See `reserved`."""
+    """Make an empty temporary folder beside the target for the block; see `reserved`."""
     with reserved(target, tell) as place:
         new, _ = _beside(place)
         try:
@@ -293,7 +293,7 @@ def staging(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
 def complete_folder(
     target: str | Path, check: Callable[[], None] = lambda: None, tell: Tell = warnings.warn
 ) -> Iterator[Path]:
-    """A temporary folder beside the target that takes the target's place when the block ends without an exception.
+    """Make a temporary folder that replaces the target when the block ends without an exception.
 
     On any exception, KeyboardInterrupt included, the target is as it was. After a kill it is the earlier folder or the
     later one, or both are beside it, and the next writer puts that right.
@@ -301,7 +301,7 @@ def complete_folder(
     Args:
         target: the folder; missing parents are made.
         check: raises if what is in the place may not be replaced; called before the block and after it.
-        tell: told where the file system has no locks.
+        tell: called where the file system has no locks.
 
     Yields:
         the temporary folder.
@@ -327,8 +327,7 @@ def complete_folder(
 
 @contextmanager
 def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]:
-    """A file to write to, which takes the place of `path` when the block ends without an exception; else that is as it
-    was.
+    """Open a temporary file that replaces `path` when the block ends without an exception.
 
     Args:
         path: the file; its folder must exist.
@@ -379,7 +378,7 @@ def remove_unfinished(folder: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """See that a file's bytes, or a folder's names, are on the disk: a full disk is reported here at the latest."""
+    """Flush a file's bytes, or a folder's names, to disk; a full disk is reported here at the latest."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""PLY files: what their header says, and the rows of an element, binary or text.
+"""Reader of PLY files: header, and the rows of an element, binary or text.
 
 `bundle.ply` reads and writes the PLY file of a bundle with it, `plugin.data.point_files` the clouds of captures.
 
@@ -41,7 +41,7 @@ class PlyError(ValueError):
 
 @dataclass(frozen=True)
 class Element:
-    """What a PLY file declares of one element.
+    """Element of a PLY file.
 
     Attributes:
         count: of its rows.
@@ -56,7 +56,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What a PLY file declares.
+    """Header of a PLY file.
 
     Attributes:
         order: of the bytes, < or >; "" in a text file.
@@ -71,8 +71,8 @@ class Header:
     lines: int
 
     def ahead(self, name: str) -> int | None:
-        """What lies between the header and an element's rows: lines of a text file, else bytes; None where lists do
-        not tell."""
+        """Count lines of a text file, else bytes, between the header and an element's rows; None where lists hide
+        it."""
         total = 0
         for other, element in self.elements.items():
             if other == name:
@@ -143,7 +143,7 @@ def _row(properties: dict[str, str | None], order: str) -> np.dtype | None:
 
 
 def rows_there(path: Path, header: Header, name: str) -> int | None:
-    """How many rows of an element the file has room for; None where that cannot be told from the header."""
+    """Count the rows of an element that the file has room for; None where the header does not determine it."""
     element, ahead = header.elements[name], header.ahead(name)
     if ahead is None:
         return None

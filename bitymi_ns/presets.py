@@ -1,4 +1,4 @@
-"""Where the preset files (method_configs/*.yaml) are, in a wheel and in a source checkout."""
+"""Paths of the preset files (method_configs/*.yaml), in a wheel and in a source checkout."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
-"""Files and folders where other people can write, too: links are not followed, their folders are not used, and what
-their files say stays within bounds: names within a folder, nesting within a depth, text within what can be shown."""
+"""Protection against files of others: links are not followed, folders that others can write to are not used, names stay
+inside a folder, JSON within a nesting depth, and text is printable."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\u
 
 
 class Refused(PermissionError):
-    """Something in the place of a file or folder may have been put there by somebody else: what, and what to do."""
+    """A file or folder may have been put there by somebody else; the message says what to do."""
 
     def __init__(self, message: str, path: Path) -> None:
         super().__init__(errno.EPERM, message, str(path))
@@ -75,13 +75,13 @@ def _check(path: Path, found: os.stat_result) -> None:
 
 
 def _check_owner(path: Path, found: os.stat_result) -> None:
-    """The owner of the folder can put another file there at any time; nobody else may have."""
+    """Refuse files of anybody but the user and the owner of the folder, who could replace them at any time."""
     if found.st_uid not in (os.geteuid(), os.stat(path.parent).st_uid):
         raise Refused(f"{path} belongs to somebody else: have it removed, or give another place", path)
 
 
 def is_left(folder: Path) -> bool:
-    """Whether a folder of this name, which a killed process may have left, is there.
+    """Test for a folder that a killed process may have left.
 
     Raises:
         Refused: something else is there, or somebody else's.
@@ -97,11 +97,11 @@ def is_left(folder: Path) -> bool:
 
 
 def own_folder(folder: Path, close: bool = False) -> None:
-    """Make a folder that the user alone can write to, where it is missing.
+    """Make a folder that only the user can write to, where it is missing.
 
     Args:
-        folder: its parent is not looked at.
-        close: take the right to write from others where the folder is there already: what is in it does not matter.
+        folder: its parent is not checked.
+        close: remove write permission of others from an existing folder, whose content does not matter.
 
     Raises:
         Refused: what is there belongs to somebody else, can be written by others, or is a link.
@@ -119,7 +119,7 @@ def own_folder(folder: Path, close: bool = False) -> None:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether it is a folder, and no link to one, that belongs to the user, and that nobody else can write to."""
+    """Test for a folder, not a link to one, that belongs to the user and that nobody else can write to."""
     try:
         found = os.lstat(folder)
     except OSError:
@@ -128,7 +128,7 @@ def is_own(folder: Path) -> bool:
 
 
 def check_no_links(paths: Iterable[Path]) -> None:
-    """See that none of these, which may be missing, is a link or a hard link: they come out of archives, too.
+    """Check that none of these paths, which may be missing, is a symbolic or hard link; archives can contain both.
 
     Raises:
         Refused: one is.
@@ -143,18 +143,18 @@ def check_no_links(paths: Iterable[Path]) -> None:
 
 
 def strangers(folder: Path, made: Iterable[str]) -> list[str]:
-    """What is in a folder that was not made by what wants to replace it: names of files and folders, seen from it.
+    """List files and folders in a folder that are not among those made by its writer, relative to it.
 
     Args:
         folder: with what it holds.
-        made: names of all files that were made, seen from it.
+        made: names of all files that were made, relative to it.
     """
     named = [PurePosixPath(name) for name in made]
     files = {str(path) for name in named for path in (name, name.with_name(f".{name.name}{UNFINISHED}"))}
     folders = {str(parent) for name in files for parent in PurePosixPath(name).parents}
     found = []
-    for place, below, names in os.walk(folder):
-        where = Path(place).relative_to(folder)
+    for parent, below, names in os.walk(folder):
+        where = Path(parent).relative_to(folder)
         for name in [*below, *names]:
             path = (where / name).as_posix()
             links = (folder / path).is_symlink()
@@ -165,10 +165,10 @@ def strangers(folder: Path, made: Iterable[str]) -> list[str]:
 
 
 def keep(folder: Path, made: Iterable[str]) -> None:
-    """See that a folder holds nothing that would be lost if it was replaced.
+    """Check that a folder holds nothing that would be lost if it was replaced.
 
     Raises:
-        Refused: it does; names it.
+        Refused: it does.
     """
     others = strangers(folder, made)
     if others:
@@ -181,10 +181,10 @@ def keep(folder: Path, made: Iterable[str]) -> None:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The file of this name in a folder or the folders in it.
+    """Join a folder and a relative name.
 
     Raises:
-        ValueError: the name leads elsewhere, or is none.
+        ValueError: the name leads out of the folder, or is empty.
     """
     if not leads_inside(name):
         raise ValueError(f"the name {name!r} leads elsewhere than to a file in the folder: correct it")
@@ -192,16 +192,16 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def leads_inside(name: str) -> bool:
-    """Whether a name is that of a file in the folder that it is relative to, or in the folders in that."""
+    """Test that a relative name stays inside the folder that it is relative to."""
     path = PurePosixPath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
 def json_of(data: str | bytes) -> Any:
-    """The value of JSON that a file of somebody's holds.
+    """Parse untrusted JSON.
 
     Raises:
-        ValueError: it is no JSON, or is nested so deeply that what works on it would fail.
+        ValueError: it is no JSON, or is nested too deeply to process.
     """
     try:
         value = json.loads(data)
@@ -221,13 +221,13 @@ def json_of(data: str | bytes) -> Any:
 
 
 def printable(text: str) -> str:
-    """A text for a terminal: what in it controls terminals, as a file's name may, or turns the direction of writing, or
-    is no character, stands as an escape."""
+    """Escape control characters, changes of writing direction and surrogates for a terminal; file names may hold
+    them."""
     return _CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
 
 
 def is_text(name: str | os.PathLike[str]) -> bool:
-    """Whether a file's name is UTF-8, without which it cannot be written into most files."""
+    """Test if a file's name is UTF-8, as most files that name it need."""
     try:
         os.fspath(name).encode()
     except UnicodeEncodeError:

@@ -34,8 +34,7 @@ class Baked:
         options: what it was baked with.
         uncoded: [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`.
         in_front: [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1.
-        codes: the integers that the surfels, and once they are coded the texels, stand for; None = they are stored as
-            they are.
+        codes: integer codes of the surfels, and of the texels once coded; None = not compact.
         statistics: what was left out, what it cost, and the error of the quantisation.
     """
 
@@ -51,7 +50,7 @@ class Baked:
     in_front: Tensor | None = None
 
     def with_statistics(self, **changes: Any) -> Baked:
-        """The same bake with other statistics."""
+        """Copy with other statistics."""
         return replace(self, statistics=self.statistics.but(**changes))
 
     @property
@@ -67,12 +66,12 @@ class Baked:
         return self.scene.extent
 
     def with_mean_residual(self, mean_residual: Tensor) -> Baked:
-        """The same bake with other means [N, 3]."""
+        """Copy with other means [N, 3]."""
         return replace(self, scene=replace(self.scene, mean_residual=mean_residual))
 
     @property
     def tiles(self) -> Tiles:
-        """Of every surfel."""
+        """Tiles of the surfels."""
         return Tiles(self.packing, self.texels, self.extent, self.mean_residual)
 
     def unquantised(self) -> BakedScene:
@@ -92,12 +91,12 @@ class Baked:
         return replace(self.scene, atlas=pages, offset=atlas.range.offset, scale=atlas.range.scale)
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> Baked:
-        """The same bake with other parameters of its N surfels; tiles and texels are as they are."""
+        """Copy with other parameters of its N surfels, and the same tiles."""
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
         return replace(self, scene=replace(self.scene, surfels=given))
 
     def with_tiles(self, tiles: Tiles) -> Baked:
-        """The same bake with other tiles of its N surfels. The atlas is to be `encoded`."""
+        """Copy with other tiles of its N surfels, not encoded yet."""
         scene = replace(
             self.scene,
             tiles=torch.from_numpy(tiles.packing.tiles),
@@ -107,8 +106,7 @@ class Baked:
         return replace(self, scene=scene, packing=tiles.packing, texels=tiles.texels, atlas=None)
 
     def only(self, kept: Tensor) -> Baked:
-        """The bake of some of its surfels, `kept` [N] bool: their tiles, packed anew, with their texels. The atlas is
-        to be `encoded`."""
+        """Copy with the surfels of the mask `kept` [N] and their tiles, packed again, not encoded yet."""
         if bool(kept.all()):
             return self
         surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
@@ -122,7 +120,7 @@ class Baked:
         return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.mean_residual[kept]))
 
     def with_texels(self, texels: Tensor) -> Baked:
-        """The same bake with other residual colours (fine-tuned ones, say), to be `encoded`."""
+        """Copy with other residual colours, not encoded yet."""
         if self.texels is None or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         texels = texels.detach().float().cpu().contiguous()
@@ -132,18 +130,17 @@ class Baked:
         return replace(self.with_mean_residual(means), texels=texels, atlas=None, statistics=statistics)
 
     def encoded(self, progress: Progress = no_progress) -> Baked:
-        """The same bake with its texels quantised and encoded, where that is not done."""
+        """Copy with its texels quantised and encoded, where that is not done."""
         if self.texels is None or self.atlas is not None:
             return self
         return self.with_atlas(encoded_pages(self.texels, self.packing, self.options, progress))
 
     def with_atlas(self, atlas: EncodedAtlas) -> Baked:
-        """The same bake with its texels as they are encoded."""
+        """Copy with an encoded atlas."""
         return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas)))
 
     def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> Baked:
-        """The same bake with the residual colours of codes, which are those of its tiles, and were made of `uncoded`
-        [T, 3]."""
+        """Copy with the residual colours of the codes of its tiles, which were made of `uncoded` [T, 3]."""
         assert self.codes is not None
         texels = paged_texels(codes.texels(), self.packing)
         value_range = choose_range(

@@ -1,4 +1,4 @@
-"""The directions at which a surfel's view colour counts: those of the training views that see it, and others nearby."""
+"""Directions at which a surfel's view colour is evaluated: of the training views that show it, and others nearby."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Directions:
         rows: [n] int64 rows of the surfels.
         unit: [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first.
         valid: [n, D] bool; the rest of a row is filling.
-        views: how many of the D places are for views.
-        view: [n, views] int64, which view each of these places is for.
+        views: number of the D columns that are for views.
+        view: [n, views] int64, view of each of these columns.
     """
 
     rows: Tensor
@@ -41,8 +41,9 @@ class Directions:
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
     """The directions of all surfels, in chunks of surfels that about equally many views see.
 
-    Beside those of the views that see a surfel there are BETWEEN others: of three such views drawn by lot, the same lot
-    for every surfel, a point of their triangle, a quarter larger. A surfel that no view sees has SPHERE directions.
+    Beside those of the views that see a surfel there are BETWEEN others: random points of the triangles of three such
+    views, a quarter larger, with the same random numbers for every surfel. A surfel that no view sees has SPHERE
+    directions.
 
     Args:
         means: [N, 3] world positions.

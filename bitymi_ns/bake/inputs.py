@@ -18,7 +18,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import Visibility, visibility
 
 POINTS = 256
-"""Of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame."""
+"""Points of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class BakeInput:
         return nothing if self.views is None else self.views.seen
 
     def of(self, rows: Tensor) -> BakeInput:
-        """Some of the surfels."""
+        """Inputs of some of the surfels."""
         surfels = {name: value[rows] for name, value in self.surfels.items()}
         return replace(self, surfels=surfels, views=None if self.views is None else self.views.of(rows))
 
     def with_visibility(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
         """Add the visibility, where there are cameras and the options need it."""
-        if not self.cameras or not options.looks_at_views:
+        if not self.cameras or not options.needs_visibility:
             return self
         return replace(
             self,

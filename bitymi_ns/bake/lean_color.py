@@ -1,4 +1,4 @@
-"""View colours without what a scene does not need: a surfel keeps as few sites as hold its colour, or one colour."""
+"""Lean view colours: a surfel keeps the fewest sites that hold its colour, or one colour."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 FIT_STEPS = 6
 FIT_VIEWS = 16
-"""The fit looks at so many of a surfel's views; the error is measured in all of them."""
+"""Views of a surfel in the fit; the error is measured in all of them."""
 OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
-"""So many directions over the whole sphere count a little in the fit: where no view looks from, the colour follows the
-trained one loosely instead of running away."""
+"""Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
+loosely instead of diverging."""
 
 
 @dataclass
@@ -147,18 +147,18 @@ def _fewer_sites(
     sites = vectors.shape[1]
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
     stride = -(-at.views // FIT_VIEWS) if at.views else 1  # views that see a surfel come first: an even choice of them
-    looked = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
+    samples = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
     weight = torch.cat([at.valid[:, : at.views : stride], at.valid[:, at.views :: 2]], dim=1).float()
     weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
-    colors = site_weights(vectors, looked) @ rgb
-    left = least_needed(vectors, rgb, looked, weight)
+    colors = site_weights(vectors, samples) @ rgb
+    left = least_needed(vectors, rgb, samples, weight)
     result = []
     for number in range(2, sites):
         if len(rest) == 0:
             break
         kept = left[number - 1][rest, :, None].expand(-1, -1, 3)
         v, r = vectors[rest].gather(1, kept), rgb[rest].gather(1, kept)
-        b, r = fit_sites(v[:, 1:] - v[:, :1], r, looked[rest], colors[rest], weight[rest], FIT_STEPS)
+        b, r = fit_sites(v[:, 1:] - v[:, :1], r, samples[rest], colors[rest], weight[rest], FIT_STEPS)
         shown = view_base(site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r)
         terms = torch.cat([b, r[:, 1:]], dim=2)
         good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
@@ -201,7 +201,7 @@ def view_color_errors(
 def describe(
     kind: str, surfels: Mapping[str, Tensor], lean: LeanColor, error: Tensor, tolerance: float
 ) -> ViewColorError:
-    """What was left out and what it costs."""
+    """Statistics of a reduction."""
     entry = VIEW_COLORS[kind]
     before = sum(each[0].numel() for each in entry.of(surfels)) if len(lean.base) else 0
     sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms

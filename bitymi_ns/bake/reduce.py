@@ -55,7 +55,7 @@ def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
-    """What tiles [n, 3, v, u] show on a finer grid (u, v)."""
+    """Interpolate tiles [n, 3, v, u] on a finer grid (u, v)."""
     u, v = texels.shape[3], texels.shape[2]
     return along_axes(texels, interpolation(size[0], u).to(texels), interpolation(size[1], v).to(texels))
 
@@ -95,7 +95,7 @@ def reduce_tiles(
     r_min: int = 4,
     progress: Progress = no_progress,
 ) -> Reduced:
-    """Chooses every tile's grid.
+    """Choose every tile's grid.
 
     The error of a grid is (reconstruction - what the tile should hold) times the largest blending weight that a
     fragment has there, in 8-bit steps: its root mean square over the colour channels and over the part of the support

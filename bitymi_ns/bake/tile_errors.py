@@ -16,7 +16,7 @@ from bitymi_ns.scene.tile_sizes import max_projected_extent
 from bitymi_ns.train.rotations import tangents
 
 _CONSTANT = (8, 8)
-"""Points at which the weight of a surfel without a tile is looked at."""
+"""Grid on which the weight of a surfel without a tile is evaluated."""
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
 
 @torch.no_grad()
 def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
-    """What differences of texels are as the closest training view sees them.
+    """Differences of texels as the closest training view shows them.
 
     Args:
         difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
@@ -63,7 +63,7 @@ def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
     """Pixels that a scale unit of every surfel takes along u and v in the view that shows it largest: [N, 2]; 0 where
-    no view looks at it.
+    no view shows it.
 
     Args:
         surfels: per-surfel parameters, N rows.
@@ -76,7 +76,7 @@ def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], ext
 
 
 def cells_per_pixel(pixels: Tensor | None, extent: Tensor, size: tuple[int, int]) -> Tensor:
-    """How many cells of a grid over a tile a pixel covers along u and v: [n, 2], from 1 to the side of the grid.
+    """[n, 2] cells of a grid over a tile that a pixel covers along u and v, from 1 to the side of the grid.
 
     Args:
         pixels: [n, 2] of `closest_pixels`; None = not known: a pixel covers one cell.

@@ -26,7 +26,7 @@ _SLACK_COUNT = 2
 
 
 def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Check:
-    """Measures the stored tiles against the field anew, and compares with the error that bundle.json states.
+    """Measure the stored tiles against the field, and compare with the error that bundle.json states.
 
     Args:
         bundle: what `check_files` read.
@@ -65,7 +65,7 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
 
 
 def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
-    """Measures lean view colours against the trained ones anew, and compares with the error that bundle.json states.
+    """Measure lean view colours against the trained ones, and compare with the error that bundle.json states.
 
     Args:
         bundle: what `check_files` read.

@@ -1,4 +1,4 @@
-"""View colours with the terms that the pictures pay for: how much error every number of them would make in views."""
+"""Rate-distortion choice of the view-colour terms: the error that every number of terms makes in the views."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
 
 BITS_PER_NUMBER = 5.5
-"""Of a term in a compact bundle, about."""
+"""Bits of a number of a term in a compact bundle, about."""
 LEAST_WEIGHT = 1e-12
-"""Of a direction: a surfel that no view shows has a colour, too."""
+"""Weight of any direction: a surfel that no view shows has a colour, too."""
 VIEW_SHARE = 0.5
-"""Of the error, that the training views count; the rest are directions between and around them."""
+"""Weight of the training views; the rest are directions between and around them."""
 
 BLIND = 4
 """Directions from so many of the nearest views that do not show the surfel count, too."""
 BLIND_SHARE = 0.1
-"""Of what a view would show of the surfel from there, that these count: a view beside them may look at it."""
+"""Weight of these as a share of what a view would show of the surfel from there: a new view may show it."""
 
 
 @dataclass(frozen=True)
 class ColorChoices:
-    """What every number of terms would do to the colours of N surfels.
+    """Errors and parameters of the colours of N surfels for every number of terms.
 
     Attributes:
         error: [N, most + 1] squared error in the views, summed over pixels and channels; infinite where that number is
@@ -51,15 +51,15 @@ class ColorChoices:
     base: Tensor
     terms: Mapping[int, Tensor]
 
-    def at(self, price: float) -> dict[str, Tensor]:
-        """The lean view colours that are worth it.
+    def at(self, lmbda: float) -> dict[str, Tensor]:
+        """Lean view colours of the least error + lambda bits.
 
         Args:
-            price: squared error, colours from 0 to 1, that saving a bit may cost.
+            lmbda: squared error per bit, colours from 0 to 1.
         """
         width = self.terms[0].shape[2]
         bits = BITS_PER_NUMBER * width * torch.arange(self.error.shape[1])
-        count = (self.error + price * bits).argmin(dim=1)
+        count = (self.error + lmbda * bits).argmin(dim=1)
         first = count.cumsum(0) - count
         terms = self.base.new_zeros(int(count.sum()), width)
         for number, values in self.terms.items():
@@ -81,12 +81,12 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
         for fragments in fitting_lists(projection):
             found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
             del fragments  # before the next list is made
-        progress("looking through the training views", done + 1, len(cameras))
+        progress("tracing the training views", done + 1, len(cameras))
     return found
 
 
 def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
-    """Bytes that `color_choices` holds at once.
+    """Memory of `color_choices`, bytes.
 
     Args:
         kind: of the view colours.
@@ -102,7 +102,7 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
 
 @torch.no_grad()
 def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progress = no_progress) -> ColorChoices:
-    """What fewer terms would do to lean view colours, from all that a surfel has down to one colour.
+    """Errors of lean view colours with fewer terms, from all of a surfel's down to one colour.
 
     Terms are left out and the others fitted as in `lean_color`, but the error is that of the pictures: squared, of
     max(f_view + 0.5, 0), in every view times what it shows of the surfel. Half of it is that in the training views,
@@ -151,7 +151,7 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
                 if number:
                     terms[number][rows] = t
             done += len(rows)
-            progress("weighing the view colours", done, len(group))
+            progress("choosing the view colours", done, len(group))
     return ColorChoices(error.cpu(), base.cpu(), {number: values.cpu() for number, values in terms.items()})
 
 
@@ -198,16 +198,16 @@ def _fewer(
     vectors, rgb = F.pad(terms[..., :3], (0, 0, 1, 0)), torch.cat([base[:, None], terms[..., 3:]], dim=1)
     stride = -(-at.views // FIT_VIEWS) if at.views else 1
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    looked = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
+    samples = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
     counts = torch.cat([weight[:, : at.views : stride], weight[:, at.views :: 2]], dim=1)
     counts = counts / counts.mean(1, keepdim=True).clamp(min=1e-20)
     counts = F.pad(counts, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
-    colors = site_weights(vectors, looked) @ rgb
-    left, found = least_needed(vectors, rgb, looked, counts), []
+    colors = site_weights(vectors, samples) @ rgb
+    left, found = least_needed(vectors, rgb, samples, counts), []
     for number in numbers:
         kept = left[number][:, :, None].expand(-1, -1, 3)
         v, r = vectors.gather(1, kept), rgb.gather(1, kept)
-        b, r = fit_sites(v[:, 1:] - v[:, :1], r, looked, colors, counts, FIT_STEPS)
+        b, r = fit_sites(v[:, 1:] - v[:, :1], r, samples, colors, counts, FIT_STEPS)
         found.append((number, r[:, 0], torch.cat([b, r[:, 1:]], dim=2)))
     return found
 

@@ -13,7 +13,7 @@ from bitymi_ns.scene.tile_sizes import check_sides
 
 @dataclass
 class BakeOptions:
-    """How the trained field becomes an atlas."""
+    """Options of the bake: tolerance, tiles, atlas format."""
 
     format: Format = "bc7"
     """Texel format: bc7 = 1 byte per texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
@@ -53,12 +53,12 @@ class BakeOptions:
     """Texels evaluated at once."""
 
     @property
-    def looks_at_views(self) -> bool:
-        """Whether what the training views see decides what is kept and how much an error counts."""
+    def needs_visibility(self) -> bool:
+        """True where visibility in the training views decides what is kept and how errors are weighted."""
         return self.drop_unseen or self.tolerance > 0
 
     def check(self) -> None:
-        """Refuses values that the bake would stumble over later."""
+        """Refuse values out of range."""
         if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
             raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
         if not 0 <= self.tolerance < STEPS:

@@ -22,7 +22,7 @@ HEADER_LIMIT = 1 << 10
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the format of the texels decides in the file."""
+    """Fields of the file that depend on the texel format."""
 
     vk_format: int
     type_size: int  # bytes of one component, 1 for compressed formats
@@ -90,7 +90,7 @@ def write_ktx2(
     height: int,
     writer: str,
 ) -> None:
-    """Writes a 2D array texture with one level, not supercompressed.
+    """Write a 2D array texture with one level, not supercompressed.
 
     Args:
         path: file to write.
@@ -124,7 +124,7 @@ def write_ktx2(
 
 @dataclass(frozen=True)
 class Header:
-    """What a KTX2 file declares.
+    """Header of a KTX2 file.
 
     Attributes:
         format: one of bc7, uint8, fp16.
@@ -183,7 +183,7 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Header:
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
-    """Reads and checks a file written by `write_ktx2`, without copying the texels.
+    """Read and checks a file written by `write_ktx2`, without copying the texels.
 
     Raises:
         Ktx2Error: the file is something else, is truncated, or contradicts itself.

@@ -1,4 +1,4 @@
-"""bundle.json: the one description of what it holds, for writing and for reading, and the digest that protects it."""
+"""bundle.json: its only description, for writing and reading, and the digest that protects it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class BundleError(ValueError):
 
 
 def check_file_name(name: str, source: str) -> None:
-    """Refuses names that are not a plain file name: a bundle never reaches out of its folder.
+    """Refuse names that are not a plain file name: a bundle never reaches out of its folder.
 
     Raises:
         BundleError: naming `source`.
@@ -60,7 +60,7 @@ def _is_file_name(name: str) -> bool:
 
 
 def _only(value: float) -> Any:
-    """The type of a constant that the renderers draw with: stated for other programs, and no other value will do."""
+    """Type of a constant of the renderers: stated for other programs, and any other value is refused."""
 
     def check(found: float) -> float:
         if found != value:
@@ -135,13 +135,13 @@ class PositionFrame(Part):
 
 
 class Surfels(Part):
-    """What surfels.ply or surfels.bin holds, and how it is to be read."""
+    """Contents and interpretation of surfels.ply or surfels.bin."""
 
     file: Literal["surfels.ply", "surfels.bin"] = SURFELS
     count: Whole
     frame: PositionFrame | None = None
     columns: Annotated[list[Column], Field(max_length=64)] | None = None
-    """Of surfels.bin, in their order."""
+    """Columns of surfels.bin, in their order."""
     view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
     support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
@@ -152,24 +152,24 @@ class Surfels(Part):
     terms: Whole | None = None
     """Terms of all lean view colours together; None = view colours are complete."""
     view_terms: str | None = None
-    """How a lean view colour is evaluated."""
+    """Formula of a lean view colour."""
 
 
 class Atlas(Part):
-    """What atlas.ktx2 holds: residual = offset + scale * value, value = stored / 255 for bc7 and uint8. Or what
-    texels.bin holds, of the format dct: texels that are rounded to 8 bits of that range."""
+    """Contents of atlas.ktx2: residual = offset + scale * value, value = stored / 255 for bc7 and uint8; or of
+    texels.bin, of the format dct: texels that are rounded to 8 bits of that range."""
 
     file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
     format: Literal["bc7", "uint8", "fp16", "dct"]
     texels: Whole | None = None
-    """Of all tiles, in texels.bin."""
+    """Texels of all tiles, in texels.bin."""
     step: Annotated[float, Field(ge=1e-6, le=100)] | None = None
-    """Of coefficients of grade 0, in texels.bin."""
+    """Step of coefficients of grade 0, in texels.bin."""
     page_width: Side | None = None
     page_rows: Side | None = None
     """Arguments of `codec.packing.pack`, by which the packing follows from the sizes of the tiles."""
     columns: Annotated[list[Column], Field(max_length=64)] | None = None
-    """Of texels.bin, in their order."""
+    """Columns of texels.bin, in their order."""
     width: Side
     height: Side
     layers: Side
@@ -199,7 +199,7 @@ class Atlas(Part):
 
 
 class Render(Part):
-    """What the renderers draw with."""
+    """Constants of the renderers."""
 
     alpha_max: _only(ALPHA_MAX) = ALPHA_MAX  # type: ignore[valid-type]
     alpha_min: _only(ALPHA_MIN) = ALPHA_MIN  # type: ignore[valid-type]
@@ -215,15 +215,15 @@ class Render(Part):
 
 
 class WorldFrame(Part):
-    """How the scene lies in the capture's own frame, x_scene = scale * (transform @ [x_capture, 1]), and in the real
-    world, as far as that is known: since versions 1.3 and 2.2."""
+    """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up and scale
+    in the real world, where known: since versions 1.3 and 2.2."""
 
     transform: tuple[Row, Row, Row]
     scale: Positive
     up: tuple[Cosine, Cosine, Cosine] | None = None
     """Unit vector of the scene that points away from the ground."""
     up_from: Annotated[str, Field(pattern=r"^[a-z][a-z_-]{0,39}$")] | None = None
-    """Where it comes from: gps, gravity, or cameras, which were held upright as a rule."""
+    """Source of `up`: gps, gravity, or cameras (upright as a rule)."""
     metres_per_unit: Positive | None = None
     """Length of a unit of the scene."""
 
@@ -316,7 +316,7 @@ def dump(manifest: Manifest) -> bytes:
 
 
 def parse(data: bytes, source: str = MANIFEST) -> Manifest:
-    """Reads bundle.json and checks everything a reader relies on; keys it does not know are kept and ignored.
+    """Read bundle.json and check everything a reader relies on; unknown keys are kept and ignored.
 
     Raises:
         BundleError: not a bundle, a newer major version, a value that is missing or out of range, or a digest that is

@@ -1,4 +1,4 @@
-"""The files of a bundle, a folder or one file: the one way to open them, and those that the format names."""
+"""Files of a bundle, a folder or one file: opening them, their names, and the folder to write."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class MissingPart(BundleError):
 
 
 def is_known(name: str) -> bool:
-    """Whether the format gives a file this name. Others may lie in a bundle; they are not passed on to anybody."""
+    """True for the names of the format. Other files may lie in a bundle; they are not passed on."""
     known = (MANIFEST, SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, CAMERAS, *PREVIEWS)
     return name in known or _PHOTOGRAPH.fullmatch(name) is not None
 
@@ -60,7 +60,7 @@ def passed_on(info: Manifest, data: bytes) -> bytes:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Opens a file for reading. A pipe or a device is refused before it is opened, also where a link leads to it.
+    """Open a file for reading. A pipe or a device is refused before it is opened, also where a link leads to it.
 
     Raises:
         BundleError: there is no such file, it is something else, or the system refuses it.
@@ -148,7 +148,7 @@ class Parts:
 
 
 _DAMAGE = (zipfile.BadZipFile, OSError, EOFError, RuntimeError, struct.error)
-"""What `zipfile` says of a file that is not one, or is damaged."""
+"""Errors of `zipfile` for other or damaged files."""
 
 
 @contextmanager
@@ -179,8 +179,8 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
 
 
 def _check_directory(file: BinaryIO) -> int:
-    """Refuses a file whose directory is larger than it may be, which takes `zipfile` long to read, or that begins with
-    something else, which may then be of another type, too; its size.
+    """Size of a file. Refuses one whose directory exceeds `DIRECTORY_LIMIT`, which takes `zipfile` long to read, or
+    that begins with something else, which may then be of another type, too.
 
     Raises:
         ValueError: says why.
@@ -200,7 +200,7 @@ def _check_directory(file: BinaryIO) -> int:
     if length > DIRECTORY_LIMIT:
         raise ValueError(f"its directory has {length} bytes, at most {DIRECTORY_LIMIT} are read")
     if begin + length != size - behind:
-        raise ValueError("its directory is not where it is said to be")
+        raise ValueError("its directory is not where its last record says")
     file.seek(0)
     return size
 

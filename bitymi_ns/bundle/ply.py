@@ -19,7 +19,7 @@ def write_ply(
     comments: Sequence[str] = (),
     more: Mapping[str, Mapping[str, npt.NDArray]] | None = None,
 ) -> None:
-    """Writes the columns as properties of `vertex`, in their order.
+    """Write the columns as properties of `vertex`, in their order.
 
     Args:
         path: file to write.
@@ -74,7 +74,7 @@ def read_header(data: bytes | bytearray, size: int) -> Header:
 
 
 def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
-    """Reads a file written by `write_ply`.
+    """Read a file written by `write_ply`.
 
     Args:
         data: the whole file.

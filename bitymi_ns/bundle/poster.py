@@ -18,7 +18,7 @@ Pixels = npt.NDArray[np.uint8]
 SIDE = 480
 """Pixels of its longer side, at most."""
 SHARE = 0.02
-"""Of the bytes of surfels and texels, that it may take."""
+"""Largest share of the bytes of surfels and texels."""
 LEAST = 2048
 """Bytes that it may take however small these are."""
 _QUALITIES = (80, 70, 60, 50, 40)

@@ -1,4 +1,4 @@
-"""Reading a bundle: every size is known from a header before more is read, and every file is read once."""
+"""Reading of bundles: sizes are checked by headers before more is read, and every file is read once."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from bitymi_ns.scene.baked import BakedOutput, BakedScene
 from bitymi_ns.scene.camera import Camera
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
-"""What to do about a damaged bundle."""
+"""Advice for a damaged bundle."""
 BESIDE_LIMIT = 64 << 20
 """Bytes that a file beside surfels and texels may have, such as a photograph, to be kept in memory."""
 LARGE_ATLAS = 64 << 20
 """Bytes of decoded texels of a compact bundle from which on a card gets BC7 blocks of them, a quarter of that. Fewer
 are no burden to any card, and blocks cost time, and some of the quality of texels that were not tuned to them."""
 LOAD_PROFILE: Profile = "veryfast"
-"""Of the encoder of these blocks: the next faster one loses more than twice as much."""
+"""Encoder profile of these blocks: the next faster one loses more than twice as much."""
 _CHUNK = 1 << 22
 
 
@@ -82,7 +82,7 @@ class Bundle:
 
 
 def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) -> Bundle:
-    """Loads a bundle.
+    """Load a bundle.
 
     Args:
         folder: the bundle's folder, or its one file (`single.write_single`).
@@ -102,7 +102,7 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """bundle.json of a bundle, a folder or one file, checked as far as it can be without the other files.
+    """Read bundle.json of a folder or one file, checked as far as possible without the other files.
 
     Raises:
         BundleError: it is missing, malformed or altered, or a value is out of range.
@@ -112,7 +112,7 @@ def read_manifest(folder: str | Path) -> Manifest:
 
 
 def manifest_of(parts: Parts) -> Manifest:
-    """The same of a bundle whose files are at hand."""
+    """Read bundle.json of an open bundle."""
     try:
         data = parts.read(MANIFEST, MANIFEST_LIMIT)
     except MissingPart as error:
@@ -298,7 +298,7 @@ def _blocks(texels: Tensor) -> Tensor | None:
 
 
 def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
-    """Refuses tiles that reach out of the atlas."""
+    """Refuse tiles that reach out of the atlas."""
     layers, height, width = (info.atlas.layers, info.atlas.height, info.atlas.width) if info.atlas else (1, 0, 0)
     x, y, layer, r_u, r_v = tiles.long().unbind(1)
     good = (tiles >= 0).all(1) & (x + r_u <= width) & (y + r_v <= height) & (layer < layers)

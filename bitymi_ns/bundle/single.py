@@ -15,13 +15,13 @@ from bitymi_ns.files import size_text, write_file
 
 _ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 SUFFIX = ".bitymi"
-"""Of the name of such a file."""
+"""Suffix of such a file."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
 class Written:
-    """What was written.
+    """Sizes of a written file.
 
     Attributes:
         first: bytes from the start to the end of the surfels.
@@ -53,7 +53,7 @@ def write_single(bundle: str | Path, path: str | Path) -> Written:
 
 
 def is_single(path: Path) -> bool:
-    """Whether a file is a bundle, and may be replaced by another one."""
+    """True where a file is a bundle, which another one may replace."""
     try:
         read_manifest(path)
     except BundleError:

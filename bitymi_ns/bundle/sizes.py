@@ -1,4 +1,4 @@
-"""What the size of a bundle's files has to fit before they are read: their headers, bundle.json, and the machine."""
+"""Checks of a bundle's files before they are read: headers, bundle.json, memory."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from bitymi_ns.files import size_text
 HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
 """Bytes from the start of a file that `check_head` reads."""
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
-"""Of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million texels 67
-with their pages."""
+"""Bytes of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million
+texels 67 with their pages."""
 _CONTROL_GROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
-    """Refuses a file of surfels or texels whose beginning contradicts its size or bundle.json; any other is let pass.
+    """Refuse a file of surfels or texels whose beginning contradicts its size or bundle.json; other files pass.
 
     Raises:
         PlyError, Ktx2Error, StreamError: say why.
@@ -77,7 +77,7 @@ def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
 
 
 def check_memory(bundle: Path, info: Manifest, name: str) -> None:
-    """Refuses a file of surfels or texels whose contents cannot be held on this machine, before they are read.
+    """Refuse a file of surfels or texels whose contents cannot be held on this machine, before they are read.
 
     Raises:
         BundleError: says what they take at least.

@@ -1,4 +1,4 @@
-"""What the bake left out and what that cost: the one description, from the bake to bundle.json and back.
+"""Statistics of the bake in bundle.json: what was left out, its error, sizes.
 
 Every part may lack what an earlier version did not state, and keeps keys that it does not know.
 """
@@ -29,7 +29,7 @@ class Part(BaseModel):
         return {key: value for key, value in serialize(self).items() if value is not None or key in given}
 
     def but(self: _P, **changes: Any) -> _P:
-        """The same with other values; None takes one out."""
+        """Copy with other values; None removes one."""
         return type(self)(**{name: value for name, value in {**dict(self), **changes}.items() if value is not None})
 
 
@@ -46,7 +46,7 @@ Decibels = Annotated[Annotated[float, Field(ge=-1e3, le=1e3)] | None, BeforeVali
 
 
 class Percentiles(Part):
-    """Of an error over the surfels; p100 is the largest. None = not a number."""
+    """Percentiles of an error over the surfels; p100 is the largest. None = not a number."""
 
     p50: NotNegative | None = None
     p90: NotNegative | None = None
@@ -55,7 +55,7 @@ class Percentiles(Part):
 
     @classmethod
     def of(cls, values: Tensor) -> Percentiles:
-        """Those of [n] values, n at least 1, to four digits."""
+        """Percentiles of [n] values, n at least 1, to four digits."""
         ordered = values.double().sort().values
         found = {p: round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)}
         return cls(**{f"p{p}": value if value <= _LARGEST else None for p, value in found.items()})
@@ -71,11 +71,11 @@ class TileError(Part):
 
 
 class Certificate(Part):
-    """Of how many surfels the stored residual is within the tolerance, as the closest training view sees it: weighted
+    """Counts of surfels whose stored residual is within the tolerance, as the closest training view shows it: weighted
     by the blending weight, averaged over a pixel, root mean square over the tile."""
 
     against: Literal["field", "texels"]
-    """What is stored is compared with: the field, or the texels as they learned, before they were stored."""
+    """Reference: the field, or the trained texels before quantisation."""
     tolerance: NotNegative
     within: Whole
     beyond: Whole
@@ -88,14 +88,14 @@ class Certificate(Part):
 
     @classmethod
     def of(cls, errors: Tensor, tolerance: float, against: Literal["field", "texels"]) -> Certificate:
-        """That of errors [n], 8-bit steps."""
+        """Certificate of errors [n], 8-bit steps."""
         within = int((errors <= tolerance).sum())
         worst = float(errors.amax()) if len(errors) else 0.0
         return cls(against=against, tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
 
 
 class LeftOut(Part):
-    """Numbers of surfels that were left out, by why; `unseen` where training views were looked at for that."""
+    """Numbers of surfels left out, by reason; `unseen` where visibility was computed."""
 
     not_finite: Whole | None = None
     beyond_limits: Whole | None = None
@@ -120,16 +120,16 @@ class KeptTexels(Part):
     after_cap_by_views: Count | None = None
     within_visible_part: Count | None = None
     polished: Count | None = None
-    """Of the tiles that a polish started from."""
+    """Texels of the tiles that a polish started from."""
     learned: Count | None = None
-    """Of the tiles that learned in training."""
+    """Texels of the tiles that were trained."""
     kept: Count | None = None
     not_finite: Count | None = None
     """Points at which the field was not finite."""
 
 
 class FieldLevels(Part):
-    """Which levels of the field the bake evaluated, and how far a residual changes without each, 8-bit steps."""
+    """Levels of the field that were evaluated, and the change of a residual without each, 8-bit steps."""
 
     unit: str | None = None
     levels: Whole | None = None
@@ -139,12 +139,12 @@ class FieldLevels(Part):
         Annotated[list[Annotated[NotNegative | None, BeforeValidator(_number)]], Field(max_length=64)] | None
     ) = None
     change: Annotated[NotNegative | None, BeforeValidator(_number)] = None
-    """Of all that are left out together."""
+    """Change without all that are left out."""
     tolerance: NotNegative | None = None
 
 
 class AtlasCost(Part):
-    """What the atlas takes, and what the quantisation cost."""
+    """Bytes of the atlas and error of the quantisation."""
 
     bytes: Count | None = None
     pages: tuple[Whole, Whole, Whole] | None = None
@@ -162,7 +162,7 @@ class Kept(Part):
 
 
 class ViewColorError(Part):
-    """What the view colours kept, and their error in 8-bit steps."""
+    """Terms of the view colours that are kept, and their error in 8-bit steps."""
 
     kind: str | None = None
     tolerance: NotNegative
@@ -181,7 +181,7 @@ class Gain(Part):
 
 
 class Rounding(Part):
-    """How the surfels of a compact bundle were rounded."""
+    """Rounding of the surfels of a compact bundle."""
 
     mse: Annotated[NotNegative | None, BeforeValidator(_number)] = None
     """Mean square error that it made in the training views before the texels were tuned, colours from 0 to 1."""
@@ -190,22 +190,22 @@ class Rounding(Part):
 
 
 class FineTuning(Part):
-    """What the fine-tuning or the polish did; no steps where there were too few views."""
+    """Fine-tuning or polish; no steps where there were too few views."""
 
     views: Whole | None = None
     held_in_views: Whole | None = None
-    """Training views that were set aside."""
+    """Validation views."""
     steps: Whole | None = None
     steps_asked: Whole | None = None
     best_step: Whole | None = None
     psnr_held_in: Gain | None = None
     psnr_held_out: Gain | None = None
     curve: Annotated[list[tuple[Whole, Decibels]], Field(max_length=1 << 16)] | None = None
-    """Steps and dB over the views that were set aside."""
+    """Steps and dB over the validation views."""
     seconds: NotNegative | None = None
     cpu_seconds: NotNegative | None = None
     error_before: TileError | None = None
-    """Of the texels as baked, which are what the field gives."""
+    """Error of the texels as baked from the field."""
 
 
 class HeldOut(Part):
@@ -238,7 +238,7 @@ class Statistics(Part):
     rounding: Rounding | None = None
     finetune: FineTuning | None = None
     seconds: NotNegative | None = None
-    """Of the bake, without the fine-tuning."""
+    """Seconds of the bake, without the fine-tuning."""
     options: BakeOptions | None = None
     method: str | None = None
     held_out: HeldOut | None = None

@@ -1,4 +1,4 @@
-"""Checks of a bundle: that its files are whole, that they make sense, and that they hold what bundle.json states."""
+"""Checks of a bundle by itself: files, numbers, tiles, and what bundle.json states of them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SLACK_SKETCH = 1.4
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the result: what was looked at, whether it holds, and the numbers."""
+    """Result of a check: its name, whether it holds, and the numbers."""
 
     name: str
     ok: bool
@@ -38,7 +38,7 @@ class Check:
 
 
 def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
-    """Checks a bundle by itself: sizes and hashes of its files, their formats, its numbers, its tiles.
+    """Check a bundle by itself: sizes and hashes of its files, their formats, its numbers, its tiles.
 
     Returns:
         the bundle, None when it cannot be read, and the checks in the order they were made.
@@ -76,13 +76,13 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
 
 
 def _real_world(place: WorldFrame) -> str:
-    """What is stated of up and of lengths."""
+    """Text of up and metres per unit, where stated."""
     text = "" if place.up is None else f", up ({', '.join(f'{x:.3f}' for x in place.up)}) by {place.up_from}"
     return text + ("" if place.metres_per_unit is None else f", {place.metres_per_unit:.4g} m per unit")
 
 
 def check_world(stated: WorldFrame, world: World) -> Check:
-    """Compares what a bundle states of its place in the capture's frame and in the real world with that of its run.
+    """Compare the frame that a bundle states with that of its run.
 
     Args:
         stated: of bundle.json; an earlier version states neither up nor lengths.
@@ -95,12 +95,12 @@ def check_world(stated: WorldFrame, world: World) -> Check:
             continue
         same = value == found if isinstance(found, str) else np.allclose(value, found, rtol=1e-4, atol=1e-5)
         wrong += [] if same else [f"{key} is {value}, that of the run {found}"]
-    return Check("place of the scene", not wrong, "; ".join(wrong) or "as the run has it")
+    return Check("frame of the scene", not wrong, "; ".join(wrong) or "as the run has it")
 
 
 def check_certificate(bundle: Bundle) -> list[Check]:
-    """Whether the texels are those of which bundle.json states how near they are to what they held before they were
-    stored, and whether they are that near; nothing where it states none, or of the field."""
+    """Check the texels by the sketches of the certificate: that they are those measured, and as near to the texels
+    before quantisation as stated; nothing to check without a certificate."""
     stated, atlas = bundle.info.statistics.certificate, bundle.info.atlas
     if stated is None:
         return []
@@ -152,7 +152,7 @@ def _tiles(bundle: Bundle) -> Check:
 
 
 def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
-    """How many tiles every 4 x 4 block belongs to, [layers, height / 4, width / 4], from differences at the corners."""
+    """[layers, height / 4, width / 4] number of tiles over every 4 x 4 block, from differences at the corners."""
     layers, height, width = (1, 4, 4) if atlas is None else atlas.shape[:3]
     counts = torch.zeros(layers, height // 4 + 1, width // 4 + 1, dtype=torch.int32)
     x, y, layer, r_u, r_v = tiles.unbind(1)
@@ -163,7 +163,7 @@ def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
 
 
 def _statements(bundle: Bundle) -> Check:
-    """What bundle.json states about the bake agrees with the files."""
+    """Check the counts of bundle.json against the files."""
     statistics = bundle.info.statistics
     surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
     found = {"surfels kept": len(bundle), "texels kept": int(bundle.scene.tiles[:, 3:].long().prod(1).sum())}

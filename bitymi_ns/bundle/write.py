@@ -1,4 +1,4 @@
-"""A bundle: the folder that the renderers read. surfels.ply, atlas.ktx2, bundle.json; no pickle anywhere."""
+"""Writing of bundles: compact columns, or surfels.ply and atlas.ktx2; and bundle.json."""
 
 from __future__ import annotations
 
@@ -57,8 +57,7 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class World:
-    """How the scene's frame lies in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and how that
-    lies in the real world.
+    """Frame of the scene in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and in the real world.
 
     Attributes:
         transform: [3, 4] (the dataparser's transform).
@@ -119,7 +118,7 @@ def export(
     interchange: bool = False,
     first: Camera | None = None,
 ) -> Path:
-    """Writes a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
+    """Write a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
 
     `statistics` is added to those of the bake. `first` is the camera with which a viewer opens, the first of
     cameras.json that was held out, or its first: the poster is drawn from there; None = the bundle gets no poster.
@@ -156,7 +155,7 @@ def write_bundle(
     interchange: bool = False,
     poster: Pixels | None = None,
 ) -> Path:
-    """Writes a bundle; the folder appears complete or not at all.
+    """Write a bundle; the folder appears complete or not at all.
 
     Args:
         folder: the bundle's folder.
@@ -213,12 +212,12 @@ def write_bundle(
 
 
 def _scene_bytes(folder: Path, parts: Mapping[str, bytes]) -> int:
-    """Of surfels and texels: of the two files of a compact bundle, or of what else there is so far."""
+    """Bytes of surfels and texels: of the two files of a compact bundle, or of the files so far."""
     return sum(map(len, parts.values())) if parts else sum(path.stat().st_size for path in folder.iterdir())
 
 
 def write_surfels(path: Path, scene: BakedScene) -> None:
-    """Writes the surfels of a scene on the CPU as a PLY file, which viewers of Gaussian splats open, too."""
+    """Write the surfels of a scene on the CPU as a PLY file, which viewers of Gaussian splats open, too."""
     columns = to_columns(scene.surfels, scene.tiles.numpy(), scene.mean_residual, scene.extent, scene.view_color)
     terms = {TERMS: term_columns(scene.surfels)} if "view_terms" in scene.surfels else None
     ply.write_ply(path, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
@@ -248,7 +247,7 @@ def _describe(
     world: World,
     statistics: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """What `manifest.describe` takes, without the list of files; what is the same for all bundles stands there."""
+    """Arguments of `manifest.describe` without the list of files."""
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels

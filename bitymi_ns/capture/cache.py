@@ -1,4 +1,4 @@
-"""Where the poses of a capture are kept while they are found and afterwards."""
+"""Cache folders of structure from motion, beside the photographs or in the user's cache, locked while in use."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from bitymi_ns.trust import Refused, check_no_links, is_own, json_of, own_folder
 
 FOLDER = ".bitymi"
 OF = "of.json"
-"""File in a work folder: what it is of, and the key of that alone."""
+"""File in a work folder with the source and the key of its content."""
 Kind = Literal["poses", "points"]
-"""What a work folder is for, with which its name begins: poses, or points of known poses."""
+"""First part of the name of a work folder: poses, or points of known poses."""
 IN_USE = ".in-use-"
-"""Begins the names of the locks of processes that read what a work folder holds."""
+"""Prefix of the locks of processes that read from a work folder."""
 VERSION = 5
-"""Raised where the same photographs and options give other poses than before, so that kept ones are found anew."""
+"""Increased where the same photographs and options give other poses than before, to invalidate cached ones."""
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
-    """A key of files and of all that decides what is made of them.
+    """Hash files and settings to a key.
 
     Args:
         inputs: the files, each with its name in the capture. That, its size and its time of change count; how the
@@ -43,7 +43,7 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 
 @contextmanager
 def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
-    """The folder of this key, held for one process, made where it is missing: in `.bitymi` beside the photographs, or
+    """Make and lock the folder of this key for one process: in `.bitymi` beside the photographs, or
     in the user's cache folder where nothing can be written there, or others can write there.
 
     Args:
@@ -57,20 +57,20 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
     """
     beside, cache = home(photographs), user_cache()
     problem: OSError | None = None
-    for place in (beside, cache):
-        if place is None:
+    for root in (beside, cache):
+        if root is None:
             continue
-        folder = place / f"{kind}-{key}"
+        folder = root / f"{kind}-{key}"
         try:
-            place.parent.mkdir(parents=True, exist_ok=True)
-            own_folder(place, close=True)
+            root.parent.mkdir(parents=True, exist_ok=True)
+            own_folder(root, close=True)
             own_folder(folder)
             check_no_links(folder.iterdir())
             lock = files.Lock(folder / ".lock", tell=lambda text: None)
         except files.Busy as error:
             raise CaptureError(f"{kind} of {photographs} are being found already: {error}") from error
         except OSError as error:
-            if place == beside and isinstance(error, Refused):
+            if root == beside and isinstance(error, Refused):
                 tell(f"{error}. It is not used: the {kind} are kept in {cache or 'no place that is known'}.")
             problem = error
             continue
@@ -94,8 +94,8 @@ def home(photographs: Path) -> Path:
 def finished(photographs: Path, key: str, mark: str, kind: Kind = "poses") -> Path | None:
     """The folder of this key in which a file of this name says that the work is done; None = there is none that others
     cannot write to."""
-    for place in (home(photographs), user_cache()):
-        if place is not None and is_own(place) and is_own(folder := place / f"{kind}-{key}"):
+    for root in (home(photographs), user_cache()):
+        if root is not None and is_own(root) and is_own(folder := root / f"{kind}-{key}"):
             with suppress(OSError):
                 check_no_links(folder.iterdir())
                 if (folder / mark).is_file():
@@ -103,10 +103,9 @@ def finished(photographs: Path, key: str, mark: str, kind: Kind = "poses") -> Pa
     return None
 
 
-def take_place(work: Path, photographs: Path, contents: str) -> None:
-    """Say what a work folder is of, and remove those of its kind and source as it was before: their key cannot come
-    back.
-    Those with other options stay, because runs were trained on them; so do those that a process works in or reads from.
+def replace_stale(work: Path, photographs: Path, contents: str) -> None:
+    """State the source of a work folder, and remove folders of an earlier state of that source: their key cannot recur.
+    Those with other options stay, because runs were trained on them; so do those that a process uses.
 
     Args:
         work: held by this process.
@@ -142,7 +141,7 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
 
 
 def keep_work_folder(work: Path) -> None:
-    """Keep a work folder until this process ends: no other one removes it."""
+    """Keep other processes from removing a work folder until this one ends."""
     with suppress(files.Busy, OSError):  # a folder that cannot be written is not removed either
         mark = work / f"{IN_USE}{os.getpid()}"
         files.hold(mark, lambda text: None)
@@ -150,7 +149,7 @@ def keep_work_folder(work: Path) -> None:
 
 
 def user_cache() -> Path | None:
-    """The user's folder for what can be made again; None where nothing says where it is."""
+    """Return the user's cache folder; None where it is unknown."""
     with suppress(RuntimeError):  # there is no HOME, and the system does not know the user
         stated = os.environ.get("XDG_CACHE_HOME", "")
         return (Path(stated) if os.path.isabs(stated) else Path.home() / ".cache") / "bitymi-ns"

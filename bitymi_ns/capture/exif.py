@@ -1,4 +1,4 @@
-"""What a photograph's EXIF says of its camera, place and time, as far as it can be believed."""
+"""EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, as far as they are plausible."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from PIL import ExifTags, Image
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; focal lengths "in 35 mm film" are relative to it."""
 SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)
-"""Of whole photographs; another aspect shows that something was cut off."""
+"""Aspect ratios of uncropped photographs."""
 SAME_ASPECT = 0.02
-"""Relative difference up to which two aspects count as one: sizes are rounded to whole blocks of pixels."""
+"""Relative difference of equal aspect ratios: sizes are rounded to blocks of pixels."""
 FOCAL_RANGE = (0.3, 15.0)
-"""Focal lengths that can be meant, in units of the longer side."""
+"""Plausible focal lengths, in units of the longer side."""
 STILL = 0.1
-"""By how much of g the length of an acceleration may differ from that of a phone that is held still."""
+"""Tolerance of the length of an acceleration, in g, for a phone that is held still."""
 
 
 @dataclass(frozen=True)
 class Exif:
-    """What is known of one photograph beyond its pixels."""
+    """EXIF of one photograph."""
 
     camera: str = ""
     """Make, model, lens and focal length; photographs with the same one and the same size share a camera."""
     focal_length: float | None = None
-    """In pixels of the photograph; None where there is none to be believed."""
+    """In pixels of the photograph; None where there is no plausible one."""
     doubt: str = ""
-    """Why the focal length that is there is not believed."""
+    """Why a stated focal length is not used."""
     position: tuple[float, float, float] | None = None
     """Latitude and longitude in degrees, altitude in metres."""
     time: str = ""
-    """When it was taken, sortable; empty where it is not known."""
+    """Sortable time of the photograph; empty where unknown."""
     up: tuple[float, float, float] | None = None
     """Unit vector away from the ground, in the upright photograph's axes (x right, y down, z forward)."""
 
@@ -65,7 +65,7 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
-    """The focal length in pixels, and why the one that is there is not believed.
+    """Compute the focal length in pixels, and why a stated one is not used.
 
     Args:
         detail: the Exif IFD.
@@ -97,7 +97,7 @@ def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[f
 
 
 def number(value: object) -> float | None:
-    """A positive finite number, or None: files hold rationals with a denominator of 0, and text."""
+    """Convert to a positive finite number, or None: files hold rationals with a denominator of 0, and text."""
     try:
         found = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -120,8 +120,8 @@ def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
 def _up(
     image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
 ) -> tuple[float, float, float] | None:
-    """Away from the ground by a phone's accelerometer; None where there is none, or it is not to be believed: the phone
-    was moved, or the orientation that the photograph is shown in is another."""
+    """Up by a phone's accelerometer; None where there is none, where the phone was moved, or where the photograph is
+    shown in another orientation."""
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
         return None
@@ -141,22 +141,22 @@ def _up(
 
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
-    """AccelerationVector (tag 8) of Apple's maker note, in g.
+    """Parse AccelerationVector (tag 8) of Apple's maker note, in g.
 
     Its components point to the left side of the phone as seen from its front, to its bottom, and into its face. When
     the phone is held still the vector points away from the ground.
 
-    The note is an IFD of big-endian numbers after 14 bytes, "Apple iOS", its version and "MM"; places count from its
-    start.
+    The note is an IFD of big-endian numbers after 14 bytes, "Apple iOS", its version and "MM"; offsets count
+    from its start.
     """
     if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
         return None
     try:
         (entries,) = struct.unpack_from(">H", note, 14)
         for i in range(entries):
-            tag, kind, count, place = struct.unpack_from(">HHII", note, 16 + 12 * i)
+            tag, kind, count, offset = struct.unpack_from(">HHII", note, 16 + 12 * i)
             if (tag, kind, count) == (8, 10, 3):  # signed rationals
-                parts = struct.unpack_from(">6i", note, place)
+                parts = struct.unpack_from(">6i", note, offset)
                 x, y, z = (parts[j] / parts[j + 1] for j in (0, 2, 4))
                 return x, y, z
     except (struct.error, ZeroDivisionError):
@@ -165,7 +165,7 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
 
 
 def _position(gps: Mapping[int, object]) -> tuple[float, float, float] | None:
-    """Latitude, longitude and altitude; None unless the first two are there and can be meant."""
+    """Latitude, longitude and altitude; None without plausible latitude and longitude."""
     try:
         angles = []
         for tag, reference, limit in ((2, 1, 90), (4, 3, 180)):

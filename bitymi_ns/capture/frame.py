@@ -1,4 +1,4 @@
-"""A world for the poses: up is up, and metres are metres where GPS says how long they are."""
+"""World frame of a model: z up by gravity, GPS or the cameras, and metric scale by GPS."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ EARTH = 6378137.0
 """Equatorial radius in metres, WGS 84."""
 FLATTENING = 1 / 298.257223563
 GPS_ERROR = 5.0
-"""Metres by which a phone's GPS is off."""
+"""Error of a phone's GPS, metres."""
 LEAST_SPREAD = 4 * GPS_ERROR
-"""Metres; positions that spread less say nothing of the scale."""
+"""Least spread of positions, metres, that determines the scale."""
 SAME_SHAPE = 0.5
-"""The largest error of the alignment, relative to the spread, at which it is believed."""
+"""Largest error of an accepted alignment, relative to the spread."""
 
 
 FILE = "frame.json"
-"""The frame of a model, beside its report."""
+"""File of the frame, beside the report."""
 UP = (0.0, 0.0, 1.0)
-"""Up in the world of a settled model."""
+"""Up in the world frame."""
 SOURCES = ("gps", "gravity", "cameras")
 SAME_UP = np.cos(np.radians(10.0))
-"""Cosine of the angle up to which two photographs have the same up."""
+"""Cosine of the largest angle between equal up directions."""
 STEEPEST = np.cos(np.radians(45.0))
-"""Cosine of the angle up to which GPS positions may be tilted; beyond it the accelerometers are not believed."""
+"""Cosine of the largest tilt of GPS positions against gravity; beyond it, gravity is ignored."""
 
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """How the world of a model lies in the real one."""
+    """Relation of a model's world to the real one."""
 
     up: str
-    """Where up comes from, one of SOURCES; it is +z in any case."""
+    """Source of up (+z), one of SOURCES."""
     metres_per_unit: float | None
-    """1 where GPS gave the scale; None where it is not known."""
+    """1 with scale by GPS; None = unknown."""
     gps_origin: tuple[float, float, float] | None
     """Latitude, longitude (degrees) and altitude (metres) of the world's origin, x east and y north there."""
     gps_error: float | None
     """Median distance in metres between the cameras and their GPS positions."""
     gps_positions: int
-    """Photographs with a position."""
+    """Number of photographs with a position."""
     transform: list[list[float]]
-    """[3,4] from the world as COLMAP left it to this one, scale included."""
+    """[3, 4] from COLMAP's world to this one, scale included."""
 
 
 def write_frame(folder: Path, frame: WorldFrame) -> None:
@@ -60,7 +60,7 @@ def write_frame(folder: Path, frame: WorldFrame) -> None:
 
 
 def read_frame(folder: Path) -> WorldFrame | None:
-    """The frame.json in a folder; None where there is none, or another program's."""
+    """Read frame.json in a folder; None where there is none, or another program's."""
     try:
         frame = WorldFrame(**json_of((folder / FILE).read_text("utf8")))
     except (OSError, ValueError, TypeError):
@@ -71,16 +71,16 @@ def read_frame(folder: Path) -> WorldFrame | None:
 
 
 def local_positions(
-    places: Mapping[str, tuple[float, float, float]],
+    gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """East, north and up in metres from the middle of the places, and that middle.
+    """Convert GPS positions to east, north and up in metres from their middle, and return that middle.
 
     Args:
-        places: latitude, longitude and altitude by name.
+        gps: latitude, longitude and altitude by name.
     """
-    if not places:
+    if not gps:
         return {}, None
-    middle = np.median(np.array(list(places.values())), axis=0)
+    middle = np.median(np.array(list(gps.values())), axis=0)
     latitude = np.radians(middle[0])
     eccentricity = FLATTENING * (2 - FLATTENING)
     w = 1 - eccentricity * np.sin(latitude) ** 2
@@ -92,28 +92,28 @@ def local_positions(
             float(np.radians(lat - middle[0]) * north),
             float(alt - middle[2]),
         ]
-        for name, (lat, lon, alt) in places.items()
+        for name, (lat, lon, alt) in gps.items()
     }
     return local, (float(middle[0]), float(middle[1]), float(middle[2]))
 
 
-def settle(
+def move_to_world(
     model: pycolmap.Reconstruction,
-    places: Mapping[str, tuple[float, float, float]],
+    gps: Mapping[str, tuple[float, float, float]],
     ups: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> WorldFrame:
-    """Move a model into a world with z up; changed in place.
+    """Transform a model in place to a world with z up.
 
     Up is that of the phones' accelerometers where most of them agree, else by GPS where that is enough, else by the
     cameras. Scale and north are by GPS where that is enough.
 
     Args:
         model: cameras and points.
-        places: latitude, longitude and altitude by name.
+        gps: latitude, longitude and altitude by name.
         ups: unit vectors away from the ground by name, in the cameras' axes (x right, y down, z forward).
     """
     up = _by_gravity(model, ups or {})
-    local, origin = local_positions(places)
+    local, origin = local_positions(gps)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
     names = [name for name in centers if name in local]
     found = _by_gps(np.array([centers[n] for n in names]), np.array([local[n] for n in names])) if names else None
@@ -141,7 +141,7 @@ def _error(
 
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
-    """Up in the model's world [3], of the photographs that know it; None unless three or more, and most, agree."""
+    """Mean up [3] in the model's world by accelerometers; None unless three or more, and most of them, agree."""
     found = [
         image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name])
         for image in model.images.values()
@@ -159,29 +159,29 @@ def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, f
 
 
 def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The rotation [3,3] by the smallest angle that takes one unit vector to another, which is not its opposite."""
+    """Smallest rotation [3, 3] from one unit vector to another, which is not its opposite."""
     axis, cosine = np.cross(start, end), float(start @ end)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
-def _by_gps(centers: np.ndarray, places: np.ndarray) -> tuple[pycolmap.Sim3d, float] | None:
-    """The similarity from centers [n,3] to places [n,3] in metres, and its median error; None where it is not to be
-    believed: too few, too close together or along one line, or another shape than the cameras'."""
-    if len(places) < 3:
+def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, float] | None:
+    """Align centers [n, 3] with positions [n, 3] in metres; returns the similarity and its median error, or None where
+    positions are too few, too close together, on one line, or of another shape."""
+    if len(positions) < 3:
         return None
-    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
+    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     shape = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
     if spread[0] < LEAST_SPREAD or spread[1] < LEAST_SPREAD / 2 or shape[1] < 0.05 * shape[0]:
         return None
     options = pycolmap.RANSACOptions()
     options.max_error = 2 * GPS_ERROR
     options.random_seed = 0
-    found = pycolmap.estimate_sim3d_robust(centers, places, options)
+    found = pycolmap.estimate_sim3d_robust(centers, positions, options)
     if found is None:
         return None
     similarity = found["tgt_from_src"] if isinstance(found, dict) else found  # as pycolmap 4.1 and 4.2 have it
-    error = float(np.median(np.linalg.norm((similarity * centers) - places, axis=1)))
+    error = float(np.median(np.linalg.norm((similarity * centers) - positions, axis=1)))
     return (similarity, error) if error < SAME_SHAPE * spread[0] else None
 
 
@@ -195,7 +195,7 @@ def _of_cameras(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray) -> pycolmap.Sim3d:
-    """Takes `up` to z; the origin is the middle of the cameras, and their mean distance from it is 1."""
+    """Similarity that maps `up` to z, the middle of the cameras to the origin, and their mean distance from it to 1."""
     turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
     side = np.mean([turn[0] for turn in turns], axis=0)
     side -= up * (up @ side)

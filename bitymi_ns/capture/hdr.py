@@ -1,7 +1,5 @@
-"""Frames of high dynamic range (HLG or PQ, as phones film in 10 bits) as ordinary pictures.
-
-Their numbers mean other amounts of light than those of a photograph. Taken as they are, they give pale pictures.
-"""
+"""Tone mapping of high dynamic range frames (HLG or PQ, the 10-bit video of phones) to sRGB; without it they are
+pale."""
 
 from __future__ import annotations
 
@@ -17,39 +15,39 @@ WHITE = 203.0
 """Candelas per square metre of white paper in such films (ITU-R BT.2408); a screen's white here."""
 HLG_PEAK = 1000.0
 HLG_GAMMA = 1.2
-"""Of the screen that HLG is seen on by ITU-R BT.2100."""
+"""Peak luminance and gamma of the reference display of HLG (ITU-R BT.2100)."""
 KNEE = 0.8
-"""Light up to this share of white stays as it is; what is brighter is drawn together up to white."""
+"""Light up to this share of white is kept; brighter light is compressed up to white."""
 LUMA = np.array([0.2627, 0.6780, 0.0593])
-"""Of red, green and blue in BT.2020."""
+"""Luma coefficients of BT.2020."""
 TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
 """BT.2020's red, green and blue to those of BT.709 and sRGB, linear."""
 
 
 def is_hdr(frame: av.VideoFrame) -> bool:
-    """Whether a frame states one of these transfer functions."""
+    """Test for one of these transfer functions."""
     return getattr(frame, "color_trc", None) in (PQ, HLG)
 
 
-def ordinary(frame: av.VideoFrame) -> Image.Image:
-    """A frame of high dynamic range as an sRGB picture of 8 bits."""
+def tone_mapped(frame: av.VideoFrame) -> Image.Image:
+    """Convert a frame to 8-bit sRGB."""
     signal = _signal(frame)
     nits = pq_to_nits(signal) if frame.color_trc == PQ else hlg_to_nits(signal)
     light = nits @ TO_709.T / WHITE
     brightest = np.maximum(light.max(-1, keepdims=True), 1e-6)
-    light *= _drawn_together(brightest) / brightest
+    light *= _compressed(brightest) / brightest
     return Image.fromarray(np.uint8(_srgb(np.clip(light, 0.0, 1.0)) * 255.0 + 0.5))
 
 
 def pq_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Display light of a PQ signal in [0, 1], in candelas per square metre (ITU-R BT.2100)."""
+    """Convert a PQ signal in [0, 1] to display light in cd/m^2 (ITU-R BT.2100)."""
     m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
     power = np.maximum(signal, 0.0) ** (1.0 / m2)
     return 10_000.0 * (np.maximum(power - c1, 0.0) / (c2 - c3 * power)) ** (1.0 / m1)
 
 
 def hlg_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """The same of an HLG signal [..., 3]."""
+    """Convert an HLG signal [..., 3] in [0, 1] to display light in cd/m^2."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     scene = np.where(signal <= 0.5, signal**2 / 3.0, (np.exp((signal - c) / a) + b) / 12.0)
     luminance = np.maximum(scene @ LUMA, 1e-6)[..., None]
@@ -57,7 +55,7 @@ def hlg_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def _signal(frame: av.VideoFrame) -> npt.NDArray[np.float32]:
-    """Red, green and blue [h, w, 3] as they are coded, in [0, 1]."""
+    """Decode the non-linear RGB signal [h, w, 3] in [0, 1]."""
     whole = frame.reformat(format="yuv444p16le")
     planes = []
     for plane in whole.planes:
@@ -73,7 +71,7 @@ def _signal(frame: av.VideoFrame) -> npt.NDArray[np.float32]:
     return np.clip(np.stack([red, green, blue], -1), 0.0, 1.0).astype(np.float32)
 
 
-def _drawn_together(light: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+def _compressed(light: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     rest = 1.0 - KNEE
     return np.where(light <= KNEE, light, KNEE + rest * (1.0 - np.exp(-np.maximum(light - KNEE, 0.0) / rest)))
 

@@ -1,4 +1,4 @@
-"""A point cloud for photographs whose poses are known."""
+"""Triangulation of points from photographs with known poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
-from bitymi_ns.capture.cache import content_key, finished, take_place, work_folder
+from bitymi_ns.capture.cache import content_key, finished, replace_stale, work_folder
 from bitymi_ns.capture.masks import mask_pixels
 from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
 from bitymi_ns.capture.recognise import open_picture
@@ -40,7 +40,7 @@ class KnownView:
     width: int
     height: int
     params: tuple[float, ...]
-    """Of the camera model, in pixels of the file."""
+    """Parameters of the camera model, in pixels of the file."""
     world_to_camera: np.ndarray
     """[3,4] rotation and translation, OpenCV axes (x right, y down, z forward)."""
     mask: Path | None = None
@@ -48,7 +48,7 @@ class KnownView:
 
     @property
     def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """What photographs of one camera have in common."""
+        """Key that photographs of one camera share."""
         return self.model, self.width, self.height, self.params
 
 
@@ -96,7 +96,7 @@ def triangulate(
                 shutil.rmtree(work / name, ignore_errors=True)
             process.forget(work)
             folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
-            take_place(work, folder, content_key(inputs, "contents"))
+            replace_stale(work, folder, content_key(inputs, "contents"))
         return work / MODEL
 
 
@@ -136,14 +136,14 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
 
 
 def _converted(image: Image.Image, file: Path) -> Image.Image | None:
-    """What COLMAP reads instead of a photograph; None = the file itself."""
+    """Convert a photograph for COLMAP; None = COLMAP reads the file itself."""
     return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
 
 
-def _read(path: Path, what: Callable[[Image.Image], T]) -> T:
-    """What is made of a picture."""
+def _read(path: Path, convert: Callable[[Image.Image], T]) -> T:
+    """Apply `convert` to an opened image."""
     try:
         with open_picture(path) as image:
-            return what(image)
+            return convert(image)
     except Exception as error:
         raise CaptureError(f"{path} cannot be read as a picture: save it anew") from error

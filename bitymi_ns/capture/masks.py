@@ -1,7 +1,5 @@
-"""Masks of photographs: which folder holds them, which file belongs to a photograph, and which of its pixels count.
-
-The finding of poses and the training go by these rules alike.
-"""
+"""Masks of photographs: their folder, the mask file of a photograph, and the pixels that count. Structure from motion
+and training share these rules."""
 
 from __future__ import annotations
 
@@ -19,15 +17,15 @@ from bitymi_ns.capture.types import CaptureError
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
 """Names of a capture's folder of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
-"""Formats, as Pillow names them, that may give black back as almost black."""
+"""Lossy formats by Pillow's names, in which black may come back as almost black."""
 MIDDLE = 127
-"""Of 8 bits; pixels of a lossy mask count above it."""
+"""Threshold of lossy masks, of 255."""
 PROPORTIONS = 0.02
-"""Relative difference between the proportions of a mask and its photograph below which it is taken for rounding."""
+"""Relative difference of aspect ratios that counts as rounding."""
 
 
-def mask_folder(photographs: Path, data: Path, given: Path | None = None, reduction: int = 1) -> Path | None:
-    """The folder of a capture's masks: the given one; else `masks` beside the folder of the photographs, in that
+def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
+    """Find the folder of a capture's masks: the stated one; else `masks` beside the folder of the photographs, in that
     folder, or in that of the data, the first of them that is there.
 
     Beside a folder that is the data, or holds it, lie other things than the capture. There `masks` is used if the
@@ -36,36 +34,36 @@ def mask_folder(photographs: Path, data: Path, given: Path | None = None, reduct
 
     Args:
         photographs: their folder.
-        data: what the user names as the capture, a folder.
-        given: what the user names as the folder of masks.
-        reduction: a folder is there, too, if there is one of masks that are so many times smaller, as `masks_2`.
+        data: folder that the user names as the capture.
+        stated: folder that the user names as that of the masks.
+        downscale: a folder of masks that are smaller by this factor, as `masks_2`, counts, too.
 
     Raises:
-        CaptureError: the given one is not there.
+        CaptureError: the stated one does not exist.
     """
-    if given is not None:
-        if not _is_there(given, reduction):
-            raise CaptureError(f"the folder of masks {given} does not exist")
-        return given
+    if stated is not None:
+        if not _exists(stated, downscale):
+            raise CaptureError(f"the folder of masks {stated} does not exist")
+        return stated
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
-    places = [shown, named]
+    folders = [shown, named]
     if shown.name in USUAL_FOLDERS or not named.is_relative_to(shown):
-        places.insert(0, shown.parent)
-    return next((place / "masks" for place in places if _is_there(place / "masks", reduction)), None)
+        folders.insert(0, shown.parent)
+    return next((folder / "masks" for folder in folders if _exists(folder / "masks", downscale)), None)
 
 
-def _is_there(masks: Path, reduction: int) -> bool:
-    return masks.is_dir() or (reduction > 1 and downscaled_masks(masks, reduction).is_dir())
+def _exists(masks: Path, downscale: int) -> bool:
+    return masks.is_dir() or (downscale > 1 and downscaled_masks(masks, downscale).is_dir())
 
 
-def downscaled_masks(masks: Path, reduction: int) -> Path:
-    """Where masks that are so many times smaller lie."""
-    return masks.with_name(f"{masks.name}_{reduction}")
+def downscaled_masks(masks: Path, downscale: int) -> Path:
+    """Folder of masks that are smaller by a factor."""
+    return masks.with_name(f"{masks.name}_{downscale}")
 
 
 def mask_of(masks: Path, name: str) -> Path | None:
-    """The mask of a photograph: NAME.png after the whole name, as COLMAP has it, or the same name with any suffix of an
-    image, as nerfstudio has it. That of an upright copy is that of the photograph."""
+    """Find the mask of a photograph: its name with .png appended, as COLMAP has it, or its stem with any image suffix,
+    as nerfstudio has it. An upright copy has the mask of its photograph."""
     stem = str(PurePosixPath(name).with_suffix(""))
     endings = (".png", *PHOTOGRAPHS)
     candidates = [f"{name}.png", *(stem + ending for ending in endings), f"{name}.PNG"]
@@ -76,13 +74,11 @@ def mask_of(masks: Path, name: str) -> Path | None:
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
-    """Which pixels [H, W] of a mask count: those that are not black; of a lossy format those with a channel above
-    MIDDLE. Transparent pixels do not.
+    """Threshold a mask to the pixels [H, W] that count: those that are not black, for lossy formats those with a
+    channel above MIDDLE. Transparent pixels do not count.
 
-    COLMAP and nerfstudio let all count that is not black, and so do masks of zeros and ones, or of the numbers of
-    classes, need it: a cut in the middle of the range would leave nothing of them. The compression of a JPEG file
-    spreads an edge by several pixels on both sides, as ripples a few levels above black; all of these would count. It
-    does not reach the middle, where the edge is.
+    COLMAP and nerfstudio count all that is not black, as masks of zeros and ones or of class numbers need it. JPEG
+    compression ripples around an edge are a few levels above black, but do not reach MIDDLE.
     """
     if image.mode.startswith(("I", "F")):
         result = np.asarray(image) != 0
@@ -95,10 +91,10 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
 
 
 def has_transparency(image: Image.Image) -> bool:
-    """Whether an image has an alpha channel or a transparent colour."""
+    """Test for an alpha channel or a transparent color."""
     return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
 
 
 def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
-    """Whether a mask of this width and height has the proportions of its photograph, so that it can be resized."""
+    """Test if a mask (width, height) has the aspect ratio of its photograph, so that it can be resized."""
     return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS

@@ -1,4 +1,4 @@
-"""A capture as nerfstudio reads it: photographs, transforms.json, a point cloud, and the COLMAP model beside them."""
+"""Export of poses as a nerfstudio capture: photographs, transforms.json, point cloud, COLMAP model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLOUD = "sparse_pc.ply"
 def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
     """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
 
-    Photographs are copied as they are, so their cameras are distorted; nerfstudio-data undistorts them on loading.
+    Photographs are copied as they are, so their cameras are distorted; parsers undistort them on loading.
     There is no applied_transform: COLMAP model, cameras and points share one world with z up.
 
     Raises:
@@ -50,8 +50,8 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
 
 
 def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
-    """The content of transforms.json: camera to world with OpenGL axes (x right, y up, z backward), cameras with
-    OpenCV's distortion; what all frames share stands outside them."""
+    """Build transforms.json: camera to world with OpenGL axes (x right, y up, z backward), cameras with OpenCV
+    distortion, common entries at the top."""
     frames = []
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
         pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
@@ -64,7 +64,7 @@ def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
 
 
 def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
-    """nerfstudio's keys of a camera, for COLMAP's models up to OPENCV."""
+    """Return nerfstudio's entries of a camera, for COLMAP models up to OPENCV."""
     distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     first = sum(len(part) for part in (camera.focal_length_idxs(), camera.principal_point_idxs()))
     distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))

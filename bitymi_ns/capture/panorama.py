@@ -1,7 +1,5 @@
-"""Pictures that show all directions at once (360 degrees, equirectangular), told by their metadata or their content.
-
-A width of twice the height alone says nothing: phones take such photographs, too.
-"""
+"""Detection of 360-degree (equirectangular) pictures by metadata or content. An aspect ratio of 2 alone is no evidence:
+phones take such photographs, too."""
 
 from __future__ import annotations
 
@@ -16,24 +14,23 @@ PANORAMAS = (
     "`ns-process-data images --camera-type equirectangular`, which finds their poses anew."
 )
 HEADER = 1 << 17
-"""Bytes at the start of a file in which metadata are looked for."""
+"""Bytes at the start of a file that are searched for metadata."""
 SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
-"""What XMP says of a picture that no single lens took, by Google's description of its entries."""
+"""XMP entries of panoramas (Google Photo Sphere)."""
 ASPECT = 0.01
-"""Relative difference from a width of twice the height that is rounding."""
+"""Relative difference from aspect ratio 2 that counts as rounding."""
 ALIKE = 0.6
-"""Correlation between the details of the left and the right edge from which on they are one edge."""
+"""Correlation of the details of the left and right edge from which on they match."""
 SMOOTH = 15
-"""Rows over which the mean is taken that is no detail."""
+"""Rows of the moving average that is subtracted to leave the detail."""
 DETAIL = 1.5
-"""Grey levels; edges with less detail than this are alike in any picture of a bare background."""
+"""Least standard deviation of detail, grey levels: edges of a bare background always match."""
 POLE = 0.35
-"""A picture of all directions shows one point in its first row, and one in its last: grey levels along these vary by
-less than this share of those of the picture."""
+"""Largest standard deviation of the first and last row, each one point of the sphere, relative to the picture's."""
 
 
-def says_so(path: Path) -> bool:
-    """Whether a file's metadata say that it is such a picture."""
+def has_panorama_metadata(path: Path) -> bool:
+    """Test the metadata of a file for a spherical or cylindrical projection."""
     try:
         with open(path, "rb") as file:
             return SPHERICAL.search(file.read(HEADER)) is not None
@@ -41,8 +38,8 @@ def says_so(path: Path) -> bool:
         return False
 
 
-def shows_so(grey: npt.NDArray[np.float32]) -> bool:
-    """Whether a picture goes on at its left edge where it ends at its right, and its poles are points.
+def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
+    """Test if left and right edge continue each other, and the first and last row are constant.
 
     Args:
         grey: [h, w] grey levels to 255 of the whole picture, reduced to some hundreds of pixels.

@@ -1,4 +1,4 @@
-"""Finding photographs, and reading what the finding of poses has to know of each."""
+"""Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from bitymi_ns.capture.exif import Exif, read_exif
-from bitymi_ns.capture.panorama import says_so, shows_so
+from bitymi_ns.capture.panorama import has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
@@ -24,43 +24,48 @@ from bitymi_ns.trust import is_text
 PLAIN = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),
 }  # fmt: skip
-"""What COLMAP and nerfstudio read as it is, by the file's content, if it has the ending of that."""
+"""Formats that COLMAP and nerfstudio read, with the extensions that they expect."""
 COPY = ".jpg"
-"""What the name of an upright copy has at its end, after that of the photograph."""
+"""Extension appended to the name of a photograph for its upright copy."""
 THUMB = 256
-"""Longer side in pixels of the grey thumbnails by which duplicates are found."""
+"""Longer side of the grey thumbnails for duplicate detection, pixels."""
 SHARPNESS_SIZE = 1024
-"""Longer side in pixels at which sharpness is judged."""
+"""Longer side at which sharpness is measured, pixels."""
+
+BLURRED = 0.5
+"""A photograph is blurred if its sharpness is below this share of the set's median."""
+DUPLICATE_SHIFT = 0.1
+"""Two photographs are duplicates if they differ by less than a shift by this many pixels of their thumbnails."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One photograph that can be read."""
+    """A readable photograph."""
 
     name: str
     """Path relative to the folder, with slashes."""
     path: Path
     width: int
-    """Of the upright image, as the height."""
+    """Width of the upright image, as the height."""
     height: int
     exif: Exif
     plain: bool
-    """Whether it can be used as it is: upright, and in a format that everything reads."""
+    """True if it can be used as it is: upright, in a format that everything reads."""
     thumb: np.ndarray
     """[h,w] float32 grey levels, longer side THUMB."""
     sharpness: float
     """Share of the fine detail in all detail; see `sharpness`."""
     panorama: bool = False
-    """Whether it shows all directions at once."""
+    """True for 360-degree pictures."""
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts numbers in names by value: frame_2 before frame_10."""
+    """Sort key with numbers by value: frame_2 before frame_10."""
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
 def photo_folder(source: Path) -> Path:
-    """The folder that the photographs of a capture stand in: itself, or `images` in it."""
+    """Return the folder of the photographs of a capture: itself, or `images` in it."""
     images = source / "images"
     return images if images.is_dir() and not _photos_in(source) else source
 
@@ -70,7 +75,7 @@ def _photos_in(folder: Path) -> list[Path]:
 
 
 def find_photos(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its folders, in natural order; see `photographs_below`.
+    """List the photographs in and below a folder in natural order; see `photographs_below`.
 
     Raises:
         CaptureError: the folder is missing, or cannot be read.
@@ -84,7 +89,7 @@ def find_photos(folder: Path) -> list[str]:
 
 
 def check_names(folder: Path, names: Sequence[str]) -> None:
-    """Stop at names that COLMAP, and the files that name the photographs, cannot hold.
+    """Check that names are UTF-8, as COLMAP and JSON files need.
 
     Raises:
         CaptureError: the path to the folder, or a name in it, is not UTF-8.
@@ -100,7 +105,7 @@ def check_names(folder: Path, names: Sequence[str]) -> None:
 
 
 def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:
-    """Read all photographs, several at a time.
+    """Read all photographs in threads.
 
     Returns:
         those that can be read, and for each of the others why not.
@@ -153,15 +158,15 @@ def read_photo(folder: Path, name: str) -> Photo:
     plain = orientation in (0, 1) and plain and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
     thumb = np.asarray(_reduced(grey, THUMB), np.float32)
     detail = np.asarray(_reduced(grey, SHARPNESS_SIZE), np.float32)
-    panorama = says_so(path) or shows_so(thumb)
+    panorama = has_panorama_metadata(path) or looks_panoramic(thumb)
     return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail), panorama)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """The image, of which deep grey modes are scaled to 8 bits; it can still be turned by EXIF.
+    """Scale deep grey modes to 8 bits; EXIF orientation is kept.
 
     Raises:
-        ValueError: its values are none of such a file.
+        ValueError: its values have no known range.
     """
     if not image.mode.startswith(("I", "F")):
         return image
@@ -185,13 +190,12 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def is_plain(image: Image.Image, path: Path) -> bool:
-    """Whether the opened file is in a format that everything reads, and named so."""
+    """Test if the opened file is in a format that everything reads, with the right extension."""
     return path.suffix.lower() in PLAIN.get(image.format or "", ())
 
 
 def in_srgb(image: Image.Image) -> Image.Image:
-    """The image in the colours of screens, where it has a profile of other ones, as photographs of phones (Display P3)
-    and of cameras (Adobe RGB) do: their numbers, taken as they are, are pale."""
+    """Convert an image with a color profile (Display P3 of phones, Adobe RGB of cameras) to sRGB."""
     profile = image.info.get("icc_profile")
     convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
     if convert is None:
@@ -204,7 +208,7 @@ def in_srgb(image: Image.Image) -> Image.Image:
 
 @lru_cache(maxsize=8)
 def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """From the colours of a profile; None where that changes next to nothing, or it is no profile of such colours."""
+    """Transform of an RGB profile to sRGB; None where it changes next to nothing, or there is none."""
     try:
         source = ImageCms.ImageCmsProfile(BytesIO(profile))
         convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
@@ -228,7 +232,7 @@ def _reduced(image: Image.Image, size: int) -> Image.Image:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Root mean square of the Laplacian over that of the gradient: low where fine detail is missing, whatever is seen.
+    """Root mean square of the Laplacian over that of the gradient: low where fine detail is missing.
 
     Args:
         grey: [h,w] float32.
@@ -240,6 +244,45 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def upright(photo: Photo) -> Image.Image:
-    """The photograph as an upright RGB image of 8 bits."""
+    """Read the photograph as an upright 8-bit RGB image."""
     with open_picture(photo.path) as image:
         return in_srgb(ImageOps.exif_transpose(eight_bits(image))).convert("RGB")
+
+
+def blurred(photos: Sequence[Photo]) -> list[str]:
+    """Find the names of photographs with much less fine detail than the median of the set."""
+    if len(photos) < 3:
+        return []
+    middle = float(np.median([photo.sharpness for photo in photos]))
+    return [photo.name for photo in photos if photo.sharpness < BLURRED * middle]
+
+
+def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
+    """Map near-duplicates to the sharper photograph that they repeat, by name; see `shift`."""
+    found: dict[str, str] = {}
+    for shape in {photo.thumb.shape for photo in photos}:
+        same = sorted((p for p in photos if p.thumb.shape == shape), key=lambda p: -p.sharpness)
+        kept: list[Photo] = []
+        means = np.empty(0)
+        for photo in same:
+            level = float(photo.thumb.mean())
+            # A duplicate has almost the same mean, so few are compared pixel by pixel.
+            near = [kept[i] for i in np.flatnonzero(np.abs(means - level) < 2.0)]
+            twin = next((other for other in near if shift(photo.thumb, other.thumb) < DUPLICATE_SHIFT), None)
+            if twin is not None:
+                found[photo.name] = twin.name
+            else:
+                kept.append(photo)
+                means = np.append(means, level)
+    return found
+
+
+def shift(first: np.ndarray, second: np.ndarray) -> float:
+    """Root mean square difference of two images over that of their gradient: the shift in pixels that would explain it.
+
+    Args:
+        first, second: [h,w] float32 grey levels.
+    """
+    gradient = np.mean(np.diff(first, axis=0) ** 2) + np.mean(np.diff(first, axis=1) ** 2)
+    difference = np.mean((first - second) ** 2)
+    return float(np.sqrt(difference / gradient)) if gradient > 0 else (0.0 if difference == 0 else np.inf)

@@ -1,4 +1,4 @@
-"""Finding the camera poses of photographs or of a video."""
+"""Structure from motion: camera poses of photographs or of the frames of a video."""
 
 from __future__ import annotations
 
@@ -16,14 +16,21 @@ import pycolmap
 from pydantic import BaseModel
 
 from bitymi_ns.capture import prepare
-from bitymi_ns.capture.cache import content_key, take_place, work_folder
-from bitymi_ns.capture.frame import local_positions, settle, write_frame
+from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
+from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.panorama import PANORAMAS
-from bitymi_ns.capture.photos import Photo, check_names, find_photos, photo_folder, read_photos
+from bitymi_ns.capture.photos import (
+    Photo,
+    blurred,
+    check_names,
+    duplicates,
+    find_photos,
+    photo_folder,
+    read_photos,
+)
 from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
-from bitymi_ns.capture.selection import blurred, duplicates
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
@@ -32,13 +39,13 @@ from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
 GUESSED_FOCAL = 1.2
-"""First guess of a focal length that is not known, in units of the longer side; COLMAP's own."""
+"""Initial focal length where it is unknown, in units of the longer side; COLMAP's own."""
 TELLING = 0.25
-"""Share of the photographs of a size that show all directions, from which on all of them do."""
+"""Share of 360-degree pictures among photographs of one size from which on all of them count as such."""
 LEAST = 3
-"""Photographs without which there is nothing to find."""
+"""Least number of photographs."""
 SPARSE = Path("sparse/0")
-"""Where the model is in a result."""
+"""Path of the model in a result."""
 
 
 def find_poses(
@@ -46,14 +53,14 @@ def find_poses(
 ) -> Poses:
     """Find the camera poses of photographs or of the frames of a video.
 
-    They are found once. The result is kept beside the photographs, or in the user's cache folder if nothing can be
-    written there. A run that was interrupted goes on where it stopped.
+    The result is cached beside the photographs, or in the user's cache folder if nothing can be written there. An
+    interrupted run continues.
 
     Args:
         source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
         options: how; None = the defaults.
-        progress: told the stage and how far it is.
-        warn: told where the result is kept, if not beside the photographs although these can be written.
+        progress: called with the stage and its progress.
+        warn: called with the location of the result, if not beside writable photographs.
 
     Raises:
         CaptureError: no poses can be found; says what to photograph differently.
@@ -77,12 +84,12 @@ def find_poses(
             return finished
         with explained(work, CaptureError):
             found = _find(source, folder, names, masks, options, work, tell)
-            take_place(work, folder, content_key(inputs, "contents"))
+            replace_stale(work, folder, content_key(inputs, "contents"))
             return found
 
 
 def _what(source: Path) -> tuple[Path, Path, list[str]]:
-    """The source, the folder of its photographs and their names; for a video no names.
+    """Return the source, the folder of its photographs and their names; for a video no names.
 
     Raises:
         CaptureError: there is nothing, or too little.
@@ -114,10 +121,10 @@ def _few(count: int) -> str:
 
 
 class _Kept(BaseModel, extra="forbid"):
-    """poses.json, which makes a result whole."""
+    """Content of poses.json, which marks a result as complete."""
 
     made: bool
-    """The photographs of the model are copies or frames in the folder of the work, and not those of the capture."""
+    """The photographs of the model are copies or frames in the work folder."""
     left_out: dict[str, str]
     registered: int
     given: int
@@ -127,8 +134,7 @@ class _Kept(BaseModel, extra="forbid"):
 
 
 def _finished(work: Path, folder: Path) -> Poses | None:
-    """The poses that an earlier run has found of photographs in this folder, or of a video; None where there are none,
-    or they are damaged."""
+    """Read the poses of an earlier run; None where there are none, or they are damaged."""
     result = work / "result"
     try:
         kept = _Kept.model_validate_json((result / "poses.json").read_bytes())
@@ -177,15 +183,13 @@ def _find(
 
 
 def _without_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str]) -> list[Photo]:
-    """The photographs that a lens took; others are left out, or all refused where they are the most.
-
-    A zenith with detail, or edges without, hide what a picture is; others of its size tell.
-    """
+    """Leave out 360-degree pictures, or fail where they are the most. One that was not detected is recognized by others
+    of its size."""
     groups: dict[tuple[int, int], list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[photo.width, photo.height].append(photo)
-    told = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
-    all_round = [photo.name for photo in photos if (photo.width, photo.height) in told or photo.panorama]
+    panoramic = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
+    all_round = [photo.name for photo in photos if (photo.width, photo.height) in panoramic or photo.panorama]
     if len(all_round) > len(photos) / 2:
         some = ", ".join(all_round[:3])
         raise CaptureError(
@@ -220,7 +224,7 @@ def _too_few_left(
 
 
 def ordered(photos: list[Photo]) -> list[Photo]:
-    """By the times at which they were taken, if all have one and not all the same; else by name, as they are."""
+    """Sort by time, if all have one and not all the same; else keep the order by name."""
     times = {photo.exif.time for photo in photos}
     return sorted(photos, key=lambda photo: photo.exif.time) if "" not in times and len(times) > 1 else photos
 
@@ -234,7 +238,7 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """The job for these photographs, with links to them under names that COLMAP's lists can hold.
+    """Make the job for these photographs, with links to them under names without spaces for COLMAP's lists.
 
     Args:
         photos: in their order.
@@ -260,7 +264,7 @@ def make_job(
         order=[plain[photo.name] for photo in photos],
         names={plain[photo.name]: used[photo.name] for photo in photos},
         sequence=sequence,
-        positions={plain[name]: place for name, place in positions.items()},
+        positions={plain[name]: position for name, position in positions.items()},
         matching=options.matching,
         mapper=options.mapper,
         opencv_if_better=options.camera_model == "auto",
@@ -270,7 +274,7 @@ def make_job(
 
 
 def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
-    """Photographs of the same size, camera and focal length, by EXIF."""
+    """Group photographs by size and EXIF camera and focal length."""
     groups: dict[tuple[object, ...], list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[photo.exif.camera, photo.width, photo.height].append(photo)
@@ -278,7 +282,7 @@ def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
 
 
 def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions) -> CameraGroup:
-    """The first guess of the camera that took these photographs."""
+    """Initial camera of these photographs."""
     width, height = photos[0].width, photos[0].height
     stated = [photo.exif.focal_length for photo in photos]
     focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
@@ -290,10 +294,10 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
 
 
 def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
-    """Settle the model in its world and write it with its report; what was needed on the way there goes."""
+    """Move the model to its world frame and write it with its report; remove temporary files."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
-    frame = settle(
+    frame = move_to_world(
         model,
         {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None},
         {n: p.exif.up for n, p in by_used.items() if p.exif.up is not None},

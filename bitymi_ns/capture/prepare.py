@@ -1,4 +1,4 @@
-"""The photographs and masks in the form in which COLMAP and nerfstudio read them alike."""
+"""Photographs and masks in forms that both COLMAP and nerfstudio read."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
 IMAGES = "images"
-"""Folder in that of the work for upright copies, or the frames of a video."""
+"""Subfolder of the work folder for upright copies, or the frames of a video."""
 
 
 def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
-    """A folder in which every photograph stands upright in a format that everything reads.
+    """Make a folder in which every photograph is upright and in a format that everything reads.
 
     Args:
         photos: the photographs to be used.
@@ -31,7 +31,7 @@ def upright_photos(
         work: gets `images` where some have to be converted; the others are links in it.
 
     Returns:
-        the folder, which is the given one where all are fine as they are, and per photograph its name in there.
+        the folder, which is `folder` itself where no photograph needs a copy, and the names in it by photograph.
     """
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}

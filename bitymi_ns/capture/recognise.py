@@ -1,5 +1,4 @@
-"""What a folder or file holds that somebody wants to train on: a capture in one of several formats, photographs, or a
-video."""
+"""Recognition of the format of a folder or file: a capture with poses, photographs, or a video."""
 
 from __future__ import annotations
 
@@ -28,40 +27,40 @@ PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic
 FORMATS_OF_PICTURES = (
     "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
 )  # fmt: skip
-"""What a photograph or a mask may be, as Pillow names it, whatever its file is called. Of others of Pillow's formats
-one, EPS, is a program that Ghostscript runs."""
+"""Formats of photographs and masks by Pillow's names, whatever the file name. EPS, among others, is excluded: it is a
+program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
-"""Where a COLMAP model usually lies in a capture, the most usual place first."""
+"""Usual folders of a COLMAP model in a capture, the most usual first."""
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
-"""Entries that a transforms.json has from nerfstudio alone."""
+"""Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
-"""Folders of Polycam's pictures and of the cameras that belong to them, the better ones first."""
+"""Folders of Polycam's images and their cameras, the better ones first."""
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 """Files of a Blender data set."""
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 
 def open_picture(file: Path) -> Image.Image:
-    """A photograph or mask as Pillow opens it; raises what that raises."""
+    """Open a photograph or mask with Pillow; raises Pillow's errors."""
     Image.init()  # Pillow knows AVIF from a version on
     return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
 class NotRecognised(ValueError):
-    """A path that holds nothing to train on: what is there instead, and what to do."""
+    """A path holds nothing to train on; the message says what to do."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What is to be read.
+    """Recognized capture.
 
     Attributes:
-        format: how.
+        format: to read it as.
         path: nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap:
             the folder of the model; photographs: the folder; video: the file.
         folder: of the capture, to which the names in its files are relative.
-        others: what is there besides and is not read, with its format.
+        others: other captures there that are not read, with their formats.
         unread: files of poses that cannot be read, with the program that wrote each.
     """
 
@@ -72,7 +71,7 @@ class Found:
     unread: tuple[tuple[Path, str], ...] = ()
 
     def how_to_choose(self) -> str:
-        """A sentence on what is not read and how to have it read; empty where there is nothing else."""
+        """Describe what is not read and how to read it; empty where there is nothing else."""
         if not self.others:
             return ""
         ways = []
@@ -88,12 +87,12 @@ class Found:
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
-    """What a path holds.
+    """Recognize what a path holds.
 
     Args:
         data: a folder, or a file: transforms.json, a video, or a file of a COLMAP model.
-        format: what to look for; auto = whatever there is, files with poses before photographs without.
-        colmap_path: the folder of a COLMAP model, seen from the capture; it is that which is read.
+        format: to search for; auto = any, files with poses before photographs without.
+        colmap_path: folder of a COLMAP model to read, relative to the capture.
 
     Raises:
         NotRecognised: there is nothing of that format.
@@ -124,8 +123,8 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
-    """The one folder of this one that is a capture with poses, as an archive leaves it that was unpacked into a folder
-    of its own; None = there is none or are several, or photographs beside it."""
+    """Find the one subfolder that is a capture with poses, as archives unpack to; None = none or several, or
+    photographs beside it."""
     if _has_photographs(folder):
         return None
     found = []
@@ -137,7 +136,7 @@ def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | No
 
 
 def _is_another(chosen: Format, other: Format) -> bool:
-    """Photographs lie beside every capture: they are something else only to a video."""
+    """Photographs lie beside every capture: they are another capture only beside a video."""
     return other != "photographs" or chosen == "video"
 
 
@@ -154,7 +153,7 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
-    """Everything there is, in the order in which it is preferred."""
+    """Yield all captures in a folder, in order of preference."""
     yield from _transforms_in(folder)
     for model in models_in(folder):
         yield "colmap", folder / model
@@ -167,7 +166,7 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
-    """transforms.json and its relatives; where there is neither, files of other names with the same content."""
+    """Yield transforms.json and Blender's files; where there is neither, files of other names with the same content."""
     usual = folder / "transforms.json"
     if usual.is_file():
         yield _kind_of(usual), usual
@@ -180,7 +179,7 @@ def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
-    """What scanning programs wrote, and RGB-D sets with poses."""
+    """Yield captures of scanning programs, and RGB-D sets with poses."""
     keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
         yield "polycam", folder
@@ -195,10 +194,8 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _kind_of(file: Path) -> Format:
-    """Whether a transforms.json is for nerfstudio or for instant-ngp, which use the same name.
-
-    A file that cannot be read is taken for nerfstudio's; its reader says what is wrong.
-    """
+    """Tell a transforms.json of nerfstudio from one of instant-ngp. A file that cannot be read counts as nerfstudio's,
+    whose reader reports the error."""
     try:
         meta = json_of(file.read_bytes())
     except (OSError, ValueError):
@@ -214,21 +211,18 @@ def _kind_of(file: Path) -> Format:
 
 
 def is_model(folder: Path) -> bool:
-    """Whether it holds the cameras of a COLMAP model."""
+    """Test for the cameras of a COLMAP model."""
     return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
 
 
 def models_in(data: Path) -> list[Path]:
-    """Folders of COLMAP models at most three levels below a folder, seen from it; the one to read first.
-
-    That is the one in a usual place. Of models side by side, which COLMAP makes of photographs that it could not
-    connect, it is the one of most images.
-    """
+    """List COLMAP models at most three levels below a folder, relative to it, the one to read first: in a usual folder,
+    and of models side by side, which COLMAP makes of photographs that it could not connect, that of most images."""
     found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
     models = [path.relative_to(data) for path in found if is_model(path)]
     models = [model for model in models if not any(part.startswith(".") for part in model.parts)]
 
-    def place(model: Path) -> tuple[int, str, int, str]:
+    def rank(model: Path) -> tuple[int, str, int, str]:
         usual = [Path(name) for name in MODELS]
         beside = usual.index(model) if model in usual else len(usual)
         if model.name.isdigit():  # stands where the first of its neighbours would
@@ -236,11 +230,11 @@ def models_in(data: Path) -> list[Path]:
             beside = usual.index(first) if first in usual else len(usual)
         return beside, str(model.parent), -image_count(data / model), str(model)
 
-    return sorted(models, key=place)
+    return sorted(models, key=rank)
 
 
 def image_count(model: Path) -> int:
-    """How many images the model in this folder states; 0 where it states none."""
+    """Read the number of images of a model; 0 where it states none."""
     try:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as file:
@@ -252,8 +246,8 @@ def image_count(model: Path) -> int:
 
 
 def _photographs_in(folder: Path) -> Path | None:
-    """The folder to search for photographs: this one where they lie in it or in its `images`, else the one below, else
-    this one again where they lie in several. None = there are none, or captures of their own."""
+    """Choose the folder to search for photographs: this one where they lie in it or in its `images`, else the only
+    subfolder with photographs, else this one. None = none, or captures of their own."""
     if _has_photographs(folder) or _has_photographs(folder / "images", below=True):
         return folder
     holding = [path for path in _folders_in(folder) if _has_photographs(path, below=True)]
@@ -263,7 +257,7 @@ def _photographs_in(folder: Path) -> Path | None:
 
 
 def captures_in(folder: Path) -> list[Path]:
-    """Folders of this one that are captures of their own: several of them have an `images` of photographs."""
+    """List subfolders that are captures of their own: several of them have `images` with photographs."""
     found = [path for path in _folders_in(folder) if _has_photographs(path / "images", below=True)]
     return found if len(found) > 1 else []
 
@@ -284,17 +278,17 @@ def _has_photographs(folder: Path, below: bool = False) -> bool:
 
 
 def photographs_below(folder: Path) -> Iterator[Path]:
-    """The photographs in a folder and in those below it, but for hidden ones and those that hold something else."""
-    for place, below, names in os.walk(folder):
+    """Yield the photographs in and below a folder, without hidden folders and those of other content."""
+    for parent, below, names in os.walk(folder):
         below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
         for name in names:
-            path = Path(place, name)
+            path = Path(parent, name)
             if is_photograph(path):
                 yield path
 
 
 def _copies(name: str, beside: list[str]) -> str:
-    """What copies of the pictures in other folders beside it a folder holds, by its name; empty = none."""
+    """Describe the copies that a folder holds of images in a folder beside it, by its name; empty = none."""
     if f"corrected_{name}" in beside:
         return "raw copies of corrected pictures"
     original, _, factor = name.rpartition("_")
@@ -302,21 +296,21 @@ def _copies(name: str, beside: list[str]) -> str:
 
 
 def passed_over(folder: Path) -> list[str]:
-    """What pictures in a folder and below it `photographs_below` leaves out, a phrase each."""
+    """Describe the images that `photographs_below` leaves out."""
     found = []
-    for place, below, names in os.walk(folder):
+    for parent, below, names in os.walk(folder):
         for name in sorted(below):
             what = unread.FOLDERS.get(name.lower()) or _copies(name, below)
-            if what and _pictures(Path(place, name)):
-                found.append(f"{Path(place, name).relative_to(folder)} ({_pictures(Path(place, name))} {what})")
+            if what and _pictures(Path(parent, name)):
+                found.append(f"{Path(parent, name).relative_to(folder)} ({_pictures(Path(parent, name))} {what})")
         below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
         for name in sorted(names):
-            path = Path(place, name)
+            path = Path(parent, name)
             if is_picture(path) and not is_photograph(path):
                 found.append(f"{path.relative_to(folder)} ({_beside(path)})")
-        read = [name for name in names if is_picture(Path(place, name))]
+        read = [name for name in names if is_picture(Path(parent, name))]
         for ending, count in unread.pictures_among(names, read).items():
-            found.append(f"{count} {ending} of {place} ({unread.PICTURES[ending]}, which is not read)")
+            found.append(f"{count} {ending} of {parent} ({unread.PICTURES[ending]}, which is not read)")
     return found
 
 
@@ -328,18 +322,18 @@ def _pictures(folder: Path) -> int:
 
 
 def is_photograph(path: Path) -> bool:
-    """Whether it is a picture, and not one that programs put beside photographs."""
+    """Test for an image that is not a depth map or thumbnail."""
     return is_picture(path) and not _beside(path)
 
 
 def _beside(path: Path) -> str:
-    """What a picture beside photographs is, by its name; empty = a photograph."""
+    """Describe an image that is no photograph, by its name; empty = a photograph."""
     stem = path.stem.lower()
     return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else unread.FILES.get(stem, "")
 
 
 def is_picture(path: Path) -> bool:
-    """Whether it is a file with the ending of a photograph, and not hidden."""
+    """Test for a file with the extension of a photograph that is not hidden."""
     return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
@@ -356,7 +350,7 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
 
 
 def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
-    """Why a path is no capture, and what to do."""
+    """Message for a path that is no capture."""
     if format != "auto":
         there = f" It holds {_listed(data, candidates)}: leave --format out." if candidates else ""
         return f"{data} holds nothing of the format {format}.{there}"

@@ -1,4 +1,4 @@
-"""The report of a capture: what was placed, what was left out and why, and a picture of cameras and points."""
+"""Report on structure from motion: errors, photographs left out and why, and a plot of cameras and points."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:  # those who read reports need not wait for it
 
 VALUES, PAGE, PICTURE = "report.json", "report.md", "cameras.png"
 FILES = (VALUES, PAGE, PICTURE, "frame.json")
-"""The files of a report; the last one is written by frame.py."""
+"""Files of a report; the last one is written by frame.py."""
 MOST_POINTS = 20_000
-"""Points drawn; more are a blot."""
+"""Points in the plot; excess points are dropped at random."""
 
 
 def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
-    """Write all of it but the frame.
+    """Write the report without frame.json.
 
     Args:
         folder: an existing folder.
-        values: see `poses._values`.
+        values: content of report.json.
         model: cameras and points, z up.
     """
     from matplotlib import style
@@ -80,7 +80,7 @@ def _cell(text: object) -> str:
 
 
 def frame_text(values: Mapping[str, Any]) -> str:
-    """Where up and scale come from, of `up`, `metres_per_unit` and `gps_error`."""
+    """Describe the source of up and scale, from `up`, `metres_per_unit` and `gps_error`."""
     metres, error = values.get("metres_per_unit") is not None, values.get("gps_error")
     up = values.get("up") or ("gps" if metres else "cameras")  # earlier reports do not say
     text = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
@@ -95,19 +95,19 @@ def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:
     from matplotlib.figure import Figure
 
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    colours = np.array([point.color for point in model.points3D.values()], float).reshape(-1, 3) / 255
+    colors = np.array([point.color for point in model.points3D.values()], float).reshape(-1, 3) / 255
     placed = [image for image in model.images.values() if image.has_pose]
     centers = np.array([image.projection_center() for image in placed])
     views = np.array([image.viewing_direction() for image in placed])
     if len(points) > MOST_POINTS:
         some = np.random.default_rng(0).choice(len(points), MOST_POINTS, replace=False)
-        points, colours = points[some], colours[some]
+        points, colors = points[some], colors[some]
     middle, reach = np.median(np.vstack([points, centers]), axis=0), _reach(points, centers)
     figure = Figure(figsize=(12, 6), dpi=100)
     FigureCanvasAgg(figure)
-    for place, (up, title) in enumerate(((1, "from above"), (2, "from the side"))):
-        axes = figure.add_subplot(1, 2, place + 1)
-        axes.scatter(points[:, 0], points[:, up], s=1, c=colours, linewidths=0)
+    for column, (up, title) in enumerate(((1, "from above"), (2, "from the side"))):
+        axes = figure.add_subplot(1, 2, column + 1)
+        axes.scatter(points[:, 0], points[:, up], s=1, c=colors, linewidths=0)
         axes.quiver(centers[:, 0], centers[:, up], views[:, 0], views[:, up], color="crimson", angles="xy", width=0.002)
         axes.scatter(centers[:, 0], centers[:, up], s=8, c="crimson")
         axes.set(aspect="equal", title=title, xlim=(middle[0] - reach, middle[0] + reach))
@@ -119,7 +119,7 @@ def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:
 
 
 def _reach(points: np.ndarray, centers: np.ndarray) -> float:
-    """Half the side of a square that holds the cameras and nine of ten points."""
+    """Half the side of a square that holds the cameras and 90 % of the points."""
     middle = np.median(np.vstack([points, centers]), axis=0)
     far = [np.abs(centers - middle).max()] + (
         [np.quantile(np.abs(points - middle).max(axis=1), 0.9)] if len(points) else []

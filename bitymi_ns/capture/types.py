@@ -1,4 +1,4 @@
-"""What the finding of poses takes and gives."""
+"""Options and result of structure from motion."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ class CaptureError(ValueError):
 
 @dataclass(frozen=True)
 class SfmSettings:
-    """How poses are found. All of it decides the result, and so is part of the key under which that is kept."""
+    """Settings of structure from motion; they are part of the key under which a result is cached."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which photographs are compared: all with all, each with those that come after it and with what looks alike, or
-    what suits their number, order and GPS positions."""
+    """Pairs to match: all (exhaustive), neighbors and similar photographs (sequential), or by number, order and GPS
+    positions (auto)."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
-    """All cameras at once, one after the other, or the first and, where it falls short, the second."""
+    """Register all cameras at once, one after the other, or the former with the latter as fallback."""
     camera_model: Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = "auto"
     """Camera model of COLMAP; auto = SIMPLE_RADIAL, and OPENCV where that lowers the reprojection error."""
     focal_length: float | None = None
-    """Focal length of all photographs in their pixels, where it is known; None = from EXIF or the photographs."""
+    """Focal length of all photographs in pixels; None = from EXIF or estimated."""
     max_image_size: int = 1600
-    """Features are found on photographs reduced to this many pixels along their longer side. Cameras stay in pixels of
+    """Detect features on photographs downscaled to this many pixels along their longer side. Cameras stay in pixels of
     the photographs."""
     max_features: int = 8192
     """Most features per photograph."""
     frames: int | None = None
-    """Number of frames to take of a video; None = by how much the camera moves."""
+    """Number of frames of a video; None = by camera motion."""
 
 
 @dataclass(frozen=True)
 class SfmOptions(SfmSettings):
-    """The settings, and where the masks are.
+    """Settings, and the folder of masks.
 
     Raises:
         CaptureError: one is out of its range.

@@ -1,4 +1,4 @@
-"""What cameras and other programs leave in a capture that nothing here reads as photographs or poses, to be named."""
+"""Files of cameras and other programs that are not read as photographs or poses, to be reported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PICTURES = {
     ".hdr": "Radiance HDR",
     ".psd": "Photoshop",
 }
-"""Endings of pictures, and what they are."""
+"""Extensions of unread images, and their formats."""
 POSES = {
     "poses_bounds.npy": "LLFF",
     "cameras_sphere.npz": "NeuS",
@@ -26,7 +26,7 @@ POSES = {
 }
 """Files of poses, in lower case, and the programs that write them."""
 METASHAPE = b"<camera "
-"""What the XML file has in it to which Metashape exports cameras, whatever its name."""
+"""Content of the XML file to which Metashape exports cameras, whatever its name."""
 FOLDERS = {
     "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
     "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
@@ -41,7 +41,7 @@ FILES = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
 
 
 def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Files of poses in a folder, each with the program that wrote it."""
+    """Yield files of poses in a folder, each with the program that wrote it."""
     for path in sorted(path for path in folder.iterdir() if path.is_file()):
         if path.name.lower() in POSES:
             yield path, POSES[path.name.lower()]
@@ -50,8 +50,8 @@ def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 def pictures_among(names: Sequence[str], read: Sequence[str]) -> dict[str, int]:
-    """How many of the files of a folder are pictures that are not read, by their endings. A camera's raw data beside a
-    photograph of the same name, one of those that are `read`, do not count."""
+    """Count unread images of a folder by extension. Raw data beside a photograph of the same name in `read` do not
+    count."""
     stems = {Path(name).stem.lower() for name in read}
     endings = [path.suffix.lower() for path in map(Path, names) if path.stem.lower() not in stems]
     return {ending: endings.count(ending) for ending in PICTURES if ending in endings}

@@ -1,4 +1,4 @@
-"""Frames of a video: as many as the camera's motion asks for, the sharpest of each stretch."""
+"""Frames of a video: the sharpest of each stretch of equal camera motion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from bitymi_ns.capture.hdr import is_hdr, ordinary
+from bitymi_ns.capture.hdr import is_hdr, tone_mapped
 from bitymi_ns.capture.photos import sharpness
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.types import CaptureError
@@ -19,24 +19,24 @@ from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 
 SMALL = 160
-"""Longer side in pixels of the frames by which motion is measured."""
+"""Longer side of frames for measuring motion, pixels."""
 FINE = 640
-"""... and sharpness."""
+"""Longer side of frames for measuring sharpness, pixels."""
 STRIDE = 0.08
-"""Motion between neighbouring frames that are taken, in units of the longer side: they share about nine tenths."""
+"""Motion between extracted frames, in units of the longer side: neighbors share about 90 %."""
 FEWEST, MOST = 20, 300
-"""Frames that are taken of a video whose camera moves at all."""
+"""Number of frames of a video whose camera moves at all."""
 STILL = 0.02
 """Motion over the whole video, in units of the longer side, below which the camera stood still."""
 PER_SECOND = 15
-"""Frames looked at per second by their times, because phones film with a rate that varies with the light."""
+"""Frames surveyed per second by their timestamps: phones film at a rate that varies with the light."""
 TRUSTED = {
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo",
     "protocol_whitelist": "file",
 }
-"""For FFmpeg: a file may be a list of other files and addresses, whatever it is called, which would be read."""
-LOOKED_AT = 60
-"""Frames looked at where a video has as many: all of a clip of a second or two."""
+"""FFmpeg options: a file of any name may be a list of other files and URLs, which would be read."""
+LEAST_SURVEYED = 60
+"""Frames surveyed at least, where there are so many: all of a clip of a second or two."""
 
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress) -> Path:
@@ -86,7 +86,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
 
 
 def choose(motion: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
-    """The sharpest frame of each of so many stretches of equal motion.
+    """Choose the sharpest frame of each of `count` stretches of equal motion.
 
     Args:
         motion: [n] motion from the start to each frame, not decreasing.
@@ -98,7 +98,7 @@ def choose(motion: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
 
 
 def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], list[float]]:
-    """Numbers of the frames looked at, the motion up to each in units of the longer side, and their sharpness."""
+    """Return the numbers of the surveyed frames, the motion up to each in units of the longer side, and sharpness."""
     seen: list[int] = []
     motion: list[float] = []
     sharp: list[float] = []
@@ -124,10 +124,8 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
 
 
 def displacement(first: np.ndarray, second: np.ndarray) -> float:
-    """How far blocks of an image move to the next one: the mean over those with texture, in units of the longer side.
-
-    Each block's shift is the peak of its phase correlation.
-    """
+    """Measure the mean displacement of image blocks by phase correlation, in units of the longer side; blocks without
+    texture count as still."""
     size = max(16, min(first.shape) // 3)
     window = np.outer(np.hanning(size), np.hanning(size))
     lengths = []
@@ -148,21 +146,20 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _between(line: np.ndarray, at: int) -> float:
-    """Place of the peak of a parabola through three values of a line that closes on itself."""
+    """Position of the peak of a parabola through three values of a periodic line."""
     low, mid, high = line[at - 1], line[at], line[(at + 1) % len(line)]
     curve = low - 2 * mid + high
     return float(at + (0.5 * (low - high) / curve if curve < 0 else 0.0))
 
 
 def _pace(video: Path) -> tuple[float, float, int]:
-    """Seconds from one frame that is looked at to the next one at least, the mean rate in frames per second, and how
-    many frames there are, roughly."""
+    """Return the least seconds between surveyed frames, the mean frame rate, and the approximate number of frames."""
     with _opened(video) as container:
         stream = _pictures(container)
         rate = float(stream.average_rate or 30)
         length = float(container.duration or 0) / 1e6
         total = max(1, stream.frames or round(rate * length))
-        gap = min(1.0 / PER_SECOND, total / rate / LOOKED_AT)
+        gap = min(1.0 / PER_SECOND, total / rate / LEAST_SURVEYED)
         return gap - 0.5 * min(gap, 1.0 / rate), rate, total  # the nearest frame to the due time, not the next one
 
 
@@ -180,12 +177,12 @@ def _opened(video: Path) -> av.container.InputContainer:
 
 
 def _pictures(container: av.container.InputContainer) -> av.VideoStream:
-    """The film among the streams of a file: a cover stands before it in some, as a stream of one picture."""
+    """Choose the video stream; in some files a cover picture is the first."""
     return container.streams.best("video") or container.streams.video[0]
 
 
 def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
-    """Number, frame, and the degrees by which it is turned to be seen; a broken end is passed over."""
+    """Yield number, frame and display rotation in degrees; a broken end is skipped."""
     with _opened(video) as container:
         stream = _pictures(container)
         stream.thread_type = "AUTO"
@@ -207,16 +204,16 @@ def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:
 
 
 def _shape_of_pixels(video: Path) -> float:
-    """Width of a pixel over its height, by which films of camcorders and of anamorphic lenses are stretched."""
+    """Return the pixel aspect ratio, which is not 1 for some camcorders and anamorphic lenses."""
     with _opened(video) as container:
         shape = float(_pictures(container).sample_aspect_ratio or 1.0)
     return shape if 0.25 < shape < 4.0 else 1.0
 
 
 def _upright(frame: av.VideoFrame, turn: int, shape: float = 1.0) -> Image.Image:
-    """The frame as it is seen: `turn` is counter-clockwise, as ffmpeg's display matrix has it; `shape` is the width of
-    its pixels over their height."""
-    image = ordinary(frame) if is_hdr(frame) else frame.to_image()
+    """Rotate a frame upright by `turn` degrees counter-clockwise (ffmpeg's display matrix), with square pixels; `shape`
+    is the pixel aspect ratio."""
+    image = tone_mapped(frame) if is_hdr(frame) else frame.to_image()
     if shape != 1.0:  # cameras of COLMAP with one focal length have square pixels
         image = image.resize((round(image.width * shape), image.height), Image.Resampling.LANCZOS)
     return image.rotate(turn, expand=True) if turn % 360 else image

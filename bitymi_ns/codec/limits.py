@@ -1,4 +1,4 @@
-"""Which values the files of a bundle may hold.
+"""Limits of the values in the files of a bundle.
 
 Far beyond what training reaches (an optimiser moves a parameter by at most its learning rate per step), and close
 enough that every number a renderer computes is finite and no channel of a picture exceeds `BRIGHTEST`.
@@ -20,7 +20,7 @@ BRIGHTEST = 1e4
 EXTENTS = (1e-6, 16.0)
 """Half sides of tiles in scale units."""
 UNIT_SLACK = 0.01
-"""How far the length of a stored rotation may be from 1."""
+"""Tolerance of the length of a stored rotation."""
 
 LIMITS: dict[str, Limit] = {
     "means": (1e9,),
@@ -35,7 +35,7 @@ LIMITS: dict[str, Limit] = {
 
 
 def limit_of(name: str, kind: str) -> Limit:
-    """What a parameter may be at most, as in `LIMITS`; infinite for one without a limit.
+    """Largest absolute values of a parameter, as in `LIMITS`; infinite for one without a limit.
 
     Args:
         name: a parameter of the surfels, view_terms of lean view colours, or mean_residual.
@@ -45,7 +45,7 @@ def limit_of(name: str, kind: str) -> Limit:
 
 
 def beyond(name: str, kind: str, values: Tensor) -> Tensor:
-    """Which numbers of a parameter are beyond its limit: bool of the shape of `values`.
+    """Mask of the numbers of a parameter beyond its limit: bool of the shape of `values`.
 
     Args:
         name, kind: as in `limit_of`.
@@ -56,6 +56,6 @@ def beyond(name: str, kind: str, values: Tensor) -> Tensor:
 
 
 def within(surfels: Mapping[str, Tensor], kind: str) -> Tensor:
-    """Which surfels may be stored, [N] bool: their parameters, of which all have a row per surfel, keep the limits."""
+    """[N] bool, True for surfels whose parameters, each with a row per surfel, keep the limits."""
     bad = [beyond(name, kind, value.detach()) for name, value in surfels.items()]
     return ~torch.stack([each.flatten(1).any(1) if each.dim() > 1 else each for each in bad]).any(0)

@@ -13,7 +13,7 @@ ROWS = 64  # page heights are multiples of this, once an atlas has so many rows
 
 @dataclass(frozen=True)
 class Packing:
-    """Where every tile lies.
+    """Layout of the tiles in pages.
 
     Attributes:
         tiles: [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x. A surfel without a
@@ -54,7 +54,7 @@ def _round_up(value: int, step: int) -> int:
 
 
 def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192, max_layers: int = 2048) -> Packing:
-    """Packs tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
+    """Pack tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
 
     Tiles are taken by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
     opens a new shelf of its own height. Sides are powers of two, so all tiles of one size are placed by arithmetic,

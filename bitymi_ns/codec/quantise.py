@@ -147,7 +147,7 @@ def encode(
     threads: int | None = None,
     progress: Progress = no_progress,
 ) -> EncodedAtlas:
-    """Quantises and encodes an atlas, and measures the error of what was written.
+    """Quantise and encodes an atlas, and measures the error of what was written.
 
     Args:
         texels: [layers, height, width, 3] float32 residual colours.

@@ -202,7 +202,7 @@ def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]
 
 
 def term_numbers(kind: str) -> tuple[list[int], list[int]]:
-    """Which numbers of a lean term are colours, in threes, and which are not."""
+    """Indices of the numbers of a lean term that are colours, in threes, and of the others."""
     limit = limit_of("view_terms", kind)
     every = limit * (VIEW_COLORS[kind].lean_width if len(limit) == 1 else 1)
     colors = [i for i, each in enumerate(every) if each == COLOR_LIMIT]

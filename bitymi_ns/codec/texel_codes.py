@@ -18,15 +18,15 @@ from bitymi_ns.codec.pages import size_classes
 from bitymi_ns.codec.surfel_codes import SurfelCodes
 
 BLOCK = 8
-"""Tiles are transformed in blocks of at most so many texels along a side."""
+"""Side of the largest block that is transformed, texels."""
 GRADES = (-8, 24)
-"""A tile's step is the common one times 2^(grade / 2), with a grade from here."""
+"""Range of the grades: a tile's step is the common one times 2^(grade / 2)."""
 RESIDUAL_STEP = 4.0 / 255
-"""Of the mean residuals of tiles, and of the residuals of surfels without a tile."""
+"""Step of the mean residuals of tiles and of the residuals of surfels without a tile."""
 LEAST_WEIGHT = 1e-3
-"""Every texel counts as if it made up at least so much of a pixel, so that its values stay near those of the bake."""
+"""Least weight of a texel, pixels, so that unseen ones stay near their values."""
 SPARSE_ROUNDS = 8
-"""Rounds in which coefficients that only texels nobody sees would need are shrunk."""
+"""Round in which coefficients that only texels nobody sees would need are shrunk."""
 SHRINK = 0.6
 """By how much of its step a coefficient is shrunk in a round, where all texels of its block are seen alike."""
 _ATTEMPTS = 16
@@ -39,7 +39,7 @@ _OPPONENT = _OPPONENT / _OPPONENT.norm(dim=1, keepdim=True)
 
 @dataclass
 class TexelCodeOptions:
-    """How precisely texels are kept."""
+    """Precision of coded texels."""
 
     step: float = 7.5
     """Step of a coefficient, in 8-bit steps, of texels that make up one pixel of the views each: of those that make up
@@ -48,7 +48,7 @@ class TexelCodeOptions:
     """Texels take no more than this: the step grows until they fit. None = it stays."""
 
     def check(self) -> None:
-        """Refuses values that make no sense."""
+        """Refuse values that make no sense."""
         if not 0.01 <= self.step <= 1000:
             raise ValueError(f"the step of the texels must be from 0.01 to 1000, not {self.step}")
         if self.most_bytes is not None and self.most_bytes < 1:
@@ -71,7 +71,7 @@ class Blocks:
 
     @property
     def name(self) -> str:
-        """Of its column."""
+        """Name of its column."""
         return f"{self.size[0]}x{self.size[1]}"
 
     @property

@@ -1,4 +1,4 @@
-"""The cameras that a bundle has with it, and the held-out photographs, where it has these."""
+"""Cameras of a bundle's capture, and the held-out photographs, where it has these."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
 PICTURES = ("JPEG", "PNG", "WEBP")
-"""What a photograph of a bundle may be, as Pillow names it."""
+"""Formats of photographs, as Pillow names them."""
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Size = Annotated[int, Field(ge=1, le=1 << 20)]
 
@@ -93,7 +93,7 @@ def named_cameras(folder: str | Path, info: Manifest) -> list[NamedCamera]:
 
 
 def _rows(parts: Parts, info: Manifest) -> list[_Row]:
-    """What stands in the file, up to the first row that is wrong, which is refused."""
+    """Rows of cameras.json; the first malformed one is refused."""
     path = parts.bundle / CAMERAS
     try:
         value = strict_json.loads(read_file(parts, info, CAMERAS))

@@ -23,7 +23,7 @@ _AT_ONCE = 1 << 19  # pairs of quads and pixels
 
 @torch.no_grad()
 def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, near: float = 0.2) -> Tensor:
-    """Draws a view.
+    """Draw a view.
 
     A ray r through a sample, with 1 as its z, meets the plane of a quad with the corner A and the sides E, F (in the
     camera's frame) where z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with
@@ -49,7 +49,7 @@ def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, n
 
 @dataclass(frozen=True)
 class Hits:
-    """What is seen through the centres of pixels; those that show nothing are left out.
+    """Nearest quads at the centres of pixels; empty pixels are left out.
 
     Attributes:
         pixel: [F] y * width + x.
@@ -74,7 +74,7 @@ def nearest(quads: Quads, camera: Camera, near: float) -> Hits:
     sides = corners[rows][:, [1, 3]] - corner[:, None]
     normal = torch.linalg.cross(sides[:, 0], sides[:, 1])
     across = [torch.linalg.cross(sides[:, 1], corner), torch.linalg.cross(corner, sides[:, 0]), normal]
-    planes = torch.stack(across, dim=1) @ torch.linalg.inv(K)  # of places (x, y, 1) in pixels
+    planes = torch.stack(across, dim=1) @ torch.linalg.inv(K)  # of (x, y, 1) in pixels
     level = (corner * normal).sum(1)
     count = camera.width * camera.height
     depth = torch.full((count,), math.inf, dtype=torch.float64)

@@ -36,20 +36,19 @@ Frame = Literal["scene", "capture"]
 FILES: dict[str, str] = {"gaussians": "gaussians.ply", "mesh": "mesh.glb"}
 SUMMARY = "extras.json"
 SUFFIX = ".extras"
-"""Of the name of the folder beside a bundle."""
+"""Suffix of the folder beside a bundle."""
 LEVEL = 0.15
-"""Of the opacity at which the quads of a mesh end."""
+"""Opacity at which the quads of a mesh end."""
 SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
-"""Longer side in pixels of the pictures by which it is found what the cameras see, those that colour a mesh, and those
-in which the files are measured."""
+"""Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
 COLORED_VIEWS, MEASURED_VIEWS = 64, 4
-"""At most so many training views colour a mesh; in so many held-out views the files are measured."""
+"""Training views that colour a mesh, and held-out views in which the files are measured, at most."""
 _UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
 
 
 @dataclass(frozen=True)
 class Written:
-    """What was written of a kind.
+    """Result of a written kind.
 
     Attributes:
         file: its name.
@@ -107,7 +106,7 @@ def write_extras(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> dict[str, Written]:
-    """Writes a folder with a file for each kind and extras.json, which says how well they show held-out photographs;
+    """Write a folder with a file for each kind and extras.json, which says how well they show held-out photographs;
     whole or not at all.
 
     Args:

@@ -44,7 +44,7 @@ class Similarity:
 
 
 def to_capture(place: WorldFrame) -> Similarity:
-    """What undoes x_scene = scale * (transform @ [x_capture, 1]).
+    """Inverse of x_scene = scale * (transform @ [x_capture, 1]).
 
     Raises:
         BundleError: the transform is no similarity, so that discs would not stay discs; or it leads so far from the

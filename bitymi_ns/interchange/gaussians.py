@@ -52,7 +52,7 @@ class Gaussians:
         return len(self.means)
 
     def moved(self, to: Similarity) -> Gaussians:
-        """The same in another frame."""
+        """Transform to another frame."""
         coefficients = harmonics.turned(to.turn.T) @ self.harmonics.double()
         return replace(
             self,
@@ -86,7 +86,7 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Writes the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue."""
+    """Write the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue."""
     values = {
         "means": gaussians.means,
         "normals": torch.zeros_like(gaussians.means),

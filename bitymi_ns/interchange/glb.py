@@ -51,7 +51,7 @@ def glb_bytes(quads: Quads, up: Tensor | None = None) -> bytes:
 
 
 def _unlit(tree: dict[str, Any]) -> None:
-    """Adds to the file's JSON what trimesh does not know."""
+    """Add the unlit extension and the sampler, which trimesh does not write, to the JSON."""
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}

@@ -32,7 +32,7 @@ def basis(directions: Tensor) -> Tensor:
 
 
 def turned(matrix: Tensor) -> Tensor:
-    """How coefficients change when the directions are those of another frame.
+    """Matrix of the coefficients for directions of another frame.
 
     Args:
         matrix: [3, 3] float64, orthogonal: a direction d of the new frame is matrix @ d in the old one. Reflections

@@ -42,7 +42,7 @@ class Quads:
         return len(self.corners)
 
     def moved(self, to: Similarity) -> Quads:
-        """The same in another frame."""
+        """Transform to another frame."""
         return replace(self, corners=to.points(self.corners))
 
 
@@ -129,7 +129,7 @@ def _read(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The texels on both sides of places [n, r] from -1 to 1 along an axis, and how far they are to the second."""
+    """The texels on both sides of positions [n, r] from -1 to 1 along an axis, and how far they are to the second."""
     last = (count - 1)[:, None]
     x = ((0.5 * (at + 1.0)) * count[:, None] - 0.5).clamp(min=0.0)
     x = torch.minimum(x, last.to(x))

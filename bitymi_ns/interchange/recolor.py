@@ -63,7 +63,7 @@ def recolored(
 
 
 def _owners(quads: Quads) -> Tensor:
-    """Of every texel of the pages, flat, the row of its quad; -1 = none."""
+    """Row of the quad of every texel of the pages, flat; -1 = none."""
     pages, height, width, _ = quads.pages.shape
     corners = quads.uv.double() * torch.tensor([width, height])  # centres of texels
     first = corners[:, 0].floor().long()

@@ -27,7 +27,7 @@ _AT_ONCE = 512
 
 @torch.no_grad()
 def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, near: float = 0.2) -> Tensor:
-    """Draws a view.
+    """Draw a view.
 
     A Gaussian of covariance S has the footprint J W S W^T J^T + 0.3 I on the image, where W is the camera's rotation
     and J the derivative of the projection at its mean. From front to back by the depths of the means, a pixel takes
@@ -68,8 +68,8 @@ def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | No
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
-    """Of what may be in the picture, from front to back: centres [M, 2] in pixels, inverse covariances [M, 3] (xx, xy,
-    yy), reaches [M], depths [M], rows [M]."""
+    """Footprints that may be in the image, from front to back: centres [M, 2] in pixels, inverse covariances [M, 3]
+    (xx, xy, yy), reaches [M], depths [M], rows [M]."""
     rotation, K = camera.viewmat[:3, :3], camera.K
     seen = gaussians.means @ rotation.T + camera.viewmat[:3, 3]
     rows = torch.nonzero(seen[:, 2] > near).squeeze(1)

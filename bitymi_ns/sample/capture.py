@@ -74,12 +74,12 @@ def render(room: Room, view: View, supersample: int = 3) -> NDArray[np.uint8]:
     origin, directions = view.rays(supersample)
     o = tuple(np.float32(a) for a in origin)
     flat = directions.reshape(-1, 3)
-    colour = np.empty_like(flat)
+    color = np.empty_like(flat)
     for start in range(0, len(flat), BAND):
         d = tuple(np.ascontiguousarray(flat[start : start + BAND, a]) for a in range(3))
-        colour[start : start + BAND] = room.colour(o, d, room.hit(o, d))
-    colour = colour.reshape(view.height, supersample, view.width, supersample, 3).mean(axis=(1, 3))
-    return (colour * 255 + 0.5).astype(np.uint8)
+        color[start : start + BAND] = room.color(o, d, room.hit(o, d))
+    color = color.reshape(view.height, supersample, view.width, supersample, 3).mean(axis=(1, 3))
+    return (color * 255 + 0.5).astype(np.uint8)
 
 
 def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], Hits]:
@@ -94,25 +94,25 @@ def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArr
 def sparse_points(
     room: Room, views: list[View], images: list[NDArray[np.uint8]], count: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """`count` exact surface points [count, 3] with their pixels' colours [count, 3], spread over all views."""
+    """`count` exact surface points [count, 3] with their pixels' colors [count, 3], spread over all views."""
     rng = np.random.default_rng([seed, 2])
-    points, colours = [], []
+    points, colors = [], []
     shares = np.diff(np.linspace(0, count, len(views) + 1).astype(int))
     for view, image, share in zip(views, images, shares, strict=True):
         pixels = rng.choice(view.width * view.height, size=share, replace=share > view.width * view.height)
         points.append(first_hits(room, view, pixels)[0])
-        colours.append(image.reshape(-1, 3)[pixels])
-    return np.concatenate(points), np.concatenate(colours)
+        colors.append(image.reshape(-1, 3)[pixels])
+    return np.concatenate(points), np.concatenate(colors)
 
 
-def write_ply(path: Path, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
-    """Binary little-endian PLY of points [n, 3] with colours [n, 3]."""
+def write_ply(path: Path, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
+    """Binary little-endian PLY of points [n, 3] with colors [n, 3]."""
     record = np.dtype([(n, "<f4") for n in ("x", "y", "z")] + [(n, "u1") for n in ("red", "green", "blue")])
     rows = np.empty(len(points), record)
     for k, name in enumerate(("x", "y", "z")):
         rows[name] = points[:, k]
     for k, name in enumerate(("red", "green", "blue")):
-        rows[name] = colours[:, k]
+        rows[name] = colors[:, k]
     kinds = {"x": "float", "y": "float", "z": "float"}
     properties = "".join(f"property {kinds.get(n, 'uchar')} {n}\n" for n in record.names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
@@ -159,7 +159,7 @@ def generate(
 
 
 def _is_sample(folder: Path) -> bool:
-    """Whether the folder is one that `generate` wrote."""
+    """Test if `generate` wrote the folder."""
     try:
         return json_of((folder / CAPTURE).read_bytes()).get("made_by") == MADE_BY
     except (OSError, ValueError, AttributeError):

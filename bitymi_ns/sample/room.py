@@ -2,7 +2,7 @@
 
 World frame: metres, x and y along the floor, z up. Rays are structures of arrays: an origin and a direction as three
 float32 arrays [n] (or scalars for a shared origin); a ray's length parameter t counts in direction lengths.
-Colours are display values in [0, 1]; the light on walls and floor is worked out once, with soft shadows, and multiplied
+Colors are display values in [0, 1]; the light on walls and floor is worked out once, with soft shadows, and multiplied
 into their textures, so that those surfaces look the same from everywhere. The sphere and the box are glossy: what they
 mirror moves with the eye.
 """
@@ -90,7 +90,7 @@ def _take(v: Vec, index: np.ndarray) -> Vec:
 
 
 class Room:
-    """The scene: textures painted and lit from a seed, and functions that trace and colour rays."""
+    """The scene: textures painted and lit from a seed, and functions that trace and color rays."""
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -147,7 +147,7 @@ class Room:
         return (total[:, None] * warm).reshape(n, n, 3).astype(np.float32)
 
     def _blocked(self, o: Vec, d: Vec) -> np.ndarray:
-        """Whether something big or a pole stands between o and o + d; [n] bool."""
+        """Test for an occluder (a big object or a pole) between o and o + d; [n] bool."""
         t = np.full(d[0].shape, 1.0, np.float32)
         hits = Hits(t, np.zeros(t.shape, np.int8), np.zeros(t.shape, np.int8))
         self._objects(o, d, hits, with_bars=True)
@@ -247,8 +247,8 @@ class Room:
         self._objects(o, d, hits)
         return hits
 
-    def colour(self, o: Vec, d: Vec, hits: Hits, mirrors: bool = True) -> Image:
-        """Colours [n, 3] of rays with unit directions; `mirrors`: follow one reflection on glossy surfaces."""
+    def color(self, o: Vec, d: Vec, hits: Hits, mirrors: bool = True) -> Image:
+        """Colors [n, 3] of rays with unit directions; `mirrors`: follow one reflection on glossy surfaces."""
         result = np.zeros((hits.t.shape[0], 3), np.float32)
         for surface in np.unique(hits.surface):
             index = np.flatnonzero(hits.surface == surface)
@@ -262,11 +262,11 @@ class Room:
                 v = (p[2] - np.float32(OUTSIDE[2])) / np.float32(OUTSIDE[3] - OUTSIDE[2])
                 result[index] = textures.lookup(self.landscape, u, v)
             else:
-                result[index] = self._object_colour(int(surface), hits.part[index], p, dd, mirrors)
+                result[index] = self._object_color(int(surface), hits.part[index], p, dd, mirrors)
         return result
 
-    def _object_colour(self, surface: int, part: np.ndarray, p: Vec, d: Vec, mirrors: bool) -> Image:
-        """Colours [n, 3] of points p [n] on one object, seen along d [n]."""
+    def _object_color(self, surface: int, part: np.ndarray, p: Vec, d: Vec, mirrors: bool) -> Image:
+        """Colors [n, 3] of points p [n] on one object, seen along d [n]."""
         n = p[0].shape[0]
         gloss = 0.0
         if surface in (SPHERE, KNOB):
@@ -303,7 +303,7 @@ class Room:
             r = tuple(d[a] + 2 * facing * normal[a] for a in range(3))
             if mirrors:
                 start = tuple(p[a] + np.float32(1e-3) * normal[a] for a in range(3))
-                seen = self.colour(start, r, self.hit(start, r), mirrors=False)
+                seen = self.color(start, r, self.hit(start, r), mirrors=False)
             else:
                 seen = np.full((n, 3), 0.4, np.float32)
             highlight = np.maximum(_dot(r, light) / distance, 0) ** 90
@@ -336,7 +336,7 @@ def _box_face(p: Vec) -> tuple[Vec, Image, Image]:
 
 
 def _side_axes(side: int) -> tuple[int, int, int]:
-    """Which world axis is the side's normal, its texture's u and its v."""
+    """World axes of the side's normal, its texture's u and its v."""
     return ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))[side]
 
 

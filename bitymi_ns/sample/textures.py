@@ -11,7 +11,7 @@ TEXELS_PER_METRE = 160.0
 
 
 def lookup(texture: Image, u: Image, v: Image) -> Image:
-    """Bilinear colour [n, 3] at u, v [n] in [0, 1] (clamped), u along the columns."""
+    """Bilinear color [n, 3] at u, v [n] in [0, 1] (clamped), u along the columns."""
     h, w = texture.shape[:2]
     x = np.clip(u * np.float32(w) - np.float32(0.5), 0, w - 1)
     y = np.clip(v * np.float32(h) - np.float32(0.5), 0, h - 1)
@@ -61,7 +61,7 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, in
 
 
 def mix(a: Image | tuple[float, ...], b: Image | tuple[float, ...], t: Image) -> Image:
-    """a (1 - t) + b t for colours [3] or [h, w, 3] and t [h, w]."""
+    """a (1 - t) + b t for colors [3] or [h, w, 3] and t [h, w]."""
     a, b = np.asarray(a, np.float32), np.asarray(b, np.float32)
     return a + (b - a) * t[..., None]
 
@@ -78,9 +78,9 @@ def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: 
     fine = noise(rng, x.shape, (100, 100), 2)
     dark = mix((0.33, 0.19, 0.10), (0.50, 0.31, 0.17), rings)
     light = mix((0.66, 0.48, 0.29), (0.85, 0.69, 0.46), rings)
-    colour = np.where(odd[..., None], dark, light) * (0.82 + 0.18 * shift + 0.2 * (fine - 0.5))[..., None]
+    color = np.where(odd[..., None], dark, light) * (0.82 + 0.18 * shift + 0.2 * (fine - 0.5))[..., None]
     gap = np.minimum(np.minimum(x % tile, tile - x % tile), np.minimum(y % tile, tile - y % tile)) < 0.008
-    return np.where(gap[..., None], np.float32(0.12), colour).astype(np.float32)
+    return np.where(gap[..., None], np.float32(0.12), color).astype(np.float32)
 
 
 def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
@@ -91,16 +91,16 @@ def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
     column = (shifted / 0.25).astype(int)
     tone = rng.random((int(row.max()) + 1, int(column.max()) + 1), dtype=np.float32)[row, column]
     speckle = noise(rng, x.shape, (60, 120), 3)
-    colour = mix((0.47, 0.20, 0.15), (0.76, 0.42, 0.30), np.clip(0.7 * tone + 0.6 * (speckle - 0.3), 0, 1))
+    color = mix((0.47, 0.20, 0.15), (0.76, 0.42, 0.30), np.clip(0.7 * tone + 0.6 * (speckle - 0.3), 0, 1))
     mortar = (y % 0.09 < 0.012) | (shifted % 0.25 < 0.012)
-    return np.where(mortar[..., None], (0.70 + 0.2 * speckle)[..., None], colour).astype(np.float32)
+    return np.where(mortar[..., None], (0.70 + 0.2 * speckle)[..., None], color).astype(np.float32)
 
 
-def plaster(rng: np.random.Generator, width_m: float, height_m: float, colour: tuple[float, float, float]) -> Image:
-    """Rough paint of one colour."""
+def plaster(rng: np.random.Generator, width_m: float, height_m: float, color: tuple[float, float, float]) -> Image:
+    """Rough paint of one color."""
     x, _ = grid(width_m, height_m)
     coarse, fine = noise(rng, x.shape, (6, 8)), noise(rng, x.shape, (80, 100), 3)
-    return (np.asarray(colour, np.float32) * (0.78 + 0.18 * coarse + 0.3 * (fine - 0.35))[..., None]).clip(0, 1)
+    return (np.asarray(color, np.float32) * (0.78 + 0.18 * coarse + 0.3 * (fine - 0.35))[..., None]).clip(0, 1)
 
 
 def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
@@ -108,10 +108,10 @@ def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Imag
     x, y = grid(width_m, height_m)
     stripe = (x / 0.16).astype(int) % 2 == 0
     diamond = np.abs((x % 0.16) - 0.08) + np.abs((y % 0.12) - 0.06) < 0.035
-    colour = np.where(stripe[..., None], np.float32([0.30, 0.48, 0.50]), np.float32([0.78, 0.76, 0.64]))
-    colour = np.where((diamond & stripe)[..., None], np.float32([0.92, 0.80, 0.42]), colour)
-    colour = np.where((diamond & ~stripe)[..., None], np.float32([0.55, 0.25, 0.28]), colour)
-    return (colour * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1).astype(np.float32)
+    color = np.where(stripe[..., None], np.float32([0.30, 0.48, 0.50]), np.float32([0.78, 0.76, 0.64]))
+    color = np.where((diamond & stripe)[..., None], np.float32([0.92, 0.80, 0.42]), color)
+    color = np.where((diamond & ~stripe)[..., None], np.float32([0.55, 0.25, 0.28]), color)
+    return (color * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1).astype(np.float32)
 
 
 def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, margin: float = 0.05) -> None:
@@ -136,7 +136,7 @@ def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, mar
 
 
 def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str) -> Image:
-    """A framed poster: `text`, `rings` (a zone-plate-like test pattern), `noise` (marble) or `bars` (colour bars)."""
+    """A framed poster: `text`, `rings` (a zone-plate-like test pattern), `noise` (marble) or `bars` (color bars)."""
     x, y = grid(width_m, height_m)
     if kind == "text":
         image = np.broadcast_to(np.float32([0.93, 0.91, 0.84]), (*x.shape, 3)).copy()
@@ -150,8 +150,8 @@ def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str)
         vein = np.abs(np.sin(18 * n + 3 * x))
         image = mix(mix((0.05, 0.30, 0.28), (0.85, 0.30, 0.20), n), (0.98, 0.93, 0.80), vein**6)
     elif kind == "bars":
-        colours = rng.random((24, 3), dtype=np.float32)
-        image = colours[(x / width_m * 24).astype(int).clip(0, 23)]
+        colors = rng.random((24, 3), dtype=np.float32)
+        image = colors[(x / width_m * 24).astype(int).clip(0, 23)]
         image = np.where(((y / height_m * 10).astype(int) % 2 == 0)[..., None], image, 1 - image)
     else:
         raise ValueError(f"unknown poster {kind!r}")
@@ -173,10 +173,10 @@ def landscape(rng: np.random.Generator) -> Image:
     image = mix((0.80, 0.88, 0.95), (0.30, 0.52, 0.86), np.clip((v - 0.35) * 1.6, 0, 1))
     image = mix(image, (0.98, 0.98, 0.98), np.clip((cloud - 0.5) * 4, 0, 1))
     ridges = [(0.52, (0.42, 0.52, 0.62)), (0.42, (0.30, 0.48, 0.34)), (0.30, (0.40, 0.56, 0.22))]
-    for k, (level, colour) in enumerate(ridges):
+    for k, (level, color) in enumerate(ridges):
         ridge = level + 0.12 * (noise(rng, (2, w), (1, 6 + 5 * k), 4)[:1] - 0.5)
         shade = 0.7 + 0.6 * noise(rng, (h, w), (20, 60), 3)
-        image = np.where((v < ridge)[..., None], np.asarray(colour, np.float32) * shade[..., None], image)
+        image = np.where((v < ridge)[..., None], np.asarray(color, np.float32) * shade[..., None], image)
     for _ in range(60):
         x, y, r = rng.uniform(0, w), rng.uniform(60, 150), rng.uniform(8, 20)
         rows, columns = slice(int(y - r), int(y + r)), slice(max(0, int(x - r)), int(x + r))

@@ -26,8 +26,6 @@ from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, photographs, render, waving
 
-SHARP = TexelCodeOptions(step=1.0)
-
 
 @pytest.fixture(scope="module")
 def truth(scene) -> Baked:
@@ -139,12 +137,3 @@ def test_texels_learn_through_their_coding_and_are_what_is_stored(rounded: Baked
     for view in views[:2]:
         want = tuned.stored().render(view.camera, BACKGROUND).rgb
         torch.testing.assert_close(bundle.scene.render(view.camera, BACKGROUND).rgb, want, rtol=1e-4, atol=1e-4)
-
-
-def test_texels_fit_into_the_bytes_there_are(rounded: Baked, views: list[View]) -> None:
-    free = with_coded_texels(rounded, SHARP).codes.texels.nbytes()
-    most = free * 6 // 10
-    assert with_coded_texels(rounded, replace(SHARP, most_bytes=most)).codes.texels.nbytes() <= most
-    options = TuneOptions(steps=4, coded_steps=10, held_in_every=4)
-    tuned = tune_atlas(rounded, views, BACKGROUND, options, coding=replace(SHARP, most_bytes=most))
-    assert tuned.codes.texels.nbytes() <= most

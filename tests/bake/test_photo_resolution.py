@@ -1,4 +1,4 @@
-"""How large the photographs show the scene."""
+"""Resolution of the photographs at points of the scene."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format,
 
 
 def test_the_layout_is_independent_of_the_run(scene):
-    one, two = bake(scene()), bake(scene())
+    one, two = bake(scene(40)), bake(scene(40))
     np.testing.assert_array_equal(one.packing.tiles, two.packing.tiles)
     assert one.atlas.payload == two.atlas.payload and one.atlas.range == two.atlas.range
 
@@ -76,7 +76,7 @@ def test_nothing_left_is_an_error(scene):
 
 
 def test_views_cap_the_tiles_and_say_what_that_saved(scene, camera):
-    made = scene(300)
+    made = scene(80)
     rule = BakeOptions(tolerance=0, drop_unseen=False)
     free = bake(made, [camera()], replace(rule, cap_by_views=False)).statistics.texels
     capped = bake(made, [camera()], rule).statistics.texels
@@ -86,7 +86,7 @@ def test_views_cap_the_tiles_and_say_what_that_saved(scene, camera):
 
 
 def test_the_papers_rule_has_one_voxel_size_and_wider_tiles(scene):
-    made = scene(200)
+    made = scene(60)
     made.field.voxel_size = lambda x: (0.02 * (1 + x.square().sum(-1, keepdim=True))).expand(-1, 2)
     rule = BakeOptions(tolerance=0, drop_unseen=False, cap_by_views=False, r_max=1024)
     local = bake(made, [], rule).statistics.texels
@@ -142,7 +142,7 @@ def test_fine_tuned_texels_are_encoded_anew(scene):
 
 
 def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
-    made = scene(200)
+    made = scene(60)
     made.field.voxel_size = lambda x: torch.tensor([0.4, 0.05]).expand(len(x), 2)
     isotropic = bake(made).statistics.texels.nyquist
     made.field.geometry = SimpleNamespace(mid=(0.0, 0.0, 0.0))

@@ -166,7 +166,7 @@ def test_damaged_files_raise_only_bundle_errors(surfels, good_bundle, data):
         path.write_bytes(good)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=60)
 @given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
                     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)), st.data())  # fmt: skip
 def test_any_json_in_any_place_raises_only_bundle_errors(surfels, good_bundle, value, data):

@@ -20,7 +20,7 @@ from tests.bundle.made import make
 from tests.cuda.baked_scenes import front, textured
 
 SMOOTH = np.zeros((300, 480, 3), np.uint8) + np.linspace(0, 255, 480).astype(np.uint8)[None, :, None]
-NOISE = np.random.default_rng(0).integers(0, 256, (300, 480, 3), dtype=np.uint8)
+NOISE = np.random.default_rng(0).integers(0, 256, (75, 120, 3), dtype=np.uint8)
 
 
 def opened(data: bytes) -> np.ndarray:
@@ -37,7 +37,7 @@ def test_it_is_what_the_camera_sees_and_small() -> None:
 
 
 def test_it_fits_its_bytes() -> None:
-    for most in (200_000, 20_000, LEAST):
+    for most in (20_000, 5_000, LEAST):
         data = encode_poster(NOISE, most)
         assert data is not None and len(data) <= most
     whole = encode_poster(SMOOTH, 20_000)
@@ -56,10 +56,6 @@ def test_it_is_listed(compact: bool, surfels, tmp_path: Path) -> None:
     entry = read_bundle(folder).info.files[POSTER]
     assert entry.bytes == (folder / POSTER).stat().st_size <= LEAST
     assert opened((folder / POSTER).read_bytes()).ndim == 3
-
-
-def test_a_bundle_can_do_without(tmp_path: Path) -> None:
-    assert POSTER not in read_bundle(write_compact(tmp_path / "b", make_codes())).info.files
 
 
 def test_it_comes_second_in_one_file_and_is_checked(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import errno
 import hashlib
 import os
-import stat
 
 import numpy as np
 import pytest
@@ -196,23 +195,3 @@ def test_a_failed_swap_puts_the_old_bundle_back(surfels, tmp_path, monkeypatch):
         make(surfels, target, overwrite=True)
     monkeypatch.undo()
     assert read_bundle(target).scene.view_color == "sg" and names_beside(target) == ["b"]
-
-
-@pytest.mark.parametrize(
-    ("number", "why"), [(errno.EROFS, "the file system is read-only"), (errno.EDQUOT, "your quota"), (errno.EIO, "I/O")]
-)
-def test_what_cannot_be_written_is_explained_by_its_cause(surfels, tmp_path, monkeypatch, number, why):
-    monkeypatch.setattr(ply, "write_ply", raiser(OSError(number, "I/O")))
-    with pytest.raises(BundleError, match=why) as error:
-        make(surfels, tmp_path / "b")
-    assert ("needs about" in str(error.value)) == (number == errno.EDQUOT)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission_is_a_clear_error(surfels, tmp_path):
-    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
-    try:
-        with pytest.raises(BundleError, match="cannot be written"):
-            make(surfels, tmp_path / "b")
-    finally:
-        tmp_path.chmod(stat.S_IRWXU)

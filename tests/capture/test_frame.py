@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bitymi_ns.capture.frame import UP, local_positions, read_frame, settle, write_frame
+from bitymi_ns.capture.frame import UP, local_positions, move_to_world, read_frame, write_frame
 
 
 def synthetic(seed: int = 0) -> pycolmap.Reconstruction:
@@ -39,7 +39,7 @@ def test_gps_gives_metres_and_up() -> None:
     model.transform(turned)
     rng = np.random.default_rng(0)
     places = {name: to_degrees(place + rng.normal(0, 2, 3)) for name, place in true.items()}
-    frame = settle(model, places)
+    frame = move_to_world(model, places)
     assert frame.up == "gps" and frame.metres_per_unit == 1 and frame.gps_error < 5
     found = centers(model)
     names = list(true)
@@ -53,20 +53,20 @@ def test_gps_gives_metres_and_up() -> None:
 def test_positions_too_close_together_say_nothing(size: float) -> None:
     model = synthetic()
     places = {name: to_degrees(size * np.random.default_rng(i).normal(size=3)) for i, name in enumerate(centers(model))}
-    frame = settle(model, places)
+    frame = move_to_world(model, places)
     assert frame.up == "cameras" and frame.metres_per_unit is None and frame.gps_positions == 12
 
 
 def test_positions_of_another_shape_are_not_believed() -> None:
     model = synthetic()
     rng = np.random.default_rng(0)
-    frame = settle(model, {name: to_degrees(rng.normal(0, 200, 3)) for name in centers(model)})
+    frame = move_to_world(model, {name: to_degrees(rng.normal(0, 200, 3)) for name in centers(model)})
     assert frame.metres_per_unit is None
 
 
 def test_without_gps_up_is_that_of_the_cameras() -> None:
     model = synthetic()
-    frame = settle(model, {})
+    frame = move_to_world(model, {})
     ups = [-image.cam_from_world().rotation.matrix()[1] for image in model.images.values()]
     mean = np.mean(ups, axis=0)
     assert frame.up == "cameras" and mean @ [0, 0, 1] == pytest.approx(np.linalg.norm(mean), rel=1e-6)
@@ -90,7 +90,7 @@ def held(model: pycolmap.Reconstruction, up: np.ndarray, wrong: int = 0) -> dict
 def test_up_is_what_most_accelerometers_say(wrong: int, source: str) -> None:
     model = synthetic()
     up = np.array([0.36, 0.48, 0.8])
-    frame = settle(model, {}, held(model, up, wrong))
+    frame = move_to_world(model, {}, held(model, up, wrong))
     assert frame.up == source and frame.metres_per_unit is None
     if source == "gravity":
         assert np.array(frame.transform)[2, :3] @ up / np.linalg.norm(np.array(frame.transform)[2, :3]) > 0.9998
@@ -98,7 +98,7 @@ def test_up_is_what_most_accelerometers_say(wrong: int, source: str) -> None:
 
 def test_two_accelerometers_are_too_few() -> None:
     model = synthetic()
-    assert settle(model, {}, dict(list(held(model, np.array(UP)).items())[:2])).up == "cameras"
+    assert move_to_world(model, {}, dict(list(held(model, np.array(UP)).items())[:2])).up == "cameras"
 
 
 def test_gravity_says_what_is_up_and_gps_how_long_a_metre_is() -> None:
@@ -108,7 +108,7 @@ def test_gravity_says_what_is_up_and_gps_how_long_a_metre_is() -> None:
     ups = held(model, np.array(UP))
     rng = np.random.default_rng(0)
     places = {name: to_degrees(place + rng.normal(0, 4, 3)) for name, place in true.items()}
-    frame = settle(model, places, ups)
+    frame = move_to_world(model, places, ups)
     assert frame.up == "gravity" and frame.metres_per_unit == 1 and frame.gps_error < 10
     turn = np.array(frame.transform)[:, :3]
     assert turn[2] @ UP / np.linalg.norm(turn[2]) > 0.9998
@@ -118,6 +118,6 @@ def test_gravity_says_what_is_up_and_gps_how_long_a_metre_is() -> None:
 
 
 def test_the_frame_is_read_as_it_was_written(tmp_path: Path) -> None:
-    frame = settle(synthetic(), {})
+    frame = move_to_world(synthetic(), {})
     write_frame(tmp_path, frame)
     assert read_frame(tmp_path) == frame

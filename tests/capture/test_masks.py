@@ -56,7 +56,7 @@ def test_a_folder_of_smaller_masks_alone(tmp_path: Path) -> None:
     for name in ("images", "masks_2"):
         (tmp_path / name).mkdir()
     assert mask_folder(tmp_path / "images", tmp_path) is None
-    assert mask_folder(tmp_path / "images", tmp_path, reduction=2) == tmp_path / "masks"
+    assert mask_folder(tmp_path / "images", tmp_path, downscale=2) == tmp_path / "masks"
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import CaptureError, find_poses
-from bitymi_ns.capture.panorama import says_so, shows_so
+from bitymi_ns.capture.panorama import has_panorama_metadata, looks_panoramic
 from bitymi_ns.sample.room import Room
 
 XMP = (
@@ -47,7 +47,7 @@ def room_of_tests() -> Room:
 def shaded(rays: np.ndarray, centre: tuple[float, float, float]) -> np.ndarray:
     room, flat = room_of_tests(), rays.reshape(-1, 3).astype(np.float32)
     origin, direction = tuple(np.full(len(flat), c, np.float32) for c in centre), tuple(flat.T)
-    colours = np.asarray(room.colour(origin, direction, room.hit(origin, direction)))
+    colours = np.asarray(room.color(origin, direction, room.hit(origin, direction)))
     colours = colours if colours.shape[-1] == 3 else colours.T
     return np.uint8(np.clip(colours, 0.0, 1.0) * 255.0 + 0.5).reshape(rays.shape)
 
@@ -58,9 +58,9 @@ def grey(pixels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("turn", [0.0, 2.2])
 def test_what_pictures_show(turn: float) -> None:
-    assert shows_so(grey(panorama(turn, centre=(0.5, -0.4, 1.3))))
-    assert not shows_so(grey(photograph(turn)))
-    assert not shows_so(grey(panorama(turn))[:, 8:-8])  # another shape
+    assert looks_panoramic(grey(panorama(turn, centre=(0.5, -0.4, 1.3))))
+    assert not looks_panoramic(grey(photograph(turn)))
+    assert not looks_panoramic(grey(panorama(turn))[:, 8:-8])  # another shape
 
 
 def test_other_pictures_of_that_shape() -> None:
@@ -68,7 +68,7 @@ def test_other_pictures_of_that_shape() -> None:
     product = np.where(np.hypot(x - 128, y - 64) < 40, 90.0, 245.0)  # on a white background
     sea = np.where(y < 60, 200.0 - y, 90.0) + np.random.default_rng(0).normal(0, 12, (128, 256)) * (y > 60)
     for pixels in (product, sea, np.zeros((128, 256)), np.random.default_rng(1).uniform(0, 255, (128, 256))):
-        assert not shows_so(pixels.astype(np.float32))
+        assert not looks_panoramic(pixels.astype(np.float32))
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
@@ -87,7 +87,11 @@ def test_what_metadata_say(tmp_path: Path, suffix: str) -> None:
         )
     marked.write_bytes(data)
     Image.open(marked).load()
-    assert says_so(marked) and not says_so(plain) and not says_so(tmp_path / "none.jpg")
+    assert (
+        has_panorama_metadata(marked)
+        and not has_panorama_metadata(plain)
+        and not has_panorama_metadata(tmp_path / "none.jpg")
+    )
 
 
 def test_they_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

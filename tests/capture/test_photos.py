@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from bitymi_ns.capture.photos import find_photos, in_srgb, natural, photo_folder, read_photo, read_photos, upright
-from bitymi_ns.capture.selection import blurred, duplicates
+from bitymi_ns.capture.photos import (
+    blurred,
+    duplicates,
+    find_photos,
+    in_srgb,
+    natural,
+    photo_folder,
+    read_photo,
+    read_photos,
+    upright,
+)
 from bitymi_ns.capture.types import CaptureError
 from tests.profiles import DISPLAY_P3, SRGB
 

@@ -121,7 +121,7 @@ def test_sphere_mirrors() -> None:
         d = np.float32(d / np.linalg.norm(d))
         o = tuple(np.float32(a) for a in eye)
         rays = tuple(np.array([a], np.float32) for a in d)
-        return room.colour(o, rays, room.hit(o, rays))[0]
+        return room.color(o, rays, room.hit(o, rays))[0]
 
     a, b = [-1.5, -1.8, 1.2], [0.6, -1.9, 0.9]
     angles = np.linspace(-0.5, 1.3, 12)

@@ -44,7 +44,7 @@ class TileErrors:
         return TileError(tolerance=tolerance, unit=unit, rms=rms, largest=largest)
 
     def certificate(self, tolerance: float) -> Certificate | None:
-        """How many of these surfels are within the tolerance as they are seen; None without one."""
+        """Certificate of these surfels; None without a tolerance."""
         return Certificate.of(self.seen[self.shown], tolerance, "field") if tolerance else None
 
 
@@ -58,7 +58,7 @@ def tile_errors(
     chunk: int = 1 << 18,
     progress: Progress = no_progress,
 ) -> TileErrors:
-    """Compares stored tiles with the field on the grids of the plan.
+    """Compare stored tiles with the field on the grids of the plan.
 
     Args:
         field: the residual field.

@@ -1,4 +1,4 @@
-"""The field without the levels that a scene does not need: the bake then loads less of it at every point."""
+"""Removal of the levels of a field that a scene does not need."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bitymi_ns.train.rotations import tangents
 LEVEL_SHARE = 0.1
 """Levels are left out while they change the residual by no more than this share of the tolerance."""
 POINTS = 16
-"""Places a surfel at which the field is looked at."""
+"""Points per surfel at which the field is evaluated."""
 _CHUNK = 1 << 19
 
 
@@ -30,9 +30,9 @@ def level_changes(
     transmittance: Tensor | None = None,
     weight_bound: float = 0.0,
 ) -> Tensor:
-    """How far the residual of every surfel changes when the features of some levels are 0, in 8-bit steps.
+    """Change of every surfel's residual when the features of some levels are 0, in 8-bit steps.
 
-    Root mean square over points of the kernel's support (even over the disc, the same lot for every surfel) and the
+    Root mean square over points of the kernel's support (even over the disc, the same for every surfel) and the
     channels, of the change times the largest blending weight there: the measure of the tiles' tolerance. Points whose
     weight stays below `weight_bound` get no residual and are not counted.
 
@@ -78,7 +78,7 @@ def lean_field(
     weight_bound: float,
     tolerance: float,
 ) -> tuple[HashField, FieldLevels]:
-    """The field without its finest and coarsest levels, as far as no surfel needs them.
+    """Remove the finest and coarsest levels of a field, as far as no surfel needs them.
 
     The levels that stay are consecutive, so they are a field again. The finest levels are left out first, then the
     coarsest, as long as all that is left out together changes no surfel (`level_changes`) by more than LEVEL_SHARE of

@@ -48,7 +48,7 @@ class Plan(Shown):
         edges: [N, 3, 2] tangent directions times scales, world units.
         probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
         limit: [N, 2] int32, the finest tile of use, at most `probes`.
-        texels: how many texels the rules before the tolerance give.
+        texels: number of texels by the rules before the tolerance.
     """
 
     means: Tensor
@@ -117,7 +117,7 @@ def make_plan(
 
 
 def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:
-    """How many texels the paper's rule gives: one voxel size, the smallest, and tiles of extent 4.
+    """Number of texels by the paper's rule: the smallest voxel size everywhere, and tiles of extent 4.
 
     Args:
         surfels: means [N, 3], log_scales [N, 2] of all surfels that can be drawn.

@@ -1,4 +1,4 @@
-"""Why photographs have no pose, and what to photograph differently."""
+"""Reasons why photographs have no pose, with advice on what to photograph differently."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SHOOT = (
 
 @dataclass(frozen=True)
 class ViewGraph:
-    """Which photographs were found to show the same."""
+    """Matches between photographs."""
 
     features: dict[str, int]
     """Per photograph."""
@@ -73,12 +73,12 @@ def view_graph(database: Path) -> ViewGraph:
 
 
 def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[str, str]:
-    """Why the photographs that were not placed were not, by name.
+    """Explain by name why photographs have no pose.
 
     Args:
         graph: of all photographs.
         placed: those that have a pose.
-        title: what each is called for people.
+        title: names of the photographs for messages.
     """
     best: Counter[str] = Counter()
     with_placed: Counter[str] = Counter()
@@ -104,7 +104,7 @@ def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[
 
 
 def why_none(job: Job, graph: ViewGraph) -> NoPoses:
-    """Why there is no model at all."""
+    """Explain why there is no model at all."""
     count = len(job.order)
     bare = sum(features < FEW_FEATURES for features in graph.features.values())
     if bare > count / 2:
@@ -143,7 +143,7 @@ def parallax(model: pycolmap.Reconstruction) -> float:
 
 
 def only_turned(job: Job, database: Path) -> bool:
-    """Whether a turn of the camera alone explains most pairs: the matches fit K R K^-1 for some focal length."""
+    """Test if pure rotation explains most pairs: the matches fit K R K^-1 for some focal length."""
     groups = {name: group for group in job.cameras for name in group.names}
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}

@@ -1,4 +1,4 @@
-"""What the process that runs COLMAP is told, and what it tells."""
+"""Input and messages of the process that runs COLMAP."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from typing import Protocol
 DATABASE = "database.db"
 PAIRS = "pairs.txt"
 MODEL = "model"
-"""Names within the folder of the work: COLMAP's database, the pairs to be compared, and the model that comes out."""
+"""Names in the work folder: COLMAP's database, the pairs to match, and the resulting model."""
 
 SERIAL = 100
-"""Up to so many photographs cameras and points are placed by one thread. Of 50 photographs two take as long."""
+"""Number of photographs up to which one thread maps, so that runs are equal. For 50, two threads are no faster."""
 
 
 class StageProgress(Protocol):
-    """Gets the stage, how much of it is done, how much there is, and the table of the database whose rows say how much
-    is done from now on."""
+    """Receives the stage, its progress and total, and the database table whose rows count the progress from now on."""
 
     def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None: ...
 
@@ -32,28 +31,29 @@ class CameraGroup:
     params: list[float]
     """In COLMAP's order, pixels of the photographs."""
     prior: bool
-    """Whether the focal length is known, and not just a first guess."""
+    """True if the focal length is known, and not just an initial guess."""
     names: list[str]
     """Photographs, relative to the folder of images."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything the process needs; plain values, so that it can be sent as JSON."""
+    """Input of the process, in plain values for JSON."""
 
     work: str
     """Folder for the database and the model."""
     images: str
-    """Folder of the photographs, or of links to them. Their names here have no spaces, which COLMAP's lists part by."""
+    """Folder of the photographs, or of links to them, with names without spaces, which separate entries of COLMAP's
+    lists."""
     masks: str | None
     """Folder of masks named as COLMAP has it, of the size of the photographs."""
     cameras: list[CameraGroup]
     order: list[str]
     """All photographs in the order of their times or names."""
     names: dict[str, str]
-    """What each is called in the model that comes out."""
+    """Names of the photographs in the resulting model."""
     sequence: bool
-    """Whether it is known that neighbours in that order overlap, as frames of a video do."""
+    """True if neighbors in that order overlap, as frames of a video do."""
     positions: dict[str, list[float]]
     """East, north and up in metres of photographs with GPS."""
     matching: str = "auto"

@@ -1,4 +1,4 @@
-"""Which photographs are compared, and comparing them."""
+"""Selection and matching of pairs of photographs."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int
 
 
 def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
-    """How many of their largest features two photographs share.
+    """Count the largest features that pairs of photographs share.
 
     Returns:
         [n,n] counts; 0 on the diagonal.
@@ -135,7 +135,7 @@ def sequence(count: int) -> set[tuple[int, int]]:
 
 
 def is_sequence(alike: np.ndarray) -> bool:
-    """Whether neighbours in the order look as alike as any."""
+    """Test if neighbors in the order are as similar as any photographs."""
     count = len(alike)
     rank = [(alike[i] > alike[i, i + 1]).sum() for i in range(count - 1) if alike[i, i + 1] > 0]
     return sum(r < NEIGHBOURS / 2 for r in rank) >= SEQUENCE_SHARE * (count - 1)

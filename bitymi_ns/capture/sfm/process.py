@@ -103,8 +103,7 @@ class _Watch:
 
 
 def rows(database: Path, table: str) -> int:
-    """How many rows a table of a database has; 0 while it cannot be read. Not for a process that has opened it by
-    COLMAP."""
+    """Count the rows of a database table; 0 while it cannot be read. Not for a process in which COLMAP has it open."""
     try:
         connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
         try:

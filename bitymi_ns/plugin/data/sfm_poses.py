@@ -52,7 +52,7 @@ class KeptPoses:
         return self.folder / IMAGES if self.origin.photographs is None else capture / self.origin.photographs
 
     def found(self, data: Path) -> Found:
-        """What to read at `data`, folder or file, whatever else lies beside it by now."""
+        """Return the capture at `data`, folder or file, whatever else lies beside it by now."""
         folder = data if data.is_dir() else data.parent
         return Found(self.origin.kind, folder / self.origin.path, folder)
 

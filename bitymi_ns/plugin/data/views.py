@@ -58,7 +58,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """How a capture's frame becomes that of training; as in nerfstudio's parsers."""
+    """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
 
     scale_factor: float = 1.0
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"

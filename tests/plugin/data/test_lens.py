@@ -37,7 +37,7 @@ def picture(one: Lens) -> np.ndarray:
     return np.asarray(one.undistort(Image.fromarray(np.round(image).astype(np.uint8)))).astype(float)
 
 
-@pytest.mark.parametrize("f", [30.0, 60.0, 120.0])
+@pytest.mark.parametrize("f", [30.0, 120.0])
 @pytest.mark.parametrize("model", MODELS)
 def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) -> None:
     one, _ = make_lens(model, camera_of(model, f), *SIZE, SIZE, "camera 1")

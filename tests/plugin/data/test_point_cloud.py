@@ -125,8 +125,15 @@ def colored(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("format", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize(("kind", "white"), [("float", 1), ("double", 1), ("float", 255), ("ushort", 65535)])
+@pytest.mark.parametrize(
+    ("format", "kind", "white"),
+    [
+        ("ascii", "float", 1),
+        ("binary_little_endian", "double", 1),
+        ("binary_big_endian", "float", 255),
+        ("ascii", "ushort", 65535),
+    ],
+)
 def test_colors_that_are_no_bytes(tmp_path: Path, format: str, kind: str, white: int) -> None:
     bytes_of = np.uint8([[0, 128, 255], [7, 66, 200]])
     values = bytes_of * (white / 255) if kind != "ushort" else bytes_of.astype(int) * 257

@@ -14,13 +14,12 @@ import pycolmap
 import pytest
 import torch
 from nerfstudio.cameras.camera_utils import fisheye624_project
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.export.command import world_of
-from tests.plugin.data.captures import colmap_model, expect, images_of, load_any, load_with, printed
+from tests.plugin.data.captures import colmap_model, expect, images_of, load_any, printed
 
 UTM = np.array([500123.0, 4649876.0, 312.0])
 Edit = Callable[[Path, Callable[[dict[str, Any]], Any]], None]
@@ -308,14 +307,12 @@ def test_photographs_outside_of_the_capture_are_named(
 # files of a model, and sizes
 
 
-@pytest.mark.parametrize("wrong", ["nan 40 24 18", "40 inf 24 18", "40 40 24 nan"])
+@pytest.mark.parametrize("wrong", ["nan 40 24 18", "40 40 24 inf"])
 def test_the_camera_of_a_model_that_is_no_number(project: Path, wrong: str) -> None:
     path = project / "sparse/0/cameras.txt"
     path.write_text("# cameras\n" + path.read_text().replace("40 40 24 18", wrong))
     with expect(rf"{path}, line 2: camera 1 \(PINHOLE 48 36 {wrong}\) cannot be used"):
         load_any(project)
-    with expect("camera 1 .* cannot be used"):
-        load_with(project, ColmapDataParserConfig(colmap_path=Path("sparse/0")))
 
 
 def test_points_of_a_model_in_a_ply_file_alone(project: Path) -> None:

@@ -1,4 +1,4 @@
-"""How large the scene was photographed, in bundle.json."""
+"""Resolution of the photographs in bundle.json."""
 
 from __future__ import annotations
 

@@ -27,11 +27,12 @@ from bitymi_ns import bundle
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
 from bitymi_ns.plugin.run.preset import Preset, load_preset
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.train.config import REFERENCE_STEPS
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.losses import mean_psnr, psnr
-from bitymi_ns.train.views import judging_background
+from bitymi_ns.train.views import eval_background
 
 CURVE = ("steps", "training s", "surfels", "PSNR dB", "after affine fit")
 FIGURES = ("peak MB", "waits a step", "frames/s", "bake s", "atlas MB", "baked PSNR dB", "baked frames/s")
@@ -102,7 +103,7 @@ def run(
     with torch.no_grad():
         frame = milliseconds(lambda: scene.render(camera, field_mode="frozen"), options)
     start = time.perf_counter()
-    background = judging_background(preset.train, torch.device("cpu"))
+    background = eval_background(preset.train, torch.device("cpu"))
     cameras = [view.camera.to(device) for view in capture.train]
     made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning())  # without fine-tuning
     bake_seconds = time.perf_counter() - start
@@ -116,7 +117,7 @@ def run(
 
 
 def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.device) -> float:
-    background = judging_background(preset.train, device)
+    background = eval_background(preset.train, device)
     values = []
     for view in (view.to(device) for view in capture.held_out):
         rgb = baked.render(view.camera, background).rgb.clamp(0, 1)
@@ -149,7 +150,7 @@ def main() -> int:
     capture = load_capture(arguments.data.expanduser(), downscale=arguments.downscale)
     preset = preset_of(arguments.preset, arguments.options)
     options = Options(device, arguments.warm_up, arguments.runs)
-    steps = arguments.steps or preset.trainer.iterations
+    steps = arguments.steps or REFERENCE_STEPS
     name = "-".join([arguments.preset, *(o.rpartition(".")[2].replace("=", "-") for o in arguments.options)])
     with tempfile.TemporaryDirectory() as folder:
         target = (arguments.keep or Path(folder)) / f"{name}-{steps}"

@@ -4,7 +4,7 @@ are nerfstudio's own commands: ns-train, ns-export, ns-eval)."""
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Literal, TextIO
@@ -50,17 +50,9 @@ class Sample:
     def run(self) -> None:
         from bitymi_ns import sample
 
+        options = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "output_dir"}
         with explained(self.output_dir, ValueError):
-            folder = sample.generate(
-                self.output_dir,
-                views=self.views,
-                width=self.width,
-                height=self.height,
-                seed=self.seed,
-                points=self.points,
-                overwrite=self.overwrite,
-                progress=True,
-            )
+            folder = sample.generate(self.output_dir, **options, progress=True)
         say(f"Wrote {self.views} images and {self.points} points to {folder}")
 
 
@@ -71,7 +63,7 @@ class Sfm:
     source: tyro.conf.Positional[Path]
     """Folder of photographs (or with `images`, and `masks`, in it), or a video."""
     output: Path | None = None
-    """Folder to write the capture to; none = the poses are kept beside the photographs, and their place is printed."""
+    """Folder to write the capture to; none = the poses are kept beside the photographs, and their folder is printed."""
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
@@ -155,11 +147,10 @@ class BenchKnobs:
     repeats: int = 3
     """Timed renderings of each view; the median counts."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns.measure.knobs import measure_to_file
 
         measure_to_file(self.load_config, self.output, self.knobs, self.views, self.repeats)
-        return 0
 
 
 @dataclass
@@ -171,13 +162,12 @@ class BenchPictures:
     output_dir: Path = Path("pictures")
     """Folder for the PNG files and pictures.json."""
     views: int = 2
-    """How many of the worst views."""
+    """Number of worst views."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns.measure.pictures import draw_worst
 
         draw_worst(self.load_config, self.output_dir, self.views)
-        return 0
 
 
 def _suite(name: str, description: str) -> object:
@@ -206,7 +196,7 @@ class Bench:
 
 @dataclass
 class Verify:
-    """Check a bundle: files, hashes, formats, tiles; and against the run it was baked from, where that is found."""
+    """Check a bundle: files, hashes, formats, tiles; and optionally against the run it was baked from."""
 
     bundle: tyro.conf.Positional[Path]
     """Folder of the bundle, or its one file (bitymi pack)."""
@@ -224,7 +214,7 @@ class Verify:
 
         bundle, checks = check_files(self.bundle)
         if bundle is not None and self.run_config is not None:
-            from bitymi_ns.plugin.export.verify import check_run
+            from bitymi_ns.plugin.export.trained import check_run
 
             checks += check_run(bundle, self.run_config, self.views)
         table = Table("", "check", "result", title=escape(printable(f"Bundle {self.bundle}")))
@@ -251,8 +241,7 @@ def _say_left_out(names: Sequence[str]) -> None:
 
 @dataclass
 class Pack:
-    """Write a bundle as one file, its parts in the order of their use; verify and the loaders take it as they take the
-    folder."""
+    """Write a bundle as one file, its parts in the order of their use; everything reads it like the folder."""
 
     bundle: tyro.conf.Positional[Path]
     """Folder of the bundle, or its one file."""
@@ -261,21 +250,20 @@ class Pack:
     overwrite: Flag = False
     """Replace a bundle in one file that is there already."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
         from bitymi_ns.files import size_text
 
         bundle = Path(os.path.realpath(self.bundle))
         output = self.output or bundle.with_name(bundle.name + SUFFIX)
         if output.exists() and not self.overwrite:
-            raise ValueError(f"{output} is there already: choose another place (--output), or add --overwrite")
+            raise ValueError(f"{output} is there already: choose another path (--output), or add --overwrite")
         if output.exists() and not is_single(output):
-            raise ValueError(f"{output} is no bundle and is not replaced: choose another place (--output)")
+            raise ValueError(f"{output} is no bundle and is not replaced: choose another path (--output)")
         with explained(output, ValueError):
             written = write_single(bundle, output)
         _say_left_out(written.left_out)
         say(f"Wrote {output}, {size_text(written.bytes)}; the surfels are in its first {size_text(written.first)}.")
-        return 0
 
 
 @dataclass
@@ -293,7 +281,7 @@ class Extras:
     overwrite: Flag = False
     """Replace a folder of extras that is there already."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         from bitymi_ns import interchange
         from bitymi_ns.bundle import read_bundle
         from bitymi_ns.progress import rich_progress
@@ -318,7 +306,6 @@ class Extras:
             say(interchange.summary_line(each))
         if not found.train:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
-        return 0
 
 
 @dataclass
@@ -334,14 +321,13 @@ class View:
     overwrite: Flag = False
     """Replace a page that was exported there before."""
     host: str = "127.0.0.1"
-    """Address to listen at. Any other than a loopback address shows the bundle to everyone who can reach this
-    machine."""
+    """Address to listen at. Others than loopback addresses show the bundle to all who can reach this machine."""
     port: int = 0
     """Port to listen at; 0 = any that is free."""
     open_browser: bool = True
     """Open the page in the browser."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         import webbrowser
 
         from bitymi_ns import view
@@ -355,7 +341,7 @@ class View:
             with explained(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)
             say(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
-            return 0
+            return
         server = view.serve(site, self.host, self.port)
         address = view.address_of(server)
         if not view.is_loopback(server):
@@ -366,10 +352,9 @@ class View:
                 webbrowser.open(address)
             server.serve_forever()
         except KeyboardInterrupt:
-            return 0
+            pass
         finally:
             server.server_close()
-        return 0
 
 
 Command = (
@@ -401,12 +386,11 @@ def main(args: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, BenchError, KernelsUnavailable) as error:
         say(f"bitymi: {error}", sys.stderr)
         return 1
-    except MemoryError:
-        say("bitymi: there is not enough memory for this; nothing was left half-written", sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        say("bitymi: interrupted, nothing was left half-written", sys.stderr)
-        return 130
+    except (MemoryError, KeyboardInterrupt) as error:
+        interrupted = isinstance(error, KeyboardInterrupt)
+        why = "interrupted" if interrupted else "there is not enough memory for this"
+        say(f"bitymi: {why}; nothing was left half-written", sys.stderr)
+        return 130 if interrupted else 1
 
 
 if __name__ == "__main__":

@@ -17,11 +17,3 @@ def preset_dir() -> Path:
 def preset_names() -> list[str]:
     """Names of all presets, sorted."""
     return sorted(path.stem for path in preset_dir().glob("*.yaml"))
-
-
-def preset_path(name: str) -> Path:
-    """The YAML file of the preset `name` (a method name such as "bitymi-quality")."""
-    path = preset_dir() / f"{name}.yaml"
-    if not path.is_file():
-        raise FileNotFoundError(f'no preset named "{name}"; there are: {", ".join(preset_names()) or "none"}')
-    return path

@@ -25,7 +25,7 @@ from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.matrix import read_plan
 from bitymi_ns.measure.bench.process import BenchError, run_measured
-from bitymi_ns.plugin.run.curve import TrainingCurve
+from bitymi_ns.plugin.run.callbacks import TrainingCurve
 from bitymi_ns.plugin.run.run_folder import keep_poses_report
 from bitymi_ns.trust import Refused, inside, is_own, json_of, keep, no_links, own_folder, printable
 

@@ -29,8 +29,7 @@ from bitymi_ns.ops.backend import require
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.memory import MemoryBudget
-from bitymi_ns.train.views import View, shown
+from bitymi_ns.train.views import MemoryBudget, View, shown
 
 
 @dataclass

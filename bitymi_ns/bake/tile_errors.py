@@ -13,7 +13,7 @@ from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import TexelTiles
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import max_projected_extent
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 _CONSTANT = (8, 8)
 """Grid on which the weight of a surfel without a tile is evaluated."""

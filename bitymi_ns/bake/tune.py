@@ -18,9 +18,8 @@ from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.losses import numbers, photometric
-from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.schedules import falling
-from bitymi_ns.train.views import View, training_order
+from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
 
 
 @dataclass

@@ -5,10 +5,9 @@ import sys
 
 _RENAMED = {
     **{name: f"data.{name}" for name in ("datamanager", "dataparser", "dataset")},
-    **{
-        name: f"run.{name}"
-        for name in ("bundle_config", "bundle_model", "config", "model", "pipeline", "surfel_model", "trainer")
-    },
+    **{name: f"run.{name}" for name in ("bundle_model", "config", "model", "surfel_model", "trainer")},
+    "bundle_config": "run.bundle_model",
+    "pipeline": "run.trainer",
 }
 
 for _old, _new in _RENAMED.items():

@@ -13,7 +13,7 @@ from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters, next_power_of_two
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 MASK = 0.5
 """Texels whose alpha is read as less are not drawn."""

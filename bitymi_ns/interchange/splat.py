@@ -14,7 +14,7 @@ from bitymi_ns.interchange import harmonics
 from bitymi_ns.interchange.gaussians import Gaussians
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, TILE, TRANSMITTANCE_MIN
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 DILATION = 0.3
 """Pixels squared that 3DGS adds to the variances of a footprint."""

@@ -18,10 +18,10 @@ from bitymi_ns.bake import Baked, BakeOptions, Learning, baked_and_reduced, rich
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.errors import fail, say
-from bitymi_ns.plugin.export.command import load_trained, replace_file
-from bitymi_ns.plugin.export.target import see_writable
+from bitymi_ns.plugin.export.target import replace_file, require_writable
+from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
@@ -259,7 +259,7 @@ def measure_to_file(load_config: Path, output: Path, knobs: Sequence[str], views
         fail(f"--repeats must be at least 1, not {repeats}")
     if not output.parent.is_dir():
         fail(f"there is no folder {output.parent} for {output.name}")
-    see_writable(output)
+    require_writable(output)
     config, pipeline = load_trained(load_config)
     held_out = HeldOut(pipeline, views)
     about = {"scene": config.experiment_name, "method": config.method_name, "views": len(held_out.cameras)}

@@ -14,14 +14,14 @@ from torch import Tensor
 from bitymi_ns.files import reason
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.ops import composite
-from bitymi_ns.plugin.errors import fail, say
-from bitymi_ns.plugin.export.command import load_trained, replace_file
-from bitymi_ns.plugin.export.target import see_writable
+from bitymi_ns.plugin.console import fail, say
+from bitymi_ns.plugin.export.target import replace_file, require_writable
+from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.plugin.run.surfel_model import OVERDRAW_SCALE
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 from bitymi_ns.train.views import as_bytes
 
 RESIDUAL_GAIN = 4.0
@@ -108,7 +108,7 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    see_writable(output_dir / FILE)
+    require_writable(output_dir / FILE)
     config, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     count = len(datamanager.eval_dataset)

@@ -1,12 +1,12 @@
-"""What nerfstudio and its viewer say about themselves, kept off the console while one of our runs starts."""
+"""Console messages: errors without a traceback, warnings, a step bar; filtering of nerfstudio's own lines."""
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import rich
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,6 +14,8 @@ from rich.errors import MarkupError
 from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bitymi_ns.trust import printable
 
 REMARKS = re.compile(
     r"Saving config to|Saving checkpoints to"  # our summary of the run says where
@@ -25,7 +27,7 @@ REMARKS = re.compile(
 
 
 @contextmanager
-def quiet_host() -> Iterator[None]:
+def filter_console() -> Iterator[None]:
     """Drop these lines, the box in which the viewer's server states its address, and torch's
     warnings about nerfstudio's code. Afterwards all is as before: other methods are not concerned."""
 
@@ -36,7 +38,7 @@ def quiet_host() -> Iterator[None]:
         return isinstance(said, Panel) and "viser" in str(said.title)
 
     with (
-        quiet_warnings(),
+        ignore_torch_warnings(),
         _dropping(CONSOLE, "print", remark),
         _dropping(CONSOLE, "log", remark, _stack_offset=2),  # it states its caller
         _dropping(rich, "print", box),
@@ -45,7 +47,7 @@ def quiet_host() -> Iterator[None]:
 
 
 @contextmanager
-def quiet_warnings() -> Iterator[None]:
+def ignore_torch_warnings() -> Iterator[None]:
     """Ignore torch's warnings about nerfstudio's code: nobody can heed them here."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
@@ -89,3 +91,38 @@ def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
     with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=not terminal) as bar:
         task = bar.add_task("", completed=done, total=total)
         yield lambda step: bar.update(task, completed=step + 1)
+
+
+class InputError(SystemExit):
+    """Something about the input is wrong. Python prints the message to stderr and exits with status 1.
+
+    A SystemExit rather than an Exception: nerfstudio's commands have no error handling of their own, and a traceback
+    through them hides what the user can do about it.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(f"bitymi: {message}"))
+
+    def __str__(self) -> str:
+        return str(self.code)
+
+
+def fail(message: str, cause: BaseException | None = None) -> NoReturn:
+    """Raise InputError(message), remembering `cause` for debuggers."""
+    raise InputError(message) from cause
+
+
+def say(message: str) -> None:
+    """Tell the user something, in one line however long it is; brackets in it are no markup."""
+    CONSOLE.print(escape(printable(message)), soft_wrap=True)
+
+
+def warn(message: str) -> None:
+    """Tell the user about something that goes on without what it should have had."""
+    CONSOLE.print(f"[bold yellow]{escape(printable(message))}", soft_wrap=True)
+
+
+def listed(names: Sequence[object], most: int = 3) -> str:
+    """The first few names, and how many more there are."""
+    shown = ", ".join(str(name) for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

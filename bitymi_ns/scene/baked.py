@@ -20,6 +20,15 @@ FAST = 1 / 512
 """Transmittance at which a pixel ends that is drawn for speed: half of an 8-bit step of light is left."""
 
 
+OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
+"""Fields of a `BakedOutput`."""
+
+
+def image_names(maps: bool) -> tuple[str, ...]:
+    """Images to draw for a `BakedOutput`, names of `ops.baked.IMAGES`."""
+    return OUTPUTS if maps else OUTPUTS[:2]
+
+
 @dataclass
 class BakedOutput:
     """A view of a baked scene; the fields mean what they mean in `scene.RenderOutput`."""
@@ -113,8 +122,7 @@ class BakedScene:
         the scene smaller or larger than the photographs do is drawn for its size (`sampling`); overdraw is then that of
         all samples of a pixel.
 
-        On a CUDA device this waits for the image, to see whether its working memory was large enough;
-        `baked_renderer.BakedRenderer` does not.
+        On a CUDA device this allocates its images and waits for them; `baked_renderer` keeps memory and CUDA graphs.
 
         Args:
             camera: the view.
@@ -124,9 +132,8 @@ class BakedScene:
         Raises:
             ValueError: the scene is on the CPU, and its atlas only as BC7 blocks.
         """
-        names = ("rgb", "alpha", *(("beta", "depth", "normal", "overdraw") if maps else ()))
-        images = {name: image[0] for name, image in self._draw([camera], background, names).items()}
-        return BakedOutput(*(images.get(name) for name in ("rgb", "alpha", "beta", "depth", "normal", "overdraw")))
+        images = {name: image[0] for name, image in self._draw([camera], background, image_names(maps)).items()}
+        return BakedOutput(*map(images.get, OUTPUTS))
 
     @torch.no_grad()
     def render_views(

@@ -1,8 +1,9 @@
-"""Frames of a baked scene on a CUDA device at the highest rate: memory that stays, no waiting, a recorded graph."""
+"""Rendering a baked scene frame after frame: working memory that is kept and, on a card, CUDA graphs."""
 
 from __future__ import annotations
 
 import gc
+import threading
 from collections.abc import Sequence
 
 import torch
@@ -11,8 +12,9 @@ from torch import Tensor
 from bitymi_ns.ops.backend import cuda_backend, on_device
 from bitymi_ns.ops.baked_cuda import Stage, Workspace, compiled, empty_images, frame, stack_cameras
 
-from .baked import BakedScene
+from .baked import OUTPUTS, BakedOutput, BakedScene, image_names
 from .camera import Camera
+from .sampling import Sampling
 
 
 class BakedRenderer:
@@ -51,18 +53,21 @@ class BakedRenderer:
         self.workspace = Workspace(device)
         self._viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
         self._Ks = torch.eye(3, device=device).repeat(views, 1, 1)
-        self._background = None if background is None else background.to(device, torch.float32).contiguous()
+        self._background = None if background is None else background.to(device, torch.float32, copy=True)
         self._size = (views, width, height)
         self._use_graph, self._graph = graph, None
         self._resize(0)
 
-    def draw(self, cameras: Sequence[Camera], check: bool = True) -> dict[str, Tensor]:
+    def draw(
+        self, cameras: Sequence[Camera], check: bool = True, background: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Draws the views.
 
         Args:
             cameras: as many as the renderer has views, of its size.
             check: wait for the frame and draw it again when the working memory was too small. Without, the frame is
                 only begun; ask `complete` later.
+            background: [3] another colour behind the scene, where the renderer has one; None = as before.
 
         Returns:
             name -> [views, height, width, channels]; the same memory every time.
@@ -74,6 +79,8 @@ class BakedRenderer:
             )
         self._viewmats.copy_(viewmats)
         self._Ks.copy_(Ks)
+        if background is not None and self._background is not None:
+            self._background.copy_(background)
         self.run()
         if check and not self.complete():
             self._resize(self.workspace.pairs * 5 // 4)
@@ -108,7 +115,7 @@ class BakedRenderer:
         self._graph.replay()
 
     def complete(self) -> bool:
-        """Whether the working memory was large enough for the latest frame; waits for it."""
+        """True where the working memory was large enough for the latest frame; waits for it."""
         return self._surfels == 0 or self.workspace.complete
 
     def _draw(self, stages: Stage) -> None:
@@ -118,3 +125,39 @@ class BakedRenderer:
         views, width, height = self._size
         self.workspace.resize(self._surfels, views, width, height, "normal" in self.images, capacity)
         self._graph = None  # it points at the old memory
+
+
+class SceneRenderer:
+    """Renders views of any camera, on any device. On a CUDA device a size that repeats is drawn by a `BakedRenderer` of
+    its own, on a card as a CUDA graph. Threads may share a renderer.
+
+    Args:
+        scene: on the device where it is drawn.
+        kept: sizes that keep a `BakedRenderer`, each with its working memory; the oldest is dropped first.
+    """
+
+    def __init__(self, scene: BakedScene, kept: int = 4) -> None:
+        self.scene, self._kept = scene, kept
+        self._renderers: dict[tuple[int, int, bool, bool], BakedRenderer] = {}
+        self._latest: tuple[int, int, bool, bool] | None = None
+        self._lock = threading.Lock()
+
+    @torch.no_grad()
+    def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
+        """Renders a view; arguments and images are those of `BakedScene.render`."""
+        scene, device = self.scene, self.scene.tiles.device
+        # a graph keeps the size of a photograph's pixel: views that show the scene smaller or larger go without one
+        if scene.through_webgpu or not cuda_backend(device) or scene.sampling([camera]) != Sampling():
+            return scene.render(camera, background, maps)
+        key = (camera.width, camera.height, background is None, maps)
+        with self._lock:
+            repeats, self._latest = key == self._latest, key
+            if key not in self._renderers:
+                if not repeats:  # the viewer changes its size while the camera moves: recording would not pay
+                    return scene.render(camera, background, maps)
+                while len(self._renderers) >= self._kept:
+                    del self._renderers[next(iter(self._renderers))]
+                names, graph = image_names(maps), device.type == "cuda"
+                self._renderers[key] = BakedRenderer(scene, *key[:2], 1, names, background, graph)
+            images = self._renderers[key].draw([camera], background=background)
+            return BakedOutput(**{name: images[name][0].clone() if name in images else None for name in OUTPUTS})

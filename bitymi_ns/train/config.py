@@ -2,38 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 REFERENCE_STEPS = 30_000
-"""The run length for which every step count below is given."""
+"""Run length that every step count below is stated for."""
 ExposureKind = Literal["auto", "off", "gain", "affine"]
 """Colour corrections of the photographs."""
 Background = Literal["auto", "black", "white", "random"]
 """Colours behind the scene."""
+MOST = 10**9
+"""Largest value of a count, and of a weight."""
+Share = Annotated[float, Field(ge=0, le=1)]
+PositiveShare = Annotated[float, Field(gt=0, le=1)]
+NonNegative = Annotated[float, Field(ge=0, le=MOST)]
+Positive = Annotated[float, Field(gt=0, le=MOST)]
+Threshold = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=0, le=MOST)]
+PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
 
 
 @dataclass
 class LossConfig:
     """The objective: photometric loss, falloff and overdraw reduction."""
 
-    ssim_weight: float = 0.2
+    ssim_weight: Share = 0.2
     """Photometric loss = (1 - w) L1 + w (1 - SSIM)."""
-    falloff_weight: float = 0.005
+    falloff_weight: NonNegative = 0.005
     """Weight lambda of the falloff loss; 0 turns it off (the paper's quality setting)."""
-    falloff_gamma: float = 25.0
-    """How sharply the falloff and overdraw losses fade with the photometric error: omega = exp(-gamma e)."""
+    falloff_gamma: NonNegative = 25.0
+    """Decay of the falloff and overdraw losses with the photometric error e: omega = exp(-gamma e)."""
     falloff_error: Literal["l1_sum", "mse"] = "l1_sum"
     """The error e in omega: L1 summed over rgb, or the mean squared error."""
     falloff_gradient: Literal["full", "beta_only"] = "full"
     """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
-    overdraw_weight: float = 0.0
+    overdraw_weight: NonNegative = 0.0
     """Weight of the loss on the number of fragments per pixel, which fades with the error as the falloff loss does."""
     overdraw_start: int = 12_000
     """First step with the overdraw loss: before, it costs quality."""
     overdraw_stop: int = 27_000
     """Step from which the overdraw loss is off again, so that the picture settles."""
-    overdraw_half: float = 0.005
+    overdraw_half: Positive = 0.005
     """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
 
 
@@ -45,53 +56,53 @@ class DensifyConfig:
     """First step of densification (exclusive)."""
     stop: int = 15_000
     """Last step of densification (exclusive)."""
-    interval: int = 500
+    interval: PositiveCount = 500
     """Steps between densifications."""
-    views: int = 10
+    views: PositiveCount = 10
     """Training views rendered for the multi-view score; with fewer training views, all of them."""
-    error_threshold: float = 0.1
+    error_threshold: Share = 0.1
     """A pixel counts as bad when its min-max normalised error is above this."""
-    importance: int = 5
+    importance: Annotated[int, Field(ge=-1, le=MOST)] = 5
     """Surfels are densified when their mean count of bad pixels per view is above this."""
-    grad_threshold: float = 2e-4
+    grad_threshold: Threshold = 2e-4
     """Clone when the mean gradient of the projected centre (NDC) is at least this."""
-    abs_grad_threshold: float = 7e-4
+    abs_grad_threshold: Threshold = 7e-4
     """Split when the mean absolute gradient of the projected centre (NDC) is at least this."""
-    dense: float = 0.001
+    dense: Threshold = 0.001
     """Surfels larger than this share of the scene extent are split, smaller ones are cloned."""
-    prune_opacity: float = 0.005
+    prune_opacity: Share = 0.005
     """Surfels below this opacity are candidates for pruning."""
-    prune_world: float = 0.1
+    prune_world: Threshold = 0.1
     """Surfels larger than this share of the scene extent are candidates for pruning."""
-    prune_screen: float = 20.0
+    prune_screen: Threshold = 20.0
     """Surfels with a larger radius on screen, in pixels, are candidates for pruning after the first opacity reset."""
-    prune_budget: float = 0.5
+    prune_budget: Share = 0.5
     """Share of the candidates that is drawn for pruning at each densification."""
-    opacity_clamp: float = 0.8
+    opacity_clamp: PositiveShare = 0.8
     """Opacities are clamped to this at each densification."""
-    reset_interval: int = 3000
+    reset_interval: PositiveCount = 3000
     """Steps between opacity resets (until `stop`)."""
-    min_reset_interval: int = 1500
+    min_reset_interval: Count = 1500
     """Fewest steps between opacity resets, however short the run."""
-    reset_opacity: float = 0.01
+    reset_opacity: PositiveShare = 0.01
     """Opacity after a reset, at most. Very short runs reset to a higher one."""
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
     """Steps of the final prunes."""
-    final_prune_opacity: float = 0.1
+    final_prune_opacity: Share = 0.1
     """Final prunes remove surfels below this opacity."""
-    final_prune_score: float = 1.0
+    final_prune_score: Threshold = 1.0
     """Final prunes remove surfels whose multi-view error score (0 to 1) is above this; 1 = none. FastGS's 0.9 removes
     those that cover most bad pixels, the largest of a background among them, when nothing can close the hole."""
-    min_interval: int = 100
+    min_interval: Count = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
-    pixels_per_surfel: float = 300.0
+    pixels_per_surfel: NonNegative = 300.0
     """Densification stops at one surfel for so many pixels of all training photographs together; 0 = no such bound."""
-    growth: float = 2.0
+    growth: NonNegative = 2.0
     """... but not before there are so many times the surfels that training started with, however few the pixels: a
     scene that cannot grow cannot put surfels where its errors are."""
-    max_surfels: int = 0
+    max_surfels: Count = 0
     """Hard cap on the number of surfels; 0 = none."""
-    min_surfels: int = 100
+    min_surfels: Count = 100
     """No prune leaves fewer surfels than this."""
 
 
@@ -99,9 +110,9 @@ class DensifyConfig:
 class LearningRates:
     """Learning rates; pairs decay log-linearly from the first to the second over the run."""
 
-    short_run_power: float = 0.35
+    short_run_power: Annotated[float, Field(ge=0, le=10)] = 0.35
     """Runs of n < 30,000 steps multiply the rates of the surfels, not of the field, by (30,000 / n) to this power."""
-    short_run_max: float = 4.0
+    short_run_max: Positive = 4.0
     """The largest such factor: at 7 times the rates the held-out error grows again."""
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
     """Positions, times the scene extent."""
@@ -140,89 +151,86 @@ class AdamConfig:
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay of the running averages, of the surfels' parameters."""
     field_betas: tuple[float, float] = (0.9, 0.99)
-    """The same of the texture field, which forgets faster: its gradients are sparse and large early on."""
+    """Decay of the texture field's averages: its gradients are sparse, and large early on."""
 
 
 @dataclass
 class TexelSteps:
-    """How far texels move, in training and after it."""
+    """Step sizes of texels."""
 
-    rate: float = 0.05
-    """How far a texel moves in a pass over the views at the start, at most, in colour units; falls to 0 as a cosine."""
-    prior: float = 0.3
-    """How much seeing it takes to move a texel, in pixels: one seen with the summed weight m moves at m / (m + prior)
-    of the rate, one never seen not at all."""
+    rate: NonNegative = 0.05
+    """Largest step of a texel per pass over the views, in colour units; falls to 0 as a cosine."""
+    prior: Positive = 0.3
+    """Coverage prior m0 in pixels: a texel of summed blending weight m moves at m / (m + m0) of the rate."""
 
 
 @dataclass
 class TexelConfig(TexelSteps):
     """Texels that learn in the last part of a run, where the texture of the scene is `texels`."""
 
-    start: int = 18_000
+    start: Count = 18_000
     """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
     as the training views see it; 30,000 or more = there is no such part."""
-    travel: float = 0.3
+    travel: NonNegative = 0.3
     """How far a texel can move in all of that part, colour units: where it passes over the views few times, `rate` is
     raised so that texels get there, up to this."""
-    surfel_rates: float = 0.4
+    surfel_rates: NonNegative = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
-    pixels_per_texel: float = 0.25
+    pixels_per_texel: Positive = 0.25
     """A tile has at most a texel for so many pixels that its surfel makes up of the view that shows most of it."""
-    looked_pixels_per_texel: float = 32.0
-    """Where there would be more than 8 million texels, tiles together have at most one for so many pixels that the
-    steps of that part look at: more take memory that they are not worth."""
-    largest: int = 64
+    rendered_pixels_per_texel: Positive = 32.0
+    """Beyond 8 million texels, at most one for so many pixels that the steps of that part render; saves memory."""
+    largest: Annotated[int, Field(ge=4, le=4096)] = 64
     """Largest side of a tile, texels, a power of two."""
-    views: float = 0.25
-    """Views that are looked through to find what the tiles need, as a share of the steps of that part; 32 at least."""
+    views: NonNegative = 0.25
+    """Views that tile sizes and coverage are measured on, as a share of the steps of that part; at least 32."""
 
 
 @dataclass
 class GuardConfig:
-    """What happens when training diverges."""
+    """Rollback of diverged training."""
 
-    rollbacks: int = 5
-    """How often a run may go back to its last good state; 0 = a loss that is not finite ends it."""
-    rates: float = 0.3
+    rollbacks: Count = 5
+    """Most rollbacks to the last good state; 0 = a loss that is not finite ends the run."""
+    rates: PositiveShare = 0.3
     """Factor of all learning rates when it does; its square, cube, ... when that was not enough."""
-    window: int = 300
+    window: PositiveCount = 300
     """Steps over which the loss is judged."""
-    min_window: int = 20
+    min_window: PositiveCount = 20
     """Fewest steps of a window, however short the run."""
 
 
 @dataclass
 class TrainConfig:
-    """How a scene is trained."""
+    """Options of training."""
 
     loss: LossConfig = field(default_factory=LossConfig)
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     lr: LearningRates = field(default_factory=LearningRates)
     guard: GuardConfig = field(default_factory=GuardConfig)
     texels: TexelConfig = field(default_factory=TexelConfig)
-    freeze_after: int = 5000
+    freeze_after: Count = 5000
     """From this step on the texture field learns on one step in `freeze_every` only."""
-    freeze_every: int = 10
-    """How rarely the texture field learns after `freeze_after`; 1 = on every step."""
-    freeze_min_updates: int = 300
+    freeze_every: PositiveCount = 10
+    """Stride of the steps on which the texture field learns after `freeze_after`; 1 = every step."""
+    freeze_min_updates: Count = 300
     """Short runs freeze less, so that the field still learns on about this many steps after `freeze_after`."""
-    field_warmup: int = 500
+    field_warmup: Count = 500
     """Steps over which the learning rate of the texture field rises to its full value."""
-    resolution_schedule: int = 3000
+    resolution_schedule: Count = 3000
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Where
     texels learn in the last part, runs of fewer than 3,000 steps wait longer, at most until then."""
-    small_photograph: int = 10_000
+    small_photograph: PositiveCount = 10_000
     """Pixels of a photograph, of those that show something, with which they do not wait longer; with n times as many,
     by at most sqrt(n)."""
-    num_downscales: int = 2
-    """How many times the image size is halved at the start."""
-    init_opacity: float = 0.1
+    num_downscales: Annotated[int, Field(ge=0, le=16)] = 2
+    """Halvings of the image size at the start."""
+    init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first surfels."""
     first_surfels: int | None = None
     """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
-    1,000 pixels that the run looks at, because a surfel costs time in every step, and short runs on small pictures
-    cannot place more; else all points."""
-    random_points: int = 20_000
+    1,000 pixels that the run renders; else all points."""
+    random_points: PositiveCount = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
     exposure: ExposureKind = "off"
     """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
@@ -235,3 +243,17 @@ class TrainConfig:
     ns-train that of the capture, where it states one."""
     seed: int = 0
     """Seed of every random choice in training."""
+
+
+def check_ranges(config: TrainConfig) -> None:
+    """Refuse options out of their range, NaN included. Learning rates are checked by the schedule that makes them.
+
+    Raises:
+        ValueError: names the option, its range and the value.
+    """
+    try:
+        TypeAdapter(TrainConfig).validate_python(asdict(config))
+    except ValidationError as error:
+        first = error.errors()[0]
+        name, rule = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Input should be ")
+        raise ValueError(f"{name} must be {rule}, not {first['input']}") from error

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.constants import MAX_LEVELS
+from bitymi_ns.ops.constants import MAX_LEVELS, SUPPORT
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import NEAR, Scene
@@ -51,7 +53,7 @@ def build_scene(
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
     means = surfels["means"]
     near = NEAR * scene_extent(camera_centers, means)
-    if scene_config.texture != "hash":  # texels come later, when the surfels have found their places
+    if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report
     bounded = bounded or (declared is not None and box_is_small(declared, camera_centers))
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
@@ -85,8 +87,8 @@ def check_representation(config: SceneConfig) -> None:
 
 
 def box_is_small(box: Tensor, camera_centers: Tensor) -> bool:
-    """Whether a grid over the box [2, 3] is at least as fine as one over contracted space, where the cameras' ball has
-    half the width of the grid. Captures of open scenes may declare a box, too: a large one."""
+    """True where a grid over the box [2, 3] is at least as fine as one over contracted space, which is twice as wide as
+    the cameras' ball. Captures of open scenes may declare a large box."""
     return float((box[1] - box[0]).max()) <= 4 * scene_extent(camera_centers)
 
 
@@ -116,3 +118,48 @@ def table_size_of(image_pixels: int) -> int:
     """Entries per hash level, as a power of two, that the photographs can tell apart: one entry of 4 features for 32
     pixels of all photographs together."""
     return round(math.log2(max(1, image_pixels) / 32))
+
+
+SAMPLE = 4096
+"""Surfels that are tested first: nearly all views see one of them."""
+CHUNK = 1 << 20
+
+
+@torch.no_grad()
+def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
+    """Numbers of the views that no surfel can be seen in.
+
+    A surfel counts as seen where the ball around it, as large as its disc, reaches beyond the near plane and into the
+    picture.
+
+    Args:
+        scene: as training starts.
+        cameras: of the views.
+    """
+    means = scene.surfels["means"].detach()
+    radii = SUPPORT * scene.surfels["log_scales"].detach().exp().amax(-1)
+    first = torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:SAMPLE].to(means.device)
+    return [
+        i
+        for i, camera in enumerate(cameras)
+        if not _sees(camera, means[first], radii[first], scene.near)
+        and not any(
+            _sees(camera, *chunk, scene.near) for chunk in zip(means.split(CHUNK), radii.split(CHUNK), strict=True)
+        )
+    ]
+
+
+def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
+    camera = camera.to(means.device)
+    # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+    x, y, z = ((means[:, None] * camera.viewmat[:3, :3]).sum(-1) + camera.viewmat[:3, 3]).unbind(-1)
+    K = camera.K
+    depth = z.clamp(min=near)
+    seen = z > near - radii
+    for along, focal, middle, size in (
+        (x, K[0, 0], K[0, 2], camera.width),
+        (y, K[1, 1], K[1, 2], camera.height),
+    ):
+        at, reach = focal * along / depth + middle, focal * radii / depth
+        seen &= (at > -reach) & (at < size + reach)
+    return bool(seen.any())

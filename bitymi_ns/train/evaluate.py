@@ -1,4 +1,4 @@
-"""How well a scene shows views that it was not trained on."""
+"""Quality of held-out views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import cc_psnr, mean_psnr, psnr
-from bitymi_ns.train.views import View, judging_background
+from bitymi_ns.train.views import View, eval_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
@@ -65,7 +65,7 @@ def held_out_quality(
 def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Quality:
     """`held_out_quality` of a trained scene, over the background on which views are judged."""
     device = scene.surfels["means"].device
-    background = judging_background(config, device)
+    background = eval_background(config, device)
     return held_out_quality(
         lambda camera: scene.render(camera, background=background, field_mode="frozen"), views, background, device
     )

@@ -18,12 +18,11 @@ from torch.nn import Parameter
 from torch.nn.functional import embedding
 from torch.optim import SparseAdam
 
-from bitymi_ns.train.agreement import measure_agreement
 from bitymi_ns.train.config import ExposureKind
-from bitymi_ns.train.memory import OnDemand
+from bitymi_ns.train.exposure_gains import estimate_gains
 from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import OnDemand, View
 
 LIMIT = 2.0
 """Largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops."""
@@ -32,11 +31,11 @@ OTHER_LIMIT = 0.5
 EXPLAINED = 0.1
 """`auto` corrects photographs where gains explain more than this share of how far they disagree at the points."""
 EXIF_SPREAD = 0.03
-"""Where the points do not tell, `auto` corrects photographs whose EXIF gains have this deviation (0.1 stop)."""
+"""Without enough points, `auto` corrects photographs whose EXIF gains deviate by this (0.1 stop)."""
 PRIOR_POINTS = 20
-"""What EXIF says of a photograph, or else that it is like the others, counts as much as so many points."""
+"""Weight of the EXIF prior (mean exposure where unknown), in points."""
 BETAS = (0.9, 0.99)
-"""Of Adam: a photograph is shown once an epoch, so its averages have to be short."""
+"""Adam's decay: a photograph is shown once an epoch, so averages must be short."""
 ENCODING = 2.2
 """Encoded colours grow as this root of the light."""
 
@@ -48,7 +47,7 @@ class Exposure:
         table: [V, 3] logarithms of gains; of affine corrections [V, 12], the rows of [matrix | offset] one after the
             other, with the logarithms of the gains on the diagonal. None = no photograph is corrected.
         decided: whether `start` has been called, or a state loaded.
-        finding: why photographs are corrected or not, in a sentence; empty until decided.
+        reason: why photographs are corrected or not; empty until decided.
     """
 
     def __init__(self, kind: ExposureKind, exif: Sequence[float] | None = None) -> None:
@@ -60,7 +59,7 @@ class Exposure:
         self.kind: ExposureKind = kind
         self.table: Parameter | None = None
         self.decided = kind == "off"
-        self.finding = ""
+        self.reason = ""
         self._exif = exif
         self._optimizer: SparseAdam | None = None
 
@@ -73,19 +72,19 @@ class Exposure:
             near: nearest drawn depth, camera z.
         """
         self.decided = True
-        agreement = measure_agreement(points, views, near)
+        agreement = estimate_gains(points, views, near)
         prior = seeds(self._exif, len(views))
         if self.kind == "auto":
             if math.isnan(agreement.explained):
-                worth = float(prior.std(0, correction=0).max()) > EXIF_SPREAD
-                self.finding = "their EXIF exposures " + ("differ" if worth else "do not differ, or are unknown")
+                enabled = float(prior.std(0, correction=0).max()) > EXIF_SPREAD
+                self.reason = "their EXIF exposures " + ("differ" if enabled else "do not differ, or are unknown")
             else:
-                worth = agreement.explained > EXPLAINED
-                self.finding = f"gains explain {max(0.0, agreement.explained):.0%} of how far they differ at the points"
-            if not worth:
+                enabled = agreement.explained > EXPLAINED
+                self.reason = f"gains explain {max(0.0, agreement.explained):.0%} of how far they differ at the points"
+            if not enabled:
                 return
         else:
-            self.finding = "as asked for"
+            self.reason = "as asked for"
         seen = agreement.points[:, None].float()
         gains = (seen * agreement.log_gains + PRIOR_POINTS * prior) / (seen + PRIOR_POINTS)
         self._begin(gains.to(points.device), affine=self.kind == "affine")
@@ -99,12 +98,12 @@ class Exposure:
 
     @property
     def sentence(self) -> str:
-        """What was decided, and why."""
+        """The decision and its reason, for the console."""
         gains = self.log_gains
         if gains is None:
-            return f"Photographs are taken as they are exposed: {self.finding or 'as asked for'}."
+            return f"Photographs are taken as they are exposed: {self.reason or 'as asked for'}."
         spread = f"{math.expm1(float(gains.std(correction=0))):.0%}"
-        return f"The exposure of each photograph is learned, they differ by {spread}: {self.finding}."
+        return f"The exposure of each photograph is learned, they differ by {spread}: {self.reason}."
 
     @property
     def log_gains(self) -> Tensor | None:
@@ -159,7 +158,7 @@ class Exposure:
         return {
             "kind": self.kind,
             "decided": self.decided,
-            "finding": self.finding,
+            "finding": self.reason,
             "table": None if self.table is None else self.table.detach().clone(),
             "optimizer": None if self._optimizer is None else copy.deepcopy(self._optimizer.state_dict()),
         }
@@ -181,7 +180,7 @@ class Exposure:
         table = state["table"]
         if state["kind"] != self.kind or (table is not None and len(table) != count):
             return
-        self.decided, self.finding = bool(state["decided"]), str(state["finding"])
+        self.decided, self.reason = bool(state["decided"]), str(state["finding"])
         if table is None:
             self.table = self._optimizer = None
             return

@@ -37,16 +37,16 @@ class LogEntry:
     fragments: float
     """Blended fragments per view, mean over the evaluation views."""
     loss: float
-    """Of the last training step."""
+    """Objective of the last training step."""
     psnr: float
     """dB, mean over the evaluation views at full size; NaN without such views."""
     cc_psnr: float
-    """The same after the affine fit of each view's colours (`losses.color_corrected`)."""
+    """PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`)."""
 
 
 @dataclass
 class TrainLog:
-    """What happened in a run."""
+    """Log of a run."""
 
     entries: list[LogEntry] = field(default_factory=list)
     events: list[dict[str, float]] = field(default_factory=list)
@@ -78,7 +78,7 @@ class Trainer:
             config: training options.
             max_steps: length of the run; the schedules depend on it.
             extent: scene extent in world units; default: from the cameras.
-            processes: of the run, and how many views each looks at in a step; all are given the same.
+            processes: of the run, and the views of each per step; all are given the same.
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")
@@ -103,7 +103,7 @@ class Trainer:
             terms, output = self.training.losses(view)
             learning = [term for term in terms.values() if term.requires_grad]
             if learning:
-                torch.autograd.backward(learning, [_one(term) for term in learning])
+                torch.autograd.backward(learning, [_one(term.device, term.dtype) for term in learning])
         self.training.combine()
         step(self.optimizers.values())
         report = self.training.finish()
@@ -139,13 +139,9 @@ class Trainer:
 
 
 @functools.cache
-def _ones(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _one(device: torch.device, dtype: torch.dtype) -> Tensor:
+    """The gradient of a sum with respect to one of its terms."""
     return torch.ones((), device=device, dtype=dtype)
-
-
-def _one(term: Tensor) -> Tensor:
-    """The gradient of a sum with respect to one of its terms, made once."""
-    return _ones(term.device, term.dtype)
 
 
 def fit(

@@ -13,14 +13,13 @@ from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.view_kinds import entry_of
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.rotations import facing
 
 BETA_RAW = 2.0
 """Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
 MAX_SCALE = 0.25
 """Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
-LOOKS_PER_SURFEL = 1000
-"""Pixels that a run looks at for each of its first surfels, at least."""
+PIXELS_PER_FIRST_SURFEL = 1000
+"""Fewest pixels rendered in a run per first surfel."""
 FEWEST_FIRST = 5000
 """Points that are never thinned, however short the run."""
 MIN_SCALE = 1e-6
@@ -29,7 +28,7 @@ MIN_SCALE = 1e-6
 
 @dataclass
 class PointReport:
-    """What became of the sparse points."""
+    """Counts of the sparse points used and dropped."""
 
     given: int
     not_finite: int = 0
@@ -46,7 +45,7 @@ def first_surfels_for(steps: int, pixels: float) -> int:
         steps: length of the run.
         pixels: of a training view at full size.
     """
-    return max(FEWEST_FIRST, int(steps * pixels / LOOKS_PER_SURFEL))
+    return max(FEWEST_FIRST, int(steps * pixels / PIXELS_PER_FIRST_SURFEL))
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
@@ -194,3 +193,40 @@ def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
     distance = to_camera.norm(dim=-1, keepdim=True)
     normals = torch.where(distance > 1e-12, to_camera / distance.clamp(min=1e-12), fallback)
     return facing(normals, angles)
+
+
+def facing(normals: Tensor, angles: Tensor) -> Tensor:
+    """Rotations that turn the z axis to a normal after turning the disc in its plane.
+
+    Args:
+        normals: [N, 3] unit vectors.
+        angles: [N] in radians, rotation about z before the tilt.
+
+    Returns:
+        [N, 4] unit quaternions.
+    """
+    x, y, z = normals.unbind(-1)
+    zero = torch.zeros_like(x)
+    tilt = torch.stack([1.0 + z, -y, x, zero], -1)  # shortest rotation from (0, 0, 1); vanishes at -z
+    flip = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=tilt.dtype, device=tilt.device)
+    tilt = torch.where((tilt.norm(dim=-1) < 1e-4)[:, None], flip, tilt)
+    w, i, j, k = (tilt / tilt.norm(dim=-1, keepdim=True)).unbind(-1)
+    cos, sin = torch.cos(angles / 2), torch.sin(angles / 2)
+    return torch.stack([w * cos - k * sin, i * cos + j * sin, j * cos - i * sin, k * cos + w * sin], -1)
+
+
+def tangents(quats: Tensor) -> Tensor:
+    """The two tangent directions of surfels: the first two columns of their rotation matrices.
+
+    Args:
+        quats: [N, 4], not normalised; a zero quaternion counts as no rotation.
+
+    Returns:
+        [N, 3, 2] unit vectors; [..., 0] is the u axis, [..., 1] the v axis.
+    """
+    norm = quats.norm(dim=-1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
+    w, x, y, z = torch.where(norm > 0, quats / norm.clamp(min=torch.finfo(quats.dtype).tiny), identity).unbind(-1)
+    u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+    v = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)
+    return torch.stack([u, v], -1)

@@ -58,7 +58,7 @@ def objective(
 
 
 def numbers(image: Tensor, mask: Tensor | None) -> int:
-    """How many numbers of a picture [H, W, C] the mean of its loss is taken over."""
+    """Count of the values of a picture [H, W, C] that its mean loss is taken over."""
     return 3 * (image.shape[0] * image.shape[1] if mask is None else int(mask.sum()))
 
 

@@ -1,4 +1,4 @@
-"""The processes of a run, each of which looks at views of its own: the one place where they speak to each other.
+"""Communication between the processes of a run, each of which renders views of its own.
 
 Every process holds the whole scene and makes every decision itself. What decisions rest on is made alike here: sums
 over all processes, or what the first one found. They speak through torch.distributed's default group, which needs gloo
@@ -28,12 +28,12 @@ class ProcessesApart(RuntimeError):
 
 @dataclass(frozen=True)
 class Processes:
-    """Those of a run, as one of them sees them. Alone, nothing here does anything.
+    """The processes of a run, seen from one of them. For a single process every method is a no-op.
 
     Attributes:
         rank: number of this process; 0 is the first, which alone writes and prints.
         count: of processes.
-        each: views that a process looks at in a step, one after the other.
+        each: views that a process renders in a step, one after the other.
     """
 
     rank: int = 0
@@ -42,30 +42,30 @@ class Processes:
 
     @classmethod
     def joined(cls, each: int = 1) -> Processes:
-        """Those of torch.distributed's default group; this one alone where there is none."""
+        """Processes of torch.distributed's default group; a single one where there is none."""
         if not (dist.is_available() and dist.is_initialized()):
             return cls(each=each)
         return cls(dist.get_rank(), dist.get_world_size(), each)
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that writes and prints."""
+        """True for the process that writes and prints."""
         return self.rank == 0
 
     @property
     def views(self) -> int:
-        """How many views a step of all processes looks at."""
+        """Views of a step over all processes."""
         return self.count * self.each
 
     def numbers(self, step: int) -> range:
-        """Places, in the order of the training views, of those that this process looks at in a step."""
+        """Positions in the training order of the views that this process renders in a step."""
         start = step * self.views + self.rank * self.each
         return range(start, start + self.each)
 
     # what decisions rest on
 
     def any(self, condition: bool) -> bool:
-        """Whether the condition holds for a process."""
+        """True where the condition holds for any process."""
         return bool(self._largest([int(condition)])[0])
 
     def problem(self, own: str | None) -> str | None:
@@ -86,7 +86,7 @@ class Processes:
         return float(total) / self.count
 
     def from_first(self, state: Any, device: torch.device | str) -> Any:
-        """What the first process gives: tensors, numbers and text, on a device; the others may give None."""
+        """Broadcast a state (tensors, numbers, text) of the first process to a device; the others may pass None."""
         if self.count == 1:
             return state
         packed = io.BytesIO()
@@ -98,7 +98,7 @@ class Processes:
         return state if self.first else torch.load(io.BytesIO(box[0]), map_location=device, weights_only=True)
 
     def like_first(self, tensors: Iterable[Tensor]) -> None:
-        """Gives tensors the values that they have in the first process."""
+        """Broadcast the values of tensors from the first process."""
         if self.count == 1:
             return
         with _answering(), torch.no_grad():
@@ -166,9 +166,9 @@ ALONE = Processes()
 
 @contextmanager
 def _answering() -> Iterator[None]:
-    """Says in a word what torch's errors of a connection mean."""
+    """Turn torch's connection errors into ProcessLost."""
     try:
         yield
     except RuntimeError as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ProcessLost(f"another process of the run has ended, or does not answer ({said})") from error
+        message = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ProcessLost(f"another process of the run has ended, or does not answer ({message})") from error

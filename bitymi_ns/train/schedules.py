@@ -1,4 +1,4 @@
-"""Everything that changes in the course of a run, in one place."""
+"""Schedules of a run: events, learning rates, resolution."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import math
 from dataclasses import replace
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
-from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
-from bitymi_ns.train.options import check_ranges
+from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig, check_ranges
 
 PATIENT_STEPS = 3000
 """Steps of a run from which it has time for full size as early as the options say."""
@@ -50,6 +49,7 @@ class Schedule:
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
         self.texels_start = min(max_steps, self.scaled(config.texels.start)) if texels else max_steps
         stop = min(densify.stop, config.texels.start) if texels else densify.stop
+        # after these steps surfels are cloned, split and pruned; opacities reset; the finished geometry pruned
         self.densify_steps = self._events(_multiples(interval, densify.start, stop))
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
@@ -70,7 +70,7 @@ class Schedule:
         """Factor of the surfels' learning rates: more than 1 in runs of fewer than 30,000 steps.
 
         Adam moves a parameter by about its rate per step, so a run of 600 steps at the published rates ends long before
-        the surfels have found their places.
+        the surfels have settled.
         """
         shortness = max(1.0, REFERENCE_STEPS / self.max_steps)
         return min(self.config.lr.short_run_max, shortness**self.config.lr.short_run_power)
@@ -87,14 +87,6 @@ class Schedule:
     def _events(self, steps_at_30k: list[int]) -> frozenset[int]:
         return frozenset(min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
 
-    def is_densify_step(self, step: int) -> bool:
-        """Whether surfels are cloned, split and pruned after this step."""
-        return step in self.densify_steps
-
-    def is_reset_step(self, step: int) -> bool:
-        """Whether opacities are reset after this step (after a densification of the same step)."""
-        return step in self.reset_steps
-
     def reset_opacity(self) -> float:
         """Opacity that a reset lowers to: `reset_opacity`, or more in a short run.
 
@@ -110,30 +102,26 @@ class Schedule:
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
 
     def recovering(self, step: int) -> bool:
-        """Whether the last opacity reset may still show: half of the time to the next one is not over."""
+        """True where the last opacity reset may still show: half of the time to the next one is not over."""
         return any(reset < step <= reset + max(1, self.reset_every // 2) for reset in self.reset_steps)
 
-    def is_final_prune_step(self, step: int) -> bool:
-        """Whether the prune of the finished geometry takes place after this step."""
-        return step in self.final_prune_steps
-
     def overdraw_counts(self, step: int) -> bool:
-        """Whether the overdraw loss is part of this step's objective."""
+        """True where the overdraw loss is part of this step's objective."""
         loss = self.config.loss
         return loss.overdraw_weight > 0.0 and (
             self.scaled(loss.overdraw_start) <= step < self.scaled(loss.overdraw_stop)
         )
 
     def after_first_reset(self, step: int) -> bool:
-        """Whether the first opacity reset is over: from then on size on screen counts for pruning."""
+        """True where the first opacity reset is over: from then on size on screen counts for pruning."""
         return step > self.reset_every
 
     def densification_over(self, step: int) -> bool:
-        """Whether no densification can follow this step, so that its statistics are needed no more."""
+        """True where no densification can follow this step, so that its statistics are needed no more."""
         return not self.densify_steps or step > max(self.densify_steps)
 
     def field_trains(self, step: int) -> bool:
-        """Whether the texture learns in this step; on the other steps it is evaluated without gradient.
+        """True where the texture learns in this step; on the other steps it is evaluated without gradient.
 
         From `freeze_after` on it learns in one step in `freeze_every` (section Training Time of the paper). A run of
         few steps freezes less often: it could not learn a texture in a tenth of them. Texels learn in every step of
@@ -148,7 +136,7 @@ class Schedule:
         return max(1, min(self.config.freeze_every, left // max(1, self.config.freeze_min_updates)))
 
     def texels_learn(self, step: int) -> bool:
-        """Whether every surfel has its own texels in this step, and they learn."""
+        """True where every surfel has its own texels in this step, and they learn."""
         return step >= self.texels_start
 
     def texel_rate(self, step: int, views: int = 1) -> float:

@@ -12,7 +12,7 @@ from torch import Tensor
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.views import View, judging_background
+from bitymi_ns.train.views import View, eval_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -75,7 +75,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     device = scene.surfels["means"].device
     total = torch.zeros(n, dtype=torch.int64, device=device)
     weighted = torch.zeros(n, dtype=torch.float64, device=device)
-    background = judging_background(config, device)
+    background = eval_background(config, device)
     for view in (view.to(device) for view in views[processes.rank :: processes.count]):
         target = view.target(background, device)
         output = scene.render(view.camera, background=background, field_mode="frozen")

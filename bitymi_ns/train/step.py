@@ -13,23 +13,21 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
-from bitymi_ns.train.clock import Stopwatch
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.guard import Guard
 from bitymi_ns.train.losses import objective
-from bitymi_ns.train.optimizers import set_rate
+from bitymi_ns.train.optimizers import ResizeHook, set_rate
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.resize import ResizeHook
+from bitymi_ns.train.rollback import RollbackGuard
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.texels import LearningTexels
-from bitymi_ns.train.views import ReducedViews, TrainingData, View, step_background
-from bitymi_ns.train.watch import LossWatch
+from bitymi_ns.train.views import DownscaledViews, TrainingData, View, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
+import time
 
 
 def view_losses(
@@ -42,7 +40,7 @@ def view_losses(
         view: on the scene's device, its picture at the size of its camera.
         schedule, step: which parts of the scene learn.
         config: training options.
-        watch: looks at the losses of the run; without one a step waits until its own loss is known.
+        watch: checks the losses of the run; without one a step waits until its own loss is known.
 
     Returns:
         The weighted terms of the loss (their sum is the objective), and the rendered view.
@@ -73,11 +71,11 @@ def view_losses(
 
 
 class Training:
-    """What a training step needs beside the scene, and what it does. The order of a step:
+    """A run of training steps. The order of a step:
 
     `begin` -> zero the gradients -> `losses` -> backward of their sum -> `combine` -> optimisers -> `finish`.
 
-    A step of several processes looks at several views, and does what one process would with the mean of their losses.
+    With more processes a step uses the mean loss of the views of all.
     Every process calls everything here at the same steps. `losses` and backward are called for each of its views.
 
     Attributes:
@@ -124,7 +122,9 @@ class Training:
         )
         self.exposure = Exposure(config.exposure, data.exif_stops)
         self.schedule.lr("exposure", 0)
-        self.guard = Guard(scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure, processes)
+        self.guard = RollbackGuard(
+            scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure, processes
+        )
         self.texels = LearningTexels(scene, self.schedule, config.texels, processes)
         self.watch = LossWatch()
         self.clock = Stopwatch()
@@ -135,9 +135,9 @@ class Training:
         self._alike = processes.count == 1
 
     @functools.cached_property
-    def views(self) -> ReducedViews:
+    def views(self) -> DownscaledViews:
         """The training views. Made at first use: on a card it takes a share of the memory that is free then."""
-        return ReducedViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of)
+        return DownscaledViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of)
 
     def view(self, index: int) -> View:
         """Training view number `index`, as the step that was begun last wants it: on the device, reduced."""
@@ -159,7 +159,7 @@ class Training:
         grows = step > 0 and self.schedule.resolution_factor(step) != self.schedule.resolution_factor(step - 1)
         began = self.texels.begin(step, self.views)
         if began:
-            self.guard.start_from_here()
+            self.guard.forget_states()
         if began or grows:
             give_back_memory()
         self.guard.before(step, self.views)
@@ -246,7 +246,7 @@ class Training:
         return loss / self.processes.views, most
 
     def state_dict(self) -> dict[str, Any]:
-        """What decides, beside the scene and its optimisers, how the run goes on."""
+        """State of the run beside the scene and its optimisers."""
         return {
             "strategy": self.strategy.state_dict(),
             "guard": self.guard.state_dict(),
@@ -263,3 +263,21 @@ class Training:
         device = self.scene.surfels["means"].device  # a checkpoint is read on the CPU
         self.exposure.load_state_dict(state.get("exposure"), len(self._full_size), device)
         self.clock = Stopwatch(state["seconds"], state["cpu_seconds"])
+
+
+class Stopwatch:
+    """Wall-clock and CPU seconds of the training steps alone: evaluation, saving and loading are not counted."""
+
+    def __init__(self, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
+        self.seconds = seconds
+        self.cpu_seconds = cpu_seconds
+        self._started: tuple[float, float] | None = None
+
+    def start(self) -> None:
+        self._started = (time.perf_counter(), time.process_time())
+
+    def stop(self) -> None:
+        if self._started is not None:
+            self.seconds += time.perf_counter() - self._started[0]
+            self.cpu_seconds += time.process_time() - self._started[1]
+            self._started = None

@@ -25,10 +25,10 @@ from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.picture_cuda import note_centers
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
+from bitymi_ns.train.init import tangents
+from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.resize import ResizeHook, cap_opacity, replace_rows
-from bitymi_ns.train.rotations import tangents
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.score import Scores, multi_view_scores
 from bitymi_ns.train.views import View
@@ -77,7 +77,7 @@ class Strategy:
         """
         Args:
             config: training options.
-            schedule: says at which steps what takes place.
+            schedule: of the run's events.
             extent: scene extent in world units.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
@@ -174,13 +174,13 @@ class Strategy:
             What was done, by name; empty when nothing was due.
         """
         report: dict[str, float] = {}
-        if self.schedule.is_densify_step(step):
+        if step in self.schedule.densify_steps:
             report |= self._densify(step, scene, optimizers, views)
-        if self.schedule.is_reset_step(step):
+        if step in self.schedule.reset_steps:
             report["opacity_reset"] = cap_opacity(
                 scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
             )
-        if self.schedule.is_final_prune_step(step):
+        if step in self.schedule.final_prune_steps:
             report |= self._final_prune(scene, optimizers, views)
         if report:
             report["surfels"] = len(scene)
@@ -281,8 +281,8 @@ class Strategy:
         over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
         if self.config.densify.max_surfels > 0 and over > 0:
             # only a scene loaded from elsewhere is over the cap: the faintest go
-            lots = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
-            invisible[lots[:over]] = True
+            order = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
+            invisible[order[:over]] = True
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
         self._remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}

@@ -19,20 +19,19 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
+from bitymi_ns.train.init import tangents
 from bitymi_ns.train.losses import numbers
-from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.rotations import tangents
-from bitymi_ns.train.views import at_size, spread
+from bitymi_ns.train.views import OnDemand, at_size, spread
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from bitymi_ns.train.config import TexelConfig
     from bitymi_ns.train.schedules import Schedule
-    from bitymi_ns.train.views import ReducedViews, View
+    from bitymi_ns.train.views import DownscaledViews, View
 
 FEWEST_VIEWS = 32
-"""That are looked through for the tiles, however short the run."""
+"""Fewest views that tiles are measured on, however short the run."""
 SMALLEST = 4
 """Side of the smallest tile, texels: a block of BC7."""
 FEW = 1 << 23
@@ -40,36 +39,28 @@ FEW = 1 << 23
 FEWER = 0.8
 """Factor by which tiles get fewer texels, as often as it takes until all are few enough."""
 LEAST_SHARE = 0.25
-"""What a texel counts as seen by, at least, where not all views are looked through: this share of what one view can
-show of it. So no step is much longer than four times the rate. With all of it, texels that others hide learn too
-slowly."""
-LOOKED_PIXELS = 10_000
-"""Pictures that are looked through have half the size of the photographs where so many pixels are left of each: these
-tell as much in half of the time, and their lists of fragments are shorter."""
+"""Lower bound of a texel's coverage where it is measured on a part of the views, as a share of what one view
+can show: no step is much longer than four times the rate. A whole view would slow down occluded texels."""
+SURVEY_PIXELS = 10_000
+"""Coverage is measured at half the size of the photographs where so many pixels remain: as accurate, in half
+the time."""
 
 
 class LearningTexels:
     """The part of a run in which texels learn."""
 
     def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
-        """
-        Args:
-            scene: gets a `TexelField` when the part begins.
-            schedule: of the run.
-            options: see `TexelConfig`.
-            processes: of the run.
-        """
         self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
         self._rate: RemovableHandle | None = None
         self._views = 1
 
-    def begin(self, step: int, views: ReducedViews) -> bool:
-        """Gives the surfels their tiles where this step is the first that needs them; whether it was."""
+    def begin(self, step: int, views: DownscaledViews) -> bool:
+        """Create the tiles on the first step that needs them; True where this step is it."""
         self._views = len(views)
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
-        looked = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
-        some = OnDemand(len(looked), lambda i: views.at(looked[i], 1.0))
+        sample = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
+        some = OnDemand(len(sample), lambda i: views.at(sample[i], 1.0))
         field = None
         if self.processes.first:
             field = blank_texels(self.scene, some, len(views), self.options, self.views_to_come)
@@ -82,11 +73,11 @@ class LearningTexels:
 
     @property
     def views_to_come(self) -> int:
-        """Views that all steps of this part look at, each counted as often as it is looked at."""
+        """Views that the steps of this part render, counted with repetition."""
         return self.processes.views * self.schedule.texel_steps
 
     def prepare(self, step: int, view: View, factor: float) -> None:
-        """Says how the backward pass of a step on this view moves the texels.
+        """Set the step size of the texels for the backward pass of this view.
 
         Args:
             factor: of all rates.
@@ -128,56 +119,56 @@ def blank_texels(
 
     Args:
         scene: its surfels.
-        views: those that are looked through, at full size; their pictures do not matter.
+        views: sample to measure on, at full size; their pictures do not matter.
         count: of all training views, which these stand for.
         options: see `TexelConfig`.
-        to_come: views that the texels learn from, each counted as often as it is looked at.
+        to_come: views that the texels learn from, counted with repetition.
     """
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound
-    size_looked = looked_size(cameras)
-    smaller = [camera.scaled(size_looked) for camera in cameras]
+    scale = survey_scale(cameras)
+    smaller = [camera.scaled(scale) for camera in cameras]
     seen = visibility(surfels, smaller, scene.near, bound, scene.config.through_pixel)
-    seen = replace(seen, pixels=seen.pixels / size_looked**2)
+    seen = replace(seen, pixels=seen.pixels / scale**2)
     size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options, to_come)
     field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
-    looked = OnDemand(len(views), lambda i: at_size(views[i], smaller[i], extent.device))
-    seen_in_all = coverage(scene, field, looked) * (count / max(1, len(views)) / size_looked**2)
+    small = OnDemand(len(views), lambda i: at_size(views[i], smaller[i], extent.device))
+    seen_in_all = coverage(scene, field, small) * (count / max(1, len(views)) / scale**2)
     if len(views) < count:
-        least = LEAST_SHARE * in_one_view(surfels, cameras, size, extent, scene.near)
+        least = LEAST_SHARE * single_view_coverage(surfels, cameras, size, extent, scene.near)
         seen_in_all = torch.maximum(seen_in_all, least)
     field.share.copy_(1.0 / (seen_in_all + options.prior))
     return field
 
 
-def most_texels(options: TexelConfig, looked_at: float) -> float:
-    """Texels of all tiles, for a part whose steps look at so many pixels."""
-    return max(FEW, looked_at / options.looked_pixels_per_texel)
+def most_texels(options: TexelConfig, rendered: float) -> float:
+    """Most texels of all tiles, for steps that render so many pixels."""
+    return max(FEW, rendered / options.rendered_pixels_per_texel)
 
 
-def looked_size(cameras: Sequence[Camera]) -> float:
-    """Size of the pictures that are looked through, as a share of that of the photographs."""
-    return 0.5 if cameras and mean_pixels(cameras) >= 4 * LOOKED_PIXELS else 1.0
+def survey_scale(cameras: Sequence[Camera]) -> float:
+    """Scale of the pictures that coverage is measured at, relative to the photographs."""
+    return 0.5 if cameras and mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
 
 
 def mean_pixels(cameras: Sequence[Camera]) -> float:
-    """Of a view; 0 where there is none."""
+    """Mean pixels of a view; 0 without views."""
     return sum(camera.width * camera.height for camera in cameras) / max(1, len(cameras))
 
 
-def in_one_view(
+def single_view_coverage(
     surfels: Mapping[str, Tensor], cameras: Sequence[Camera], size: Tensor, extent: Tensor, near: float
 ) -> Tensor:
     """About as much as a view can show of every texel, pixels [T]: its area in the view that is nearest to it, whether
     or not that shows it, times the surfel's opacity.
 
-    Not all views are looked through. One that is not may show what all others hide: by what was counted, its texels
-    would take steps a hundred times too long, and run away.
+    A view that is not measured may show what all others hide: by the measured coverage alone, its texels would take
+    steps a hundred times too long.
 
     Args:
         surfels: of N rows.
-        cameras: the views that are looked through; the others are about as near.
+        cameras: the measured views; the others are about as near.
         size: [N, 2] of the tiles.
         extent: [N] half sides of the tiles in scale units.
         near: nearest drawn depth.
@@ -211,7 +202,7 @@ def tiles_as_seen(
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
         options: see `TexelConfig`.
-        to_come: views that the texels learn from, each counted as often as it is looked at.
+        to_come: views that the texels learn from, counted with repetition.
 
     Returns:
         sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 where no fragment reaches the bound.
@@ -230,7 +221,7 @@ def tiles_as_seen(
 
 @torch.no_grad()
 def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
-    """How much of the pictures every texel makes up, in pixels: [T] sum over views and fragments of the blending weight
+    """Coverage of every texel in pixels: [T] sum over views and fragments of the blending weight
     times the bilinear weight, in pixels that count; 0 where no view sees it."""
     total = torch.zeros_like(field.texels)
     for view in views:

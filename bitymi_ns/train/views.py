@@ -6,7 +6,7 @@ import functools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,14 +14,13 @@ from torch.nn.functional import interpolate
 
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.memory import MemoryBudget
 
-REDUCED_BYTES = 1 << 28
-"""Memory for reduced pictures on the CPU; the others are reduced anew at every use."""
+DOWNSCALED_BYTES = 1 << 28
+"""Cache of downscaled pictures on the CPU; the others are downscaled at every use."""
 
 
 COVERED_VIEWS = 8
-"""In which it is counted what the photographs show."""
+"""Views sampled for the share of pixels that show something."""
 
 
 class View(NamedTuple):
@@ -55,13 +54,13 @@ class View(NamedTuple):
         return shown(rgb, self.correction, alpha, background)
 
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
-        """[H, W, 3] the photograph as it looks over a colour [3] (None = black), on a device."""
+        """[H, W, 3] the photograph over a colour [3] (None = black), on a device."""
         return over_background(as_float(self.image.to(device)), background)
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a run learns from.
+    """Inputs of a run.
 
     Attributes:
         views: training views at full size.
@@ -131,7 +130,7 @@ def as_bytes(image: Tensor) -> Tensor:
     return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
 
 
-def reduce_image(image: Tensor, width: int, height: int) -> Tensor:
+def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
     """Area average of an image.
 
     Args:
@@ -152,12 +151,12 @@ def reduce_image(image: Tensor, width: int, height: int) -> Tensor:
     return small.contiguous()
 
 
-def reduce_mask(mask: Tensor, width: int, height: int) -> Tensor:
+def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
     """[height, width, 1] bool: True where every covered pixel of `mask` ([H, W] or [H, W, 1] bool) counts."""
     mask = mask.reshape(*mask.shape[:2], 1)
     if mask.shape[:2] == (height, width):
         return mask
-    return reduce_image(mask.float(), width, height) > 0.999
+    return downscale_image(mask.float(), width, height) > 0.999
 
 
 def background_color(
@@ -175,7 +174,7 @@ def background_color(
 
 
 def background_changes(config: TrainConfig, view: View) -> bool:
-    """Whether each step on a view has another colour behind the scene."""
+    """True where each step on a view has another colour behind the scene."""
     return config.background == "random" or (config.background == "auto" and view.image.shape[-1] == 4)
 
 
@@ -183,10 +182,10 @@ def step_background(config: TrainConfig, view: View, step: int, device: torch.de
     """[3] the colour behind the scene in a step on a view, `config.background`; None = black."""
     if background_changes(config, view):
         return background_color("random", config.seed, step, device)
-    return judging_background(config, device)
+    return eval_background(config, device)
 
 
-def judging_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
+def eval_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
     """[3] the colour behind the scene where views are judged, None = black: that of training, but `config.alpha_color`
     where it changes, so that no figure depends on the draw."""
     kind = config.background if config.background in ("black", "white") else config.alpha_color
@@ -207,22 +206,22 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
     The picture may be of that size already.
     """
     image = as_float(view.image.to(device))
-    for given, what in ((view.image, "image"), (view.mask, "mask")):
+    for picture, what in ((view.image, "image"), (view.mask, "mask")):
         sizes = ((view.camera.height, view.camera.width), (camera.height, camera.width))
-        if given is not None and tuple(given.shape[:2]) not in sizes:
-            h, w = given.shape[:2]
+        if picture is not None and tuple(picture.shape[:2]) not in sizes:
+            h, w = picture.shape[:2]
             raise ValueError(
                 f"the {what} is {w} x {h} pixels, but its camera {view.camera.width} x {view.camera.height}"
             )
-    mask = None if view.mask is None else reduce_mask(view.mask.to(device), camera.width, camera.height)
-    return View(camera, reduce_image(image, camera.width, camera.height), mask, view.correction)
+    mask = None if view.mask is None else downscale_mask(view.mask.to(device), camera.width, camera.height)
+    return View(camera, downscale_image(image, camera.width, camera.height), mask, view.correction)
 
 
-class ReducedViews:
-    """Training views at the resolution of the moment; reduced pictures are kept until the resolution changes.
+class DownscaledViews:
+    """Training views at the resolution of the moment; downscaled pictures are kept until the resolution changes.
 
-    On the CPU those are kept that fit `REDUCED_BYTES`. On a CUDA device the full-size pictures stay there as they came,
-    up to a quarter of the memory that is free at the start: else every step would wait for one to be copied.
+    On the CPU `DOWNSCALED_BYTES` of them are kept. On a CUDA device the full-size pictures stay in memory, up to a
+    quarter of what is free at the start: else every step would wait for a copy.
 
     Args:
         views: at full size.
@@ -244,7 +243,7 @@ class ReducedViews:
         self._resident: dict[int, View] = {}
         cuda = self._device.type == "cuda"
         self._budget = MemoryBudget(torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0)
-        self._reduced_bytes = sys.maxsize if cuda else REDUCED_BYTES
+        self._reduced_bytes = sys.maxsize if cuda else DOWNSCALED_BYTES
         self._reduced_budget = MemoryBudget(self._reduced_bytes)
 
     def __len__(self) -> int:
@@ -286,7 +285,7 @@ class ReducedViews:
 
 
 def training_order(n: int, seed: int, step: int) -> int:
-    """Which of `n` views step number `step` trains on: every view once an epoch, in an order that is new each time.
+    """Index of the view of a training step: every view once an epoch, reshuffled each epoch.
 
     Depends on the arguments alone, so that a resumed run sees the same views.
     """
@@ -298,3 +297,43 @@ def training_order(n: int, seed: int, step: int) -> int:
 def _order(n: int, seed: int, epoch: int) -> list[int]:
     generator = torch.Generator().manual_seed((seed * 1_000_003 + 7_919 + epoch) & 0x7FFF_FFFF_FFFF_FFFF)
     return torch.randperm(n, generator=generator).tolist()
+
+
+T = TypeVar("T")
+
+
+class MemoryBudget:
+    """Byte budget shared by caches. What fits first stays: views are used in turn, so a cache that evicts the oldest
+    would drop each one just before its next use.
+
+    Attributes:
+        left: bytes that are not taken.
+    """
+
+    def __init__(self, nbytes: int) -> None:
+        self.left = nbytes
+
+    def reserve(self, nbytes: int) -> bool:
+        """Take so many bytes if they are left; True where they were."""
+        if nbytes > self.left:
+            return False
+        self.left -= nbytes
+        return True
+
+
+class OnDemand(Sequence, Generic[T]):
+    """A sequence whose items are made whenever they are asked for.
+
+    Args:
+        count: its length.
+        make: gives the item of an index, 0 to count - 1.
+    """
+
+    def __init__(self, count: int, make: Callable[[int], T]) -> None:
+        self._indices, self._make = range(count), make
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, index: int) -> T:  # type: ignore[override]
+        return self._make(self._indices[index])

@@ -1,7 +1,6 @@
 """Bundles in a browser: a service on this machine, and a folder for any web server. The page is built from `web/`."""
 
-from .page import PageError, Site, single_site, site_of
+from .page import PageError, Site, single_site, site_of, write_static
 from .serve import address_of, is_loopback, serve
-from .static import write_static
 
 __all__ = ["PageError", "Site", "address_of", "is_loopback", "serve", "single_site", "site_of", "write_static"]

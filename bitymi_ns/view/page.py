@@ -1,4 +1,4 @@
-"""What a browser may ask for: the built page, and the files of a bundle that the format names; nothing else."""
+"""Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from importlib import resources
 from pathlib import Path
 
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, files_of, is_known, left_out, parts_of, passed_on
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.single import joined
+from bitymi_ns.files import complete_folder
+from bitymi_ns.trust import Refused, keep
 
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -35,7 +37,7 @@ BUNDLE = "bundle/"
 SINGLE = "scene.bitymi"
 """Name of the one file beside an exported page."""
 _ASKS = '<meta name="bundle" content="{}" />'
-"""Where the page reads which file it shows; empty = the folder beside it."""
+"""Tag that names the bundle file of the page; empty = the folder beside it."""
 
 
 class PageError(ValueError):
@@ -44,7 +46,7 @@ class PageError(ValueError):
 
 @dataclass(frozen=True)
 class Site:
-    """What is served.
+    """Files served.
 
     Attributes:
         files: path on the server, without the first slash, to the file.
@@ -125,9 +127,9 @@ def single_site(bundle: Path) -> Site:
 
 
 def _title(bundle: Path) -> Callable[[], bytes]:
-    """What view.json says of a bundle."""
-    place = Path(os.path.realpath(bundle))
-    title = place.stem if os.path.isfile(place) else place.parent.name if place.name == "bundle" else place.name
+    """Contents of view.json: the title of a bundle."""
+    path = Path(os.path.realpath(bundle))
+    title = path.stem if os.path.isfile(path) else path.parent.name if path.name == "bundle" else path.name
     text = json.dumps({"title": title}).encode()
     return lambda: text
 
@@ -152,7 +154,7 @@ class _Shown:
         path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
             found = os.stat(path)
-        except OSError:  # which is said when it is read
+        except OSError:  # reported when it is read
             return ()
         return found.st_ino, found.st_size, found.st_mtime_ns
 
@@ -170,3 +172,45 @@ class _Shown:
             raise BundleError(f"{self._bundle} has no {name} any longer")
         with parts_of(self._bundle, inside=True) as parts:
             return read_file(parts, self.info, name)
+
+
+def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
+    """Writes what is served to a folder, which appears complete or not at all.
+
+    Args:
+        site: the page and its bundle.
+        folder: where to.
+        overwrite: replace a page that was written there before.
+
+    Returns:
+        bytes written.
+
+    Raises:
+        PageError: something else is there, or beside an earlier page.
+        BundleError: a file of the bundle is missing, altered, or a link that leads out of it.
+        OSError: the folder cannot be written.
+    """
+
+    def check() -> None:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        bundles = (folder / "bundle" / "bundle.json", folder / SINGLE)
+        ours = (folder / "index.html").is_file() and any(bundle.is_file() for bundle in bundles)
+        if not ours:
+            raise PageError(f"{folder} holds something else than an exported page: choose another folder")
+        if not overwrite:
+            raise PageError(f"{folder} is there already: choose another folder, or add --overwrite")
+        made = {*site.paths, *page_files(), "view.json", SINGLE}
+        if (folder / BUNDLE / MANIFEST).is_file():
+            made |= {f"{BUNDLE}{name}" for name in files_of(folder / BUNDLE)}
+        try:
+            keep(folder, made)
+        except Refused as error:
+            raise PageError(str(error)) from error
+
+    with complete_folder(folder, check) as new:
+        for path in site.paths:
+            to = new / path
+            to.parent.mkdir(exist_ok=True)
+            to.write_bytes(site.read(path))
+        return sum(path.stat().st_size for path in new.rglob("*") if path.is_file())

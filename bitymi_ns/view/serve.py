@@ -17,7 +17,7 @@ from .page import POLICY, PageError, Site, media_type
 LOOPBACK = "127.0.0.1"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0
-"""How long a request may take to come, also the next one of a connection, and a piece of an answer to go."""
+"""Timeouts of receiving a request and of sending a piece of an answer."""
 _PIECE = 1 << 20
 _HEADERS = {
     "Content-Security-Policy": POLICY,
@@ -30,7 +30,7 @@ _HEADERS = {
 
 
 class _Timed(io.RawIOBase):
-    """What comes over a connection until `until`, however slowly."""
+    """Reads a connection until the deadline `until`."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection, self.until = connection, 0.0
@@ -89,8 +89,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def _is_whole(self) -> bool:
-        """Whether the header is all of the request: what follows is read as the next one. And whether it can be
-        understood in one way only."""
+        """True for a request without a body and with an unambiguous header."""
         bodies = self.headers.get_all("Content-Length", ["0"]) + self.headers.get_all("Transfer-Encoding", [])
         return set(bodies) == {"0"} and len(self.headers.get_all("Host", [])) < 2 and not self.headers.defects
 
@@ -117,7 +116,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(view[at : at + _PIECE])
 
     def log_message(self, format: str, *args: object) -> None:
-        """Says nothing."""
+        """Log nothing."""
 
 
 class _Server(ThreadingHTTPServer):
@@ -130,7 +129,7 @@ class _Server(ThreadingHTTPServer):
         self._names = {*LOCAL_NAMES, host.lower(), _shown(self)}
 
     def is_named(self, host: str) -> bool:
-        """Whether a request's Host may be asked for: any where others than this machine can ask."""
+        """True where the Host header is allowed; any is when the server is open to the network."""
         host = host.lower()
         return not is_loopback(self) or host in self._names or host.rpartition(":")[0] in self._names
 
@@ -163,12 +162,12 @@ def serve(
 
 
 def is_loopback(server: ThreadingHTTPServer) -> bool:
-    """Whether nothing but this machine can reach a server: by the address that it has, whatever name it was given."""
+    """True where the server listens on a loopback address."""
     return ipaddress.ip_address(str(server.server_address[0]).partition("%")[0]).is_loopback
 
 
 def address_of(server: ThreadingHTTPServer) -> str:
-    """Where a browser on this machine finds the page."""
+    """URL of the page for a browser on this machine."""
     return f"http://{_shown(server)}:{server.server_address[1]}/"
 
 

@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns.bake import BakeOptions, bake, rich_progress
 from bitymi_ns.bundle import export, read_bundle
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 
 def bilinear(bundle, surfel, u, v, extent=3.0):

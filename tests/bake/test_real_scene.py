@@ -12,7 +12,7 @@ from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 
 def real_scene(surfels, count=80, kind="sv", min_resolution=8):

@@ -13,7 +13,7 @@ from bitymi_ns.bake.field.references import references
 from bitymi_ns.bake.reduce import fit, interpolation
 from bitymi_ns.ops.reference.texel import texel, texel_centers
 from bitymi_ns.scene.tile_sizes import kernel_parameters, visible_extent
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 OPTIONS = BakeOptions(format="fp16")
 BOUND = 0.02

@@ -16,8 +16,7 @@ from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews
 from bitymi_ns.ops import fitting_lists, project, trace_cpu
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
-from bitymi_ns.train.memory import MemoryBudget
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import MemoryBudget, View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 OPTIONS = TuneOptions(steps=60, rate=0.3, held_in_every=4, coded_steps=0)

@@ -12,8 +12,8 @@ from bitymi_ns.capture.photos import read_photo
 from bitymi_ns.capture.prepare import _read_mask
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.report.pictures import open_image
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.images import file_has_transparency, orientation, read_image, read_mask, set_up_pillow
-from bitymi_ns.plugin.errors import InputError
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -29,7 +30,7 @@ from bitymi_ns.ops.baked_scene import DrawCache
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera, baked_renderer
 from bitymi_ns.scene.baked import FAST, BakedScene
-from bitymi_ns.scene.baked_renderer import BakedRenderer
+from bitymi_ns.scene.baked_renderer import BakedRenderer, SceneRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
 from tests.bundle.compact_scene import make_codes, write_compact
@@ -258,6 +259,39 @@ def test_recorded_graph(views: int, device: torch.device) -> None:
     for distance in (3.0, 5.0):
         cameras = [front(40, 30, distance + i) for i in range(views)]
         assert torch.equal(renderer.draw(cameras)["rgb"], scene.render_views(cameras)["rgb"])
+
+
+@pytest.mark.parametrize("maps", [False, True])
+def test_the_renderer_of_any_camera(maps: bool, device: torch.device) -> None:
+    scene = textured(50, 7).to(device)
+    renderer, white = SceneRenderer(scene, kept=2), torch.ones(3, device=device)
+    drawn = []
+    for width, distance, background in [
+        *((40, d, white) for d in (3.0, 4.0, 5.0, 3.0)),
+        *((40, 3.0, background) for background in (0.5 * white, None, None)),
+        *((w, 4.0, None) for w in (30, 30, 20, 20, 40, 40)),
+    ]:
+        camera = front(width, 30, distance)
+        drawn.append((renderer.render(camera, background, maps), scene.render(camera, background, maps)))
+        assert len(renderer._renderers) <= 2
+    for got, want in drawn:  # no frame overwrote an earlier one
+        for name in FIELDS:
+            a, b = getattr(got, name), getattr(want, name)
+            assert (a is b is None) or torch.equal(a, b), name
+    near = replace(scene, photographed=torch.tensor([[0.0, 0.0, 0.0, 1e-3]]))  # a view far larger than the photographs
+    only = SceneRenderer(near)
+    for _ in range(3):
+        assert torch.equal(only.render(front(40, 30)).rgb, near.render(front(40, 30)).rgb)
+    assert not only._renderers
+
+
+def test_threads_share_a_renderer(device: torch.device) -> None:
+    scene = textured(50, 7).to(device)
+    renderer, cameras = SceneRenderer(scene), [front(40, 30, 3.0 + i) for i in range(3)]
+    with ThreadPoolExecutor(3) as threads:
+        drawn = list(threads.map(renderer.render, 3 * cameras))
+    for got, camera in zip(drawn, 3 * cameras, strict=True):
+        assert torch.equal(got.rgb, scene.render(camera).rgb)
 
 
 @pytest.mark.parametrize("width, height", [(1, 1), (17, 3), (3, 33), (8200, 2), (2, 8200)])

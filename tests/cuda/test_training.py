@@ -9,7 +9,7 @@ import torch
 
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View

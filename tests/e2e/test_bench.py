@@ -14,9 +14,9 @@ from bitymi_ns import cli
 from bitymi_ns.measure import knobs as host_knobs
 from bitymi_ns.measure.knobs import measure_to_file
 from bitymi_ns.measure.pictures import KINDS, decompose, draw_worst, residual_parts
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.errors import InputError
-from bitymi_ns.plugin.export.command import load_trained
+from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 

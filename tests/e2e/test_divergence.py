@@ -8,7 +8,7 @@ import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.runs import a_run_of, rewrite
 

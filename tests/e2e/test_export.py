@@ -18,10 +18,10 @@ from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export import target
 from bitymi_ns.plugin.export.command import default_export
-from bitymi_ns.plugin.export.verify import check_run
+from bitymi_ns.plugin.export.trained import check_run
 from bitymi_ns.plugin.run.bundle_model import RENDERER
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.scene.baked import FAST

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.bundle import check_files, read_bundle
-from bitymi_ns.plugin.errors import InputError
-from bitymi_ns.plugin.export.verify import check_run
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.export.trained import check_run
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 

@@ -10,7 +10,7 @@ import pytest
 from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bake import tune
 from bitymi_ns.bundle import check_files
-from bitymi_ns.plugin.export import command as host_export
+from bitymi_ns.plugin.export import command
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, run_export
 
@@ -94,7 +94,7 @@ def test_ctrl_c_in_the_comparison_says_that_the_bundle_is_complete(
     def interrupted(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(host_export, "read_bundle", interrupted)
+    monkeypatch.setattr(command, "read_bundle", interrupted)
     with pytest.raises(SystemExit):
         run_export(trained, tmp_path / "b", finetune_steps=0)
     assert "is complete" in " ".join(capsys.readouterr().out.split())

@@ -13,10 +13,10 @@ import pytest
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.plugin.errors import InputError
-from bitymi_ns.plugin.export import command as host_export
-from bitymi_ns.plugin.export import target
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.export import command, target
 from bitymi_ns.plugin.export.command import ExportAtlas
+from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import run_export
 
@@ -60,7 +60,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
 def test_options_out_of_range_are_found_before_the_work(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: Any, message: str
 ) -> None:
-    monkeypatch.setattr(host_export, "load_trained", None)  # is not called
+    monkeypatch.setattr(command, "load_trained", None)  # is not called
     with pytest.raises(InputError, match=message):
         run_export(trained, tmp_path / "b", **options)
     assert list(tmp_path.iterdir()) == []
@@ -75,13 +75,13 @@ def test_options_that_make_no_sense(trained: BitymiTrainerConfig, tmp_path: Path
 def test_a_config_of_another_kind(tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text("just text")
     with pytest.raises(InputError, match="is not the configuration of a trained scene"):
-        host_export.load_trained(tmp_path / "config.yml")
+        load_trained(tmp_path / "config.yml")
 
 
 def test_a_place_that_will_not_do_is_found_before_the_work(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(host_export, "load_trained", None)  # is not called
+    monkeypatch.setattr(command, "load_trained", None)  # is not called
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="b cannot be written: .*file is not a folder.*--output-dir"):
         run_export(trained, tmp_path / "file" / "b")

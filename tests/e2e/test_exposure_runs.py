@@ -14,8 +14,8 @@ from PIL import Image
 
 from bitymi_ns.bake import learn
 from bitymi_ns.plugin.export.command import ExportAtlas
+from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.plugin.run.curve import FILE
 from bitymi_ns.sample import generate
 from tests.e2e.runs import checkpoint, different
 

@@ -22,8 +22,8 @@ from PIL import Image
 import bitymi_ns.capture
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.plugin.errors import InputError
-from bitymi_ns.plugin.export.command import load_trained, world_of
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.run_folder import POSES

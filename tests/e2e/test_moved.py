@@ -20,7 +20,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from bitymi_ns.bundle import strict_json
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.commands import REFUSED
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import evaluate

@@ -14,11 +14,11 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 from PIL import Image
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run import callbacks
+from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.plugin.run.curve import FILE
 from tests.plugin.data.captures import mixed_project
 
 Start = Callable[..., BitymiTrainerConfig]

@@ -15,9 +15,9 @@ import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.plugin.run.curve import FILE
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
 from tests.e2e.runs import Start, a_run_of, checkpoint, different
 

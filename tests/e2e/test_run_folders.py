@@ -17,7 +17,7 @@ from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.measure.report import build
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.runs import Start, checkpoint

@@ -13,9 +13,9 @@ import torch.distributed as dist
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.plugin.run.curve import FILE
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
 from tests.e2e.conftest import STEPS, small_run
 from tests.e2e.runs import Start, checkpoint, different

@@ -13,9 +13,9 @@ import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.plugin.run.curve import FILE
 from bitymi_ns.train import init
 from tests.e2e.runs import Start, checkpoint
 
@@ -70,9 +70,7 @@ def test_options_out_of_range(start: Start, group: str, option: str, value: Any,
         ns_train.main(config)
 
 
-@pytest.mark.parametrize(
-    "method", ["bitymi-quality", "bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"]
-)
+@pytest.mark.parametrize("method", ["bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"])
 def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
     config = start(method=method)
     config.max_num_iterations = 3

@@ -11,7 +11,7 @@ from bitymi_ns.bundle.manifest import WorldFrame
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.gaussians import gaussians_of
 from bitymi_ns.ops.reference.view_color import sh_basis
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 from tests.interchange.conftest import TURN
 from tests.interchange.test_surfel_colors import baked
 

@@ -13,7 +13,7 @@ from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.scene.tile_sizes import kernel_parameters
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 from tests.interchange.glb import read_glb
 
 LEVEL = 0.15

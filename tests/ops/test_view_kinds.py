@@ -16,7 +16,7 @@ from bitymi_ns import ops
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import check_lean, check_view_color
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, VIEW_PARAMETERS, kind_of
-from bitymi_ns.presets import preset_names, preset_path
+from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import LearningRates
 
@@ -126,6 +126,6 @@ def test_a_base_of_one_shows_its_unit_and_whole_numbers_of_terms_are_taken(kind:
 
 
 def test_every_kind_has_a_preset() -> None:
-    stated = [yaml.safe_load(preset_path(name).read_text("utf8")).get("scene", {}) for name in preset_names()]
+    stated = [yaml.safe_load(path.read_text("utf8")).get("scene", {}) for path in preset_dir().glob("*.yaml")]
     kinds = {scene.get("view_color", SceneConfig().view_color) for scene in stated}
     assert kinds == set(VIEW_COLORS)

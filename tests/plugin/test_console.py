@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.panel import Panel
 
 from bitymi_ns.plugin import console
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
 
 
@@ -72,7 +72,7 @@ def test_only_known_remarks_are_dropped_and_only_for_a_while(capsys: pytest.Capt
 
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        with console.quiet_host():
+        with console.filter_console():
             said = say()
         assert not warned
         for kept in ("factor of 16", "test_console.py", "no point cloud found", "a line"):
@@ -95,6 +95,6 @@ def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatc
 
 
 def test_brackets_in_what_the_host_says_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    with console.quiet_host():
+    with console.filter_console():
         CONSOLE.print("logging events to: o[/b]/run")
     assert "o[/b]/run" in capsys.readouterr().out

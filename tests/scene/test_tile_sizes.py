@@ -12,7 +12,7 @@ from bitymi_ns.scene.tile_sizes import (
     nyquist_resolution,
     voxel_along_axes,
 )
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]])  # u along x, v along y
 

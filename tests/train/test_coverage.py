@@ -8,9 +8,9 @@ import torch
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train import coverage
+from bitymi_ns.train import domain
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.coverage import views_without_surfels
+from bitymi_ns.train.domain import views_without_surfels
 from bitymi_ns.train.init import surfels_from_points
 
 
@@ -31,7 +31,7 @@ def camera(turned: bool = False) -> Camera:
 
 @pytest.mark.parametrize("sample", [1, 4096])
 def test_views_that_see_nothing_are_named(sample: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(coverage, "SAMPLE", sample)
+    monkeypatch.setattr(domain, "SAMPLE", sample)
     points = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [50.0, 0.0, 2.0], [90.0, 0.0, 2.0]])
     assert views_without_surfels(scene_at(points), [camera(), camera(turned=True)]) == [1]
 

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns.train import exposure as module
-from bitymi_ns.train.agreement import Agreement
 from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, corrected, exif_stops, seeds, settled
+from bitymi_ns.train.exposure_gains import ExposureGains
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View, shown
@@ -37,9 +37,9 @@ def uneven(views) -> list[View]:
 def started(kind: str, log_gains: Tensor, stops: Sequence[float] | None = None, points: int = 10**6) -> Exposure:
     """An exposure whose photographs were found to have these gains."""
     exposure = Exposure(kind, stops)
-    found = Agreement(log_gains, torch.full((len(log_gains),), points), 0.1, 0.05)
+    found = ExposureGains(log_gains, torch.full((len(log_gains),), points), 0.1, 0.05)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "measure_agreement", lambda *_: found)
+        patch.setattr(module, "estimate_gains", lambda *_: found)
         exposure.start(torch.zeros(1, 3), [None] * len(log_gains), 0.02)
     return exposure
 
@@ -161,11 +161,11 @@ def test_exif_is_where_the_corrections_start_from() -> None:
     ],
 )
 def test_auto_asks_the_photographs_and_then_exif(monkeypatch, stops, before, after, on) -> None:
-    found = Agreement(torch.zeros(3, 3), torch.zeros(3, dtype=torch.int64), before, after)
-    monkeypatch.setattr(module, "measure_agreement", lambda *_: found)
+    found = ExposureGains(torch.zeros(3, 3), torch.zeros(3, dtype=torch.int64), before, after)
+    monkeypatch.setattr(module, "estimate_gains", lambda *_: found)
     exposure = Exposure("auto", stops)
     exposure.start(torch.zeros(1, 3), [None] * 3, 0.02)
-    assert exposure.decided and (exposure.table is not None) == on and exposure.finding in exposure.sentence
+    assert exposure.decided and (exposure.table is not None) == on and exposure.reason in exposure.sentence
     assert on == (exposure.of(1) is not None)
 
 

@@ -11,7 +11,7 @@ import torch
 
 import bitymi_ns.train
 from bitymi_ns.train.config import DensifyConfig, LossConfig, TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule

@@ -11,8 +11,14 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.init import first_surfels_for, neighbour_distance, scene_extent, surfels_from_points
-from bitymi_ns.train.rotations import facing, tangents
+from bitymi_ns.train.init import (
+    facing,
+    first_surfels_for,
+    neighbour_distance,
+    scene_extent,
+    surfels_from_points,
+    tangents,
+)
 
 CENTERS = torch.tensor([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 1.0]])
 

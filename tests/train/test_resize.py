@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.nn import Parameter, ParameterDict
 
-from bitymi_ns.train.optimizers import adam
-from bitymi_ns.train.resize import cap_opacity, replace_rows
+from bitymi_ns.train.optimizers import adam, cap_opacity, replace_rows
 
 
 def table(n=6):

@@ -12,7 +12,7 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import strategy as module
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged
+from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.init import surfels_from_points
 from bitymi_ns.train.optimizers import make_optimizers
 from bitymi_ns.train.schedules import Schedule

@@ -21,8 +21,8 @@ from bitymi_ns.train.texels import (
     SMALLEST,
     blank_texels,
     coverage,
-    in_one_view,
-    looked_size,
+    single_view_coverage,
+    survey_scale,
     tiles_as_seen,
 )
 from bitymi_ns.train.views import at_size
@@ -89,13 +89,13 @@ def test_every_surfel_gets_a_tile_as_fine_as_it_is_seen(textured, views) -> None
 def test_there_are_no_more_texels_than_a_run_can_use(textured, views, monkeypatch) -> None:
     scene, cameras = textured(), [view.camera for view in views]
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
-    options = replace(OPTIONS, pixels_per_texel=0.01, looked_pixels_per_texel=8.0)
+    options = replace(OPTIONS, pixels_per_texel=0.01, rendered_pixels_per_texel=8.0)
     free = blank_texels(scene, views, len(views), options, to_come=1)  # few enough for any run
     smallest = SMALLEST**2 * len(scene)
     assert len(free.texels) > 2 * smallest
     monkeypatch.setattr(texels, "FEW", smallest)
     for share in (0.5, 0.8, 2.0):
-        to_come = share * len(free.texels) * options.looked_pixels_per_texel / pixels
+        to_come = share * len(free.texels) * options.rendered_pixels_per_texel / pixels
         bound = blank_texels(scene, views, len(views), options, to_come)
         if share < 1:
             assert 0.5 * share * len(free.texels) < len(bound.texels) <= share * len(free.texels)
@@ -112,7 +112,7 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
     assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
     half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views stand for all
     cameras = [view.camera for view in views]
-    least = LEAST_SHARE * in_one_view(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
+    least = LEAST_SHARE * single_view_coverage(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
     assert torch.allclose(half.share, 1 / (torch.maximum(2 * found, least) + OPTIONS.prior))
     with torch.no_grad():
         scene.surfels["sv_rgb"].fill_(0.2)  # no colour is cut off
@@ -130,9 +130,9 @@ def test_large_photographs_are_looked_through_at_half_their_size(textured, views
     whole = blank_texels(scene, views, len(views), OPTIONS)
     pixels = sum(camera.width * camera.height for camera in cameras) // len(cameras)
     for least, size in ((pixels, 1.0), (pixels // 4, 0.5), (0, 0.5)):
-        monkeypatch.setattr(texels, "LOOKED_PIXELS", least)
-        assert looked_size(cameras) == size
-    assert looked_size([]) == 1.0
+        monkeypatch.setattr(texels, "SURVEY_PIXELS", least)
+        assert survey_scale(cameras) == size
+    assert survey_scale([]) == 1.0
     field = blank_texels(scene, views, len(views), OPTIONS)
     halves = [at_size(view, view.camera.scaled(0.5), "cpu") for view in views]
     assert all(half.camera.width == round(0.5 * camera.width) for half, camera in zip(halves, cameras, strict=True))

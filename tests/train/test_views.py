@@ -7,16 +7,16 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train import views as views_module
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import (
-    ReducedViews,
+    DownscaledViews,
     View,
     as_float,
     at_size,
     background_color,
     covered_share,
-    judging_background,
+    downscale_image,
+    downscale_mask,
+    eval_background,
     over_background,
-    reduce_image,
-    reduce_mask,
     step_background,
     training_order,
 )
@@ -24,22 +24,22 @@ from bitymi_ns.train.views import (
 
 def test_area_average():
     image = torch.rand(8, 12, 3)
-    small = reduce_image(image, 6, 4)
+    small = downscale_image(image, 6, 4)
     torch.testing.assert_close(small, image.reshape(4, 2, 6, 2, 3).mean((1, 3)))
-    assert reduce_image(image, 12, 8) is image
+    assert downscale_image(image, 12, 8) is image
 
 
 def test_hidden_colours_do_not_bleed_in():
     image = torch.zeros(2, 2, 4)
     image[0, 0] = torch.tensor([1.0, 0.5, 0.0, 1.0])
     image[0, 1] = torch.tensor([0.0, 1.0, 1.0, 0.0])
-    torch.testing.assert_close(reduce_image(image, 1, 1)[0, 0], torch.tensor([1.0, 0.5, 0.0, 0.25]))
+    torch.testing.assert_close(downscale_image(image, 1, 1)[0, 0], torch.tensor([1.0, 0.5, 0.0, 0.25]))
 
 
 def test_a_reduced_pixel_counts_when_all_of_it_does():
     mask = torch.ones(4, 4, dtype=torch.bool)
     mask[0, 3] = False
-    assert reduce_mask(mask, 2, 2)[..., 0].tolist() == [[True, False], [True, True]]
+    assert downscale_mask(mask, 2, 2)[..., 0].tolist() == [[True, False], [True, True]]
 
 
 def test_background():
@@ -58,17 +58,17 @@ def test_photographs_with_alpha_train_over_another_colour_in_every_step_and_are_
     camera = Camera(torch.eye(4), torch.eye(3), 2, 2)
     opaque, transparent = View(camera, torch.ones(2, 2, 3)), View(camera, torch.ones(2, 2, 4))
     config = TrainConfig(seed=3)
-    assert step_background(config, opaque, 5, "cpu") is None and judging_background(config, "cpu") is None
+    assert step_background(config, opaque, 5, "cpu") is None and eval_background(config, "cpu") is None
     drawn = step_background(config, transparent, 5, "cpu")
     assert torch.equal(drawn, background_color("random", 3, 5)) and drawn.unique().numel() == 3
     white = TrainConfig(alpha_color="white")
-    assert judging_background(white, "cpu").tolist() == [1, 1, 1] and torch.equal(
+    assert eval_background(white, "cpu").tolist() == [1, 1, 1] and torch.equal(
         step_background(white, opaque, 5, "cpu"), torch.ones(3)
     )
     for view in (opaque, transparent):
         assert step_background(TrainConfig(background="white"), view, 5, "cpu").tolist() == [1, 1, 1]
         assert step_background(TrainConfig(background="black"), view, 5, "cpu") is None
-    assert judging_background(TrainConfig(background="black", alpha_color="white"), "cpu") is None
+    assert eval_background(TrainConfig(background="black", alpha_color="white"), "cpu") is None
 
 
 def test_bytes_become_unit_floats():
@@ -83,7 +83,7 @@ def test_a_picture_of_another_size_is_refused(cameras):
 
 
 def test_reduced_views_are_kept_until_the_resolution_changes(views):
-    reduced = ReducedViews(views)
+    reduced = DownscaledViews(views)
     half = reduced.at(1, 0.5)
     assert half.image.shape == (24, 24, 3) and (half.camera.width, half.camera.height) == (24, 24)
     assert reduced.at(1, 0.5) is half
@@ -92,9 +92,9 @@ def test_reduced_views_are_kept_until_the_resolution_changes(views):
 
 
 def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.MonkeyPatch) -> None:
-    everything = ReducedViews(views)
-    monkeypatch.setattr(views_module, "REDUCED_BYTES", 2 * everything.at(0, 0.5).nbytes)
-    few = ReducedViews(views)
+    everything = DownscaledViews(views)
+    monkeypatch.setattr(views_module, "DOWNSCALED_BYTES", 2 * everything.at(0, 0.5).nbytes)
+    few = DownscaledViews(views)
     for factor in (0.5, 0.25, 0.5):  # the room is there again at every size
         for _ in range(2):
             pairs = [(few.at(i, factor), everything.at(i, factor)) for i in range(len(views))]
@@ -122,7 +122,7 @@ def test_pixels_that_show_something(cameras) -> None:
 
 
 def test_views_are_drawn_without_replacement(views):
-    reduced = ReducedViews(views)
+    reduced = DownscaledViews(views)
     drawn = reduced.draw(4, torch.Generator().manual_seed(1), 1.0)
     assert len({id(view.camera) for view in drawn}) == 4
     assert len(reduced.draw(10, torch.Generator(), 1.0)) == len(views)

@@ -13,7 +13,7 @@ from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field import field as evaluate
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 LEVEL_SHARE = 0.1
 """Levels are left out while they change the residual by no more than this share of the tolerance."""

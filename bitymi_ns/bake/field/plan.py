@@ -20,7 +20,7 @@ from bitymi_ns.scene.tile_sizes import (
     visible_extent,
     voxel_along_axes,
 )
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 PAPER_EXTENT = 4.0  # e of the paper's rule
 

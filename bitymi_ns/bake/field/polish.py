@@ -24,10 +24,9 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import numbers, photometric
-from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling
-from bitymi_ns.train.views import View, background_changes, step_background, training_order
+from bitymi_ns.train.views import OnDemand, View, background_changes, step_background, training_order
 
 
 @dataclass

@@ -15,7 +15,7 @@ from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 
 def tile_points(means: Tensor, axes: Tensor, size: tuple[int, int], extent: float) -> Tensor:

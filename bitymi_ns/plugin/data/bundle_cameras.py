@@ -16,9 +16,9 @@ from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.interchange.bundle_cameras import NamedCamera, named_cameras
+from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.lens import Pinhole
 from bitymi_ns.plugin.data.views import NO_PHOTOS, OPENCV_AXES, Views, pinhole_cameras
-from bitymi_ns.plugin.errors import fail
 from bitymi_ns.trust import inside
 
 

@@ -10,7 +10,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
 MAX_OFF_AXIS = 80

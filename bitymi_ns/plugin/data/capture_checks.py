@@ -22,6 +22,7 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.recognise import Format, Found
+from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.colmap_views import mask_files
@@ -32,7 +33,6 @@ from bitymi_ns.plugin.data.pose_checks import check_spread
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
 from bitymi_ns.plugin.data.transforms_views import check_photographs_exist
-from bitymi_ns.plugin.errors import fail
 from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
 from bitymi_ns.trust import json_of
 

@@ -21,8 +21,8 @@ import pycolmap
 
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.files import encoding_of
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.point_files import color_bytes, ply_fault, read_points
-from bitymi_ns.plugin.errors import fail, listed, warn
 
 FORMS = (".txt", ".bin")
 

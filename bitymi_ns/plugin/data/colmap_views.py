@@ -14,11 +14,11 @@ from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 from bitymi_ns.capture.masks import USUAL_FOLDERS, downscaled_masks, mask_folder, mask_of
 from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError, SfmSettings
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.plugin.data.names import FileFinder, renamed_message
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 from bitymi_ns.trust import leads_inside
 
 TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

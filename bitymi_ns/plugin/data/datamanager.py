@@ -18,6 +18,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera
@@ -28,10 +29,8 @@ from bitymi_ns.plugin.data.initial_points import reading_points
 from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
-from bitymi_ns.plugin.errors import fail, listed, warn
-from bitymi_ns.train.memory import MemoryBudget, OnDemand
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import View, spread, training_order
+from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
 
 ALPHA_SAMPLES = 8
 """Photographs that are searched for transparent pixels."""

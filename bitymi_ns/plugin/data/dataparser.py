@@ -17,6 +17,7 @@ from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.files import encoding_of
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data import splits
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.colmap_views import (
@@ -43,7 +44,6 @@ from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import colmap_points
 from bitymi_ns.plugin.data.transforms_views import Transforms, check_photographs_exist, read_transforms
 from bitymi_ns.plugin.data.views import FrameOptions, Photograph, Pose, Views, fit_scale, make_views, select_views
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model."""

@@ -17,14 +17,13 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.images import ImageSummary, blank_masks, read_image, read_mask, summarize, wrong_size
 from bitymi_ns.plugin.data.lens import Lens
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import NO_PHOTOS, select_views
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.plugin.run.commands import MOVED
-from bitymi_ns.train.memory import MemoryBudget
-from bitymi_ns.train.views import over_background
+from bitymi_ns.train.views import MemoryBudget, over_background
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the images of a capture, training and held-out views together."""

@@ -16,12 +16,12 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.images import image_size, read_image
 from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.point_files import Points, read_points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
-from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.ply import PlyError
 from bitymi_ns.train.views import spread
 

@@ -17,8 +17,8 @@ from PIL import Image
 
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.panorama import PANORAMAS
+from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.images import wrong_size
-from bitymi_ns.plugin.errors import fail, warn
 
 MAX_VIEW_ANGLE = 110.0
 """Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
-from bitymi_ns.plugin.errors import listed
+from bitymi_ns.plugin.console import listed
 from bitymi_ns.trust import leads_inside
 
 Parts = tuple[str, ...]

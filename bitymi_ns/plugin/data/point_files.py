@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.plugin.errors import say
+from bitymi_ns.plugin.console import say
 from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
 
 VERTEX = "vertex"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 
 EXACT = 1e-3
 """Matrices this close to a rotation are taken as they are: float32, or four written digits."""

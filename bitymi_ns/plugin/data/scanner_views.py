@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.trust import json_of
 
 Row = tuple[Path, npt.NDArray[np.float64], tuple[float, ...], tuple[int, int] | None]

@@ -16,10 +16,10 @@ from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.recognise import Found, passed_over
 from bitymi_ns.capture.types import SfmSettings
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model, read_model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
 from bitymi_ns.plugin.data.images import THREADS, image_size
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 from bitymi_ns.trust import Refused, json_of, leads_inside
 
 MODEL = Path("sparse/0")

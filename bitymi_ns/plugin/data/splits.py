@@ -12,8 +12,8 @@ import numpy as np
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filename, get_train_eval_split_fraction
 
 from bitymi_ns.files import encoding_of
+from bitymi_ns.plugin.console import fail, listed
 from bitymi_ns.plugin.data.names import folded, without_extension
-from bitymi_ns.plugin.errors import fail, listed
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 NameLists = dict[str, list[str]]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from bitymi_ns.capture.recognise import is_model
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.splits import NameLists
-from bitymi_ns.plugin.errors import fail, listed, warn
 from bitymi_ns.trust import json_of
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."

@@ -17,6 +17,7 @@ import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
 from bitymi_ns.capture.panorama import PANORAMAS
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import colmap_distortion
@@ -32,7 +33,6 @@ from bitymi_ns.plugin.data.transforms import (
     take_lists,
 )
 from bitymi_ns.plugin.data.views import Photograph
-from bitymi_ns.plugin.errors import fail, listed, say, warn
 
 USED = {
     "frames", "file_path", "mask_path", "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",

@@ -16,12 +16,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
+from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import THREADS, image_size
 from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, make_lens, rescaled
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin, orient
-from bitymi_ns.plugin.errors import fail, say
 
 Pose = npt.NDArray[np.float64]
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -6,19 +6,14 @@ Also `python -m bitymi_ns.plugin.export.command`, should a future nerfstudio not
 from __future__ import annotations
 
 import copy
-import io
-import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 import yaml
-from nerfstudio.utils.eval_utils import eval_setup
-from PIL import Image
 
 from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn, rich_progress
 from bitymi_ns.bake.compact import Compact
@@ -26,32 +21,27 @@ from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.bundle.statistics import HeldOut
-from bitymi_ns.bundle.write import World
-from bitymi_ns.capture.frame import UP, read_frame
-from bitymi_ns.files import reason, write_file
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
+from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.compact_options import BundleFormat, CompactOptions
 from bitymi_ns.plugin.export.summary import print_summary
-from bitymi_ns.plugin.export.target import bundle_place, bundle_version, check_room
+from bitymi_ns.plugin.export.target import bundle_version, check_room, replace_file, reserve_bundle
+from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
-from bitymi_ns.train.losses import cc_psnr, psnr
-from bitymi_ns.train.views import View, as_bytes
+from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
 FEWEST_PASSES = 4
 """Steps of polish or fine-tuning per photograph; with fewer than this a line says that more may gain."""
 STEPS_AFTER_LEARNING = 100
-"""Of the fine-tuning of texels that learned in training or in the polish: what is left to learn is what the reduction
-of tiles and view colours changed."""
+"""Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
 
 
 @dataclass(kw_only=True)
@@ -98,15 +88,14 @@ class ExportAtlas(BakeOptions, CompactOptions):
     check_room: bool = True
     """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
     photographs: bool = False
-    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders; who is given the
-    bundle is given them."""
+    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders."""
 
     def main(self) -> None:
         """Run the export."""
         earlier = None
         bake_options = self._options()
         try:
-            with bundle_place(self.output_dir, self.overwrite):
+            with reserve_bundle(self.output_dir, self.overwrite):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
                     check_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
@@ -122,7 +111,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             fail(str(error), error)
 
     def _options(self) -> BakeOptions:
-        """Those of the bake; stops where any is out of its range, before anything is loaded."""
+        """Options of the bake; stops where one is out of its range, before anything is loaded."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions) if f.name != "format"})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
@@ -151,7 +140,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         return self._form == "compact"
 
     def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
-        """What learns from so many training photographs, and whether the bundle is compact."""
+        """Optimisation after the bake for so many training photographs."""
         if self.exact:
             return Learning()
         has_learned, textured = isinstance(model.scene.field, TexelField), model.scene.field is not None
@@ -254,86 +243,6 @@ def default_export() -> ExportAtlas:
     return ExportAtlas(load_config=tyro.MISSING, output_dir=tyro.MISSING)
 
 
-def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
-    """Configuration and pipeline of a trained scene, at a step of which there is a checkpoint or at the last one."""
-
-    def choose(config: Any) -> Any:
-        config.load_step = step
-        return config
-
-    if (load_config.parent / MANIFEST).is_file():
-        fail(
-            f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
-            "it was made from."
-        )
-    if not load_config.is_file():
-        fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
-    try:
-        config, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=choose)
-    except (yaml.YAMLError, AttributeError, KeyError) as error:
-        fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
-    except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
-        detail = (str(error).strip().splitlines() or [""])[0]
-        if isinstance(error, AssertionError) and not detail:  # the host's word for another kind of file
-            fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
-        fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
-    if not isinstance(pipeline.model, BitymiModel):
-        fail(
-            f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
-            "give the config.yml of a bitymi training run"
-        )
-    return config, pipeline
-
-
-def world_of(datamanager: Any) -> World:
-    """Where the scene lies in the capture's own frame, and that in the real world where its poses were found here."""
-    outputs = datamanager.train_dataparser_outputs
-    report = getattr(datamanager.dataparser, "poses_report", None)
-    frame = None if report is None else read_frame(report)
-    transform, scale = np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)
-    return World(transform, scale) if frame is None else World(transform, scale, UP, frame.up, frame.metres_per_unit)
-
-
-@torch.no_grad()
-def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
-    """The trained scene as a camera sees it."""
-    rgb = model.render(camera, model.background, maps=False).rgb
-    buffer = io.BytesIO()
-    Image.fromarray(as_bytes(rgb).numpy()).save(buffer, format=format)
-    return buffer.getvalue()
-
-
-@torch.no_grad()
-def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
-    """PSNR in dB over the held-out views: means of bundle, trained scene and photographs against each other, also after
-    the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
-    rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
-    names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
-    names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")
-    means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
-    worst = round(min(row[0] for row in rows), 4)
-    return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
-
-
-@torch.no_grad()
-def held_out_psnr(
-    model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
-) -> list[list[float]]:
-    """Of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
-    bundle against photograph, and the last two after the affine fit of the colours."""
-    rows = []
-    background = model.background
-    for index in range(min(views, len(datamanager.eval_views))):
-        view = datamanager.eval_views[index]
-        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
-        baked = render_baked(view.camera.to("cpu")).clamp(0.0, 1.0)
-        photo = view.target(background.cpu(), "cpu")
-        mask = None if view.mask is None else view.mask.cpu()
-        of_photo = [measure(rgb, photo, mask) for measure in (psnr, cc_psnr) for rgb in (neural, baked)]
-        rows.append([psnr(baked, neural, mask), *of_photo])
-    return rows
-
-
 def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> bytes:
     """The config.yml with which nerfstudio's tools open the bundle.
 
@@ -346,14 +255,6 @@ def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> b
     config.optimizers = {}
     vars(config).pop("read_from", None)
     return yaml.dump(config).encode("utf8")
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
-    try:
-        write_file(path, data)
-    except OSError as error:
-        fail(f"{path} could not be written: {reason(error, path)}.", error)
 
 
 def main() -> None:

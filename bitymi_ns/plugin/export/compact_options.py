@@ -8,22 +8,22 @@ from typing import Literal
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.poster import most_bytes
-from bitymi_ns.plugin.errors import fail, say
+from bitymi_ns.plugin.console import fail, say
 
 BundleFormat = Literal["compact", "bc7", "uint8", "fp16"]
 _MUCH_SMALLER = 0.9
 MANIFEST_BYTES = 28_000
-"""Of bundle.json and config.yml, at most about."""
+"""Upper estimate of bundle.json and config.yml."""
 
 
 @dataclass(kw_only=True)
 class CompactOptions:
-    """What a compact bundle is like."""
+    """Size and quality of a compact bundle."""
 
     interchange: bool = False
     """Write surfels.ply into a compact bundle, too, for other programs; those of other formats have it."""
     compact_error: float = Compact.share
-    """How much making it compact may add to the mean square error against the training photographs, as a share of it,
+    """Share by which compacting may raise the mean square error against the training photographs,
     before the texels are tuned; less where texels would then be too coarse to learn. The bytes go where they save most
     of it: to surfels, view colours or texels."""
     target_mb: float | None = None
@@ -59,7 +59,7 @@ class CompactOptions:
             fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
 
     def state_size(self, written: int) -> None:
-        """Says so where a bundle of so many bytes is much smaller than was asked for."""
+        """Print a note where the bundle is much smaller than --target-mb."""
         if self.target_mb is not None and written < _MUCH_SMALLER * 1e6 * self.target_mb:
             say(
                 f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: with more, the "
@@ -67,7 +67,7 @@ class CompactOptions:
             )
 
     def compact_of(self, beside: int) -> Compact:
-        """How the bake is made compact.
+        """Make the options of the compact bake.
 
         Args:
             beside: bytes of other files, such as the preview.

@@ -1,4 +1,4 @@
-"""What an export says when it is done: what was written, what was left out, and what it cost."""
+"""Summary table of an export."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.bundle.statistics import FineTuning, Percentiles
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
-from bitymi_ns.plugin.errors import say
+from bitymi_ns.plugin.console import say
 from bitymi_ns.trust import printable
 
 
@@ -23,7 +23,7 @@ def decibels(value: float | None) -> str:
 
 
 def print_summary(folder: Path, info: Manifest) -> None:
-    """What was written, what was left out, and what it cost."""
+    """Print what was written, what was left out, and what it cost."""
     statistics = info.statistics
     surfels = statistics.surfels
     table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
@@ -105,7 +105,7 @@ def print_savings(table: Table, info: Manifest) -> None:
 
 
 def print_view_color(table: Table, info: Manifest) -> None:
-    """What the surfels keep of their view colours, and what that saves and costs."""
+    """Add rows for the reduced view colours: kept terms, bytes, error."""
     lean, stored = info.statistics.view_color, info.files[info.surfels.file].bytes
     if lean is None:
         table.add_row("View colour", "all of it is kept")
@@ -125,20 +125,20 @@ def print_view_color(table: Table, info: Manifest) -> None:
 
 
 def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
-    """What the polish or the fine-tuning gained, and why it ended."""
+    """Add rows for the polish or the fine-tuning: steps, time, gain."""
     if not tuned.steps:
-        table.add_row(name, f"none: {tuned.views} training views are too few to set some aside")
+        table.add_row(name, f"none: {tuned.views} training views are too few for validation views")
         return
     table.add_row(name, f"{tuned.steps} steps, {tuned.seconds:.0f} s")
     if tuned.steps < tuned.steps_asked:
         table.add_row("", f"(stopped early at step {tuned.steps} of {tuned.steps_asked}: no gain on the")
-        table.add_row("", f"set-aside training views for {tuned.steps - tuned.best_step} steps)")
-    gains = {"... set-aside training views": tuned.psnr_held_in, "... held-out views": tuned.psnr_held_out}
+        table.add_row("", f"validation views for {tuned.steps - tuned.best_step} steps)")
+    gains = {"... validation views": tuned.psnr_held_in, "... held-out views": tuned.psnr_held_out}
     for views, gain in gains.items():
         if gain is not None:
             table.add_row(views, f"{gain.before:.2f} -> {gain.after:.2f} dB")
 
 
 def percentiles_text(error: Percentiles) -> str:
-    """Of an error in 8-bit steps."""
+    """Format percentiles of an error in 8-bit steps."""
     return f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"

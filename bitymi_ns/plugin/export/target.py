@@ -1,4 +1,4 @@
-"""Whether what a command makes will find its place: found out before the work."""
+"""Checks of the output folder before the work: writable, free, with enough disk space."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
-from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text
-from bitymi_ns.plugin.errors import fail, warn
+from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text, write_file
+from bitymi_ns.plugin.console import fail, warn
 
 SURFEL_BYTES = 60 * 4
 """Bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments."""
@@ -19,7 +19,7 @@ TYPICAL_SIDE = 32
 """Side of a texture tile in texels, estimated generously: within a tolerance most are far smaller."""
 
 
-def see_writable(path: Path) -> None:
+def require_writable(path: Path) -> None:
     """Stop where a file or folder cannot be written."""
     try:
         check_writable(path)
@@ -28,8 +28,8 @@ def see_writable(path: Path) -> None:
 
 
 @contextmanager
-def bundle_place(folder: Path, overwrite: bool) -> Iterator[None]:
-    """Hold the place of a bundle; stop where another process does, or where a bundle may not or cannot be written."""
+def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
+    """Lock the folder of a bundle; stop where another process has it, or a bundle may not or cannot be written."""
     with ExitStack() as stack:
         try:
             stack.enter_context(reserved(folder, warn))
@@ -74,9 +74,17 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: 
 
 
 def bundle_version(folder: Path) -> tuple[int, int] | None:
-    """What tells a bundle from another one in its place; None where there is none."""
+    """Identity of the bundle file in a folder, inode and time; None where there is none."""
     try:
         found = (folder / MANIFEST).stat()
     except OSError:
         return None
     return found.st_ino, found.st_mtime_ns
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    try:
+        write_file(path, data)
+    except OSError as error:
+        fail(f"{path} could not be written: {reason(error, path)}.", error)

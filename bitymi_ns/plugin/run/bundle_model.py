@@ -1,8 +1,16 @@
-"""A bundle as a nerfstudio model: what ns-eval, ns-viewer and ns-render show of a baked scene."""
+"""A bundle as a nerfstudio model, for ns-eval, ns-viewer and ns-render.
+
+nerfstudio's tools read a config.yml and then look for a checkpoint at the path in it. A bundle has none, and may have
+been moved: `find_bundle` finds it, and `stub_checkpoint_dir` writes a stand-in for the checkpoint.
+"""
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import sys
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,14 +22,16 @@ from torch import Tensor
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.ops import webgpu
-from bitymi_ns.plugin.errors import fail
+from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.run.commands import folder_being_evaluated
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.scene.baked import FAST, BakedOutput
+from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 
 RENDERER = "BITYMI_RENDERER"
-"""Environment variable that goes before `BakedModelConfig.renderer`: ns-eval has no option for it."""
+"""Environment variable that overrides `BakedModelConfig.renderer`, because ns-eval has no option for it."""
 
 
 @dataclass
@@ -46,7 +56,7 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder, renderer = Path(self.config.bundle), self._renderer()
+        folder, renderer = Path(self.config.bundle), self._renderer_name()
         through_webgpu = renderer == "webgpu"
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
@@ -56,14 +66,14 @@ class BakedModel(SurfelModel):
         atlas = bundle.info.atlas
         self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
         self._bundle_bytes = download_bytes(folder, bundle.info)
-        self._scene = bundle.scene
-        self._scene.through_webgpu = through_webgpu
+        bundle.scene.through_webgpu = through_webgpu
         if renderer == "fast":
-            self._scene.transmittance_min = FAST
+            bundle.scene.transmittance_min = FAST
+        self._renderer = SceneRenderer(bundle.scene)
         self._count = len(bundle)
 
-    def _renderer(self) -> str:
-        """The renderer that is asked for; stops where there is none of that name, or no WebGPU."""
+    def _renderer_name(self) -> str:
+        """The renderer of the options; stops where it is unknown, or WebGPU is not available."""
         asked = os.environ.get(RENDERER) or self.config.renderer
         if asked not in ("kernels", "fast", "webgpu"):
             fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
@@ -76,10 +86,10 @@ class BakedModel(SurfelModel):
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         try:
-            drawn = self._scene.render(camera.to(self.device), background=background.to(self.device), maps=maps)
+            drawn = self._renderer.render(camera.to(self.device), background.to(self.device), maps)
         except webgpu.WebGpuUnavailable as error:
             fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
-        if not self._scene.through_webgpu:
+        if not self._renderer.scene.through_webgpu:
             return drawn
         return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
 
@@ -96,10 +106,52 @@ class BakedModel(SurfelModel):
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)
-        if self._scene.tiles.device != self.device and not self._scene.through_webgpu:
-            self._scene = self._scene.to(self.device)
+        scene = self._renderer.scene
+        if scene.tiles.device != self.device and not scene.through_webgpu:
+            self._renderer = SceneRenderer(scene.to(self.device))
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         """Nothing to load: everything is in the bundle."""
         return torch.nn.modules.module._IncompatibleKeys([], [])
+
+
+MANIFEST = "bundle.json"
+
+
+def find_bundle(recorded: Path) -> Path:
+    """The folder of the bundle whose config.yml is being loaded."""
+    candidates = [*_loaded_from(), recorded]
+    for folder in candidates:
+        if (folder / MANIFEST).is_file() or folder.is_file():
+            return folder.absolute()
+    tried = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
+    fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
+
+
+def _loaded_from() -> list[Path]:
+    """Folders that may hold the config.yml being loaded: of eval_setup, else of the command line."""
+    evaluated = folder_being_evaluated()
+    folders = [] if evaluated is None else [evaluated]
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config"):
+            value = value or (sys.argv[i + 1] if i + 1 < len(sys.argv) else "")
+            folders.append(Path(value).absolute().parent)
+    return folders
+
+
+def stub_checkpoint_dir(bundle: Path) -> Path:
+    """A temporary folder with an empty checkpoint, named after the bundle.
+
+    nerfstudio insists on a checkpoint file. It is not kept in the bundle, so that a bundle holds no pickled data. Its
+    path ends up in the results of ns-eval, where `bitymi report` tells by it that they are those of a bundle.
+    """
+    scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
+    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
+    folder = scratch / bundle.name / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    torch.save(
+        {"step": 0, "pipeline": {}, "optimizers": {}, "schedulers": {}, "scalers": {}}, folder / "step-000000000.ckpt"
+    )
+    return folder

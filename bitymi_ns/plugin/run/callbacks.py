@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
@@ -13,22 +15,22 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.files import reason, write_file
+from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.data.images import exposure_stops
-from bitymi_ns.plugin.errors import fail, listed, say, warn
-from bitymi_ns.plugin.run.curve import FILE, TrainingCurve, points
 from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train import bounds
+from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.coverage import views_without_surfels
+from bitymi_ns.train.domain import views_without_surfels
 from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
 from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.memory import OnDemand
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import TrainingData, View, covered_share
+from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
+from bitymi_ns.trust import json_of, no_links
 
 
 class TrainingRun:
@@ -48,16 +50,6 @@ class TrainingRun:
         curve_points: int,
         curve_views: int,
     ) -> None:
-        """
-        Args:
-            scene: what is learned.
-            config: training options.
-            attributes: nerfstudio's trainer, pipeline and optimisers.
-            metadata: what the data manager says about the capture.
-            background: [3] colour behind held-out views.
-            resume_state: `state` of the run that is continued; empty = a new run.
-            curve_points, curve_views: of the training curve.
-        """
         trainer, pipeline = attributes.trainer, attributes.pipeline
         if trainer is None or pipeline is None or attributes.optimizers is None:
             raise ValueError("a training run needs nerfstudio's trainer, pipeline and optimisers")
@@ -101,7 +93,7 @@ class TrainingRun:
             "method_name": trainer.config.method_name,
         }
         self._held_back = False  # whether it was said that densification meets its bound
-        for sentence in bounds.short_run(
+        for sentence in limits.short_run(
             self.training.schedule,
             len(self.datamanager.train_dataset),
             scene.config.texture == "hash",
@@ -182,7 +174,7 @@ class TrainingRun:
         if report.get("held_back") and not self._held_back:
             self._held_back = True
             most = self.training.strategy.most
-            warn(bounds.held_back(int(report["held_back"]), most, self.config))
+            warn(limits.held_back(int(report["held_back"]), most, self.config))
         if report:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
         if step in self.curve_steps:
@@ -230,3 +222,46 @@ class TrainingRun:
             self.background.device,
         )
         return None if math.isnan(quality.psnr) else quality
+
+
+FILE = "training_curve.jsonl"
+
+
+class TrainingCurve:
+    """Appends points to the file of a run; a resumed run keeps the points up to its checkpoint."""
+
+    def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
+        self.path = path
+        source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
+            write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
+        except OSError as error:
+            fail(f"the training curve {path} cannot be written: {reason(error, path)}.", error)
+
+    def add(self, point: dict[str, Any]) -> None:
+        """Write one point, whole and at once. A full disk costs the point, not the run."""
+        try:
+            with open(self.path, "a", encoding="utf8", opener=no_links) as file:
+                file.write(json.dumps(point) + "\n")
+        except OSError as error:
+            warn(f"A point of the training curve {self.path} could not be written: {reason(error, self.path)}.")
+
+
+def _points_until(path: Path, steps: int) -> list[str]:
+    kept = []
+    for line in path.read_text("utf8").splitlines():
+        try:
+            if json_of(line)["step"] <= steps:
+                kept.append(line)
+        except (ValueError, KeyError, TypeError):
+            continue  # cut off when the run was killed
+    return kept
+
+
+def points(total: int, count: int) -> frozenset[int]:
+    """The steps after which the curve gets a point: `count` of them, evenly spaced, the last step included."""
+    if count <= 0:
+        return frozenset()
+    return frozenset(max(0, round(total * (i + 1) / count) - 1) for i in range(count))

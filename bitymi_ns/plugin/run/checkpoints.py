@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from bitymi_ns.files import complete_file, reason
-from bitymi_ns.plugin.errors import fail, listed, warn
+from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.config import SceneConfig
 
 EXTRA_STATE = "_extra_state"
@@ -28,7 +28,7 @@ MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragm
 """Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters
 mean, only how they are drawn or learned."""
 _READING = (RuntimeError, EOFError, OSError, LookupError, ValueError, TypeError, AttributeError)
-"""What torch.load raises for files that are not as it wrote them."""
+"""Errors of torch.load for damaged files."""
 
 
 def allow_numpy_scalars() -> None:
@@ -86,7 +86,7 @@ def newest_step(folder: Path) -> int:
 
 
 def path_of(folder: Path, step: int) -> Path:
-    """Where the checkpoint of a step is kept."""
+    """Path of the checkpoint of a step."""
     return folder / f"step-{step:09d}.ckpt"
 
 

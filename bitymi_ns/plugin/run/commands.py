@@ -1,5 +1,4 @@
-"""The nerfstudio command that loads one of our scenes: which it is, whether it can work on them, and where the capture
-is that it needs."""
+"""nerfstudio's other commands on our scenes: detection, refusal of unsupported ones, moved captures, and ns-viewer."""
 
 from __future__ import annotations
 
@@ -10,7 +9,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from bitymi_ns.plugin.errors import fail
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from bitymi_ns.plugin.console import fail
 
 DATA = "BITYMI_DATA"
 """Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
@@ -27,7 +29,7 @@ REFUSED = {
     "ExportMarchingCubesMesh": f"ns-export marching-cubes needs a field of distances, which surfels have not. {_MESH}",
     "ExportGaussianSplat": f"ns-export gaussian-splat is for splatfacto. {_MESH}",
 }
-"""What cannot work on a scene of surfels, by the class of nerfstudio's script, and what does."""
+"""Classes of nerfstudio's scripts that cannot work on surfels, and what does instead."""
 SCRIPTS = ("nerfstudio.scripts.", "__main__")
 
 
@@ -56,16 +58,58 @@ def refuse_others() -> None:
 
 def moved_capture(datamanager: Any) -> None:
     """Read the capture where `DATA` says it is now, if it says anything."""
-    given = os.environ.get(DATA)
-    if not given:
+    if not os.environ.get(DATA):
         return
-    place = Path(os.path.expanduser(given)).absolute()
-    if not place.exists():
-        fail(f"{DATA} says that the capture is {place}, which does not exist. Correct it.")
-    datamanager.data = place
-    datamanager.dataparser.data = place
+    folder = Path(os.path.expanduser(os.environ[DATA])).absolute()
+    if not folder.exists():
+        fail(f"{DATA} names {folder} as the capture, which does not exist. Correct it.")
+    datamanager.data = datamanager.dataparser.data = folder
 
 
 def how_to_say_where() -> str:
-    """How to tell the running command where its capture is."""
+    """Advice: the option or variable by which the running command finds its capture."""
     return "Give its folder with --data." if folder_being_evaluated() is None else MOVED
+
+
+LOOPBACK = "127.0.0.1"
+"""The address that only this machine can reach. nerfstudio's default, 0.0.0.0, is open to the network."""
+HOST_OPTION = "--viewer.websocket-host"
+SCRIPTS = ("nerfstudio.scripts.viewer.run_viewer", "__main__")
+
+
+def adopt_viewer(config: Any) -> None:
+    """Have ns-viewer, where it is the command that loads `config`, show this scene by our rules.
+
+    ns-viewer replaces the recorded viewer options by those of its own command line, so config.yml cannot set the host;
+    and it waits for Ctrl-C in a loop that ends in a traceback. Both are put right around its `_start_viewer`.
+    """
+    for name in SCRIPTS:
+        script = sys.modules.get(name)
+        start = getattr(script, "_start_viewer", None)
+        if start is not None:
+            script._start_viewer = _ours_for(config, start)  # type: ignore[union-attr]
+
+
+def _ours_for(config: Any, start: Any) -> Any:
+    def start_viewer(shown: Any, *args: Any) -> None:
+        if shown is not config:
+            start(shown, *args)
+            return
+        for pipeline in args[:1]:  # photographs that are gone are no hindrance to it
+            for name in ("train_dataset", "eval_dataset"):
+                dataset = getattr(getattr(pipeline, "datamanager", None), name, None)
+                if dataset is not None:
+                    dataset.gray_images = True
+        if shown.viewer.websocket_host == ViewerConfig().websocket_host and not _host_given():
+            shown.viewer.websocket_host = LOOPBACK
+        CONSOLE.print("Ctrl-C ends the viewer.")
+        try:
+            start(shown, *args)
+        except KeyboardInterrupt:
+            CONSOLE.print("\nThe viewer has ended.")
+
+    return start_viewer
+
+
+def _host_given() -> bool:
+    return any(argument.partition("=")[0].replace("_", "-") == HOST_OPTION for argument in sys.argv)

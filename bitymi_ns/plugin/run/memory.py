@@ -1,4 +1,4 @@
-"""The memory that training or an export will take on the CPU, stated before it starts.
+"""Estimate of the memory that training or an export takes on the CPU, printed before it starts.
 
 What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
 a few views. The other numbers are measured; they belong to the default preset.
@@ -6,7 +6,10 @@ a few views. The other numbers are measured; they belong to the default preset.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 import psutil
 import torch
@@ -16,14 +19,14 @@ from bitymi_ns.bake.view_color_rate import choice_bytes
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES
-from bitymi_ns.plugin.errors import say, warn
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
-from bitymi_ns.train.views import REDUCED_BYTES, spread
+from bitymi_ns.train.views import DOWNSCALED_BYTES, spread
 
 COUNTED_VIEWS = 3
 """Views whose fragments are counted."""
@@ -36,7 +39,7 @@ PER_FRAGMENT = 36
 PER_SHADED_FRAGMENT = 32
 """Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
 PER_PIXEL = 400
-"""Bytes: pictures, gradients and maps of a view, and the ten views that are looked at for the multi-view scores."""
+"""Bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores."""
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
@@ -75,18 +78,18 @@ def state_training(
     to_come: int = 0,
     processes: int = 1,
 ) -> None:
-    """Say what a training run will take.
+    """Print the memory estimate of a training run.
 
     Args:
         scene: as the run finds it.
         cameras: of the training views, on the CPU.
         most_surfels: that densification may make; 0 = any number.
         texels: of those that will learn; None = none will.
-        to_come: views that they learn from, each counted as often as it is looked at.
+        to_come: views that they learn from, counted with repetition.
         processes: of the run, each of which takes as much.
     """
     pixels, total = _pixels(cameras)
-    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(REDUCED_BYTES, 6 * total)
+    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
     surfels = max(len(scene), most_surfels)
@@ -102,7 +105,7 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Say what an export will take.
+    """Print the memory estimate of an export.
 
     Args:
         scene: a trained one.
@@ -128,12 +131,35 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
 
 
+def available_memory() -> float:
+    """Bytes that this process may have, with what it has already: of the machine, within its control group's limit."""
+    return min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
+
+
+def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/proc/self/cgroup")) -> float:
+    """Bytes that the control groups (v2 and v1) of this process may take; infinite where none has a limit."""
+    found = [math.inf]
+    with suppress(OSError):  # no Linux
+        for line in cgroups.read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            base, name = (mount / "memory", "memory.limit_in_bytes") if controllers else (mount, "memory.max")
+            folder = base / path.lstrip("/")
+            for each in (folder, *folder.parents):
+                with suppress(OSError, ValueError):  # of another namespace; "max"
+                    found.append(float((each / name).read_text()))
+                if each == base:
+                    break
+    return min(found)
+
+
 def _per_fragment(scene: Scene) -> float:
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 
 def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
-    """Those of the largest view, and of all together."""
+    """Pixels of the largest view, and of all views."""
     sizes = [camera.width * camera.height for camera in cameras]
     return max(sizes), sum(sizes)
 
@@ -144,8 +170,7 @@ def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> 
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
     say(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.")
-    # what this process has taken already is a part of what it needs
-    available = psutil.virtual_memory().available + psutil.Process().memory_info().rss
+    available = available_memory()
     if needed > available:
         warn(
             f"That is more than the {available / 1e9:.1f} GB that this machine has available. Close other programs, or "

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.plugin.errors import warn
+from bitymi_ns.plugin.console import warn
 from bitymi_ns.plugin.run import lpips
 from bitymi_ns.train.losses import cc_psnr, psnr
 

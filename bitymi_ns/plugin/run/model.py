@@ -5,28 +5,32 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 import tyro
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
-from bitymi_ns.plugin.errors import fail
+from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.run.callbacks import TrainingRun
 from bitymi_ns.plugin.run.checkpoints import STATE_VERSION
-from bitymi_ns.plugin.run.scene_setup import new_scene
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.scene.scene import GEOMETRY, Scene
+from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.domain import build_scene
+from bitymi_ns.train.init import first_surfels_for
 from bitymi_ns.train.losses import photometric
-from bitymi_ns.train.views import View, judging_background
+from bitymi_ns.train.views import View, eval_background
 
 SURFEL_PARAMETERS = (*GEOMETRY, *VIEW_PARAMETERS)
 PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
@@ -39,9 +43,9 @@ class BitymiModelConfig(SurfelModelConfig):
 
     _target: type = field(default_factory=lambda: BitymiModel)
     scene: SceneConfig = field(default_factory=SceneConfig)
-    """What the scene is made of."""
+    """Representation of the scene."""
     train: TrainConfig = field(default_factory=TrainConfig)
-    """How it is trained."""
+    """Training options."""
     steps: tyro.conf.Suppress[int | None] = None
     """Length of the run, where one is going to be made."""
     curve_points: int = 20
@@ -94,8 +98,8 @@ class BitymiModel(SurfelModel):
 
     @property
     def background(self) -> Tensor:
-        """[3]: see `judging_background`."""
-        color = judging_background(self.train_config, self.device)
+        """[3]: see `eval_background`."""
+        color = eval_background(self.train_config, self.device)
         return torch.zeros(3, device=self.device) if color is None else color
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -106,7 +110,7 @@ class BitymiModel(SurfelModel):
         return len(self.scene)
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Of a training view the terms of its loss, of cameras the pictures."""
+        """Loss terms of a training view, or pictures of cameras."""
         if isinstance(ray_bundle, View):
             if self._run is None:
                 raise RuntimeError("losses exist in training only")
@@ -142,8 +146,7 @@ class BitymiModel(SurfelModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Of a training view what `get_outputs` found; of a held-out one, which nerfstudio asks for where
-        --steps-per-eval-batch is given, the photometric loss."""
+        """Loss terms from `get_outputs`; of a held-out view (--steps-per-eval-batch) the photometric loss."""
         if "losses" in outputs:
             return outputs["losses"]
         target, mask = self.photograph(batch, outputs["rgb"])
@@ -179,3 +182,100 @@ class BitymiModel(SurfelModel):
                 # the same Parameter object: nerfstudio's optimisers hold it already
                 parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super().load_state_dict(state_dict, strict=True)
+
+
+FEW_POINTS = 50
+"""Number of points below which much of a scene may have none near it."""
+
+
+def new_scene(
+    points: tuple[Tensor, Tensor] | None,
+    scene_box: SceneBox | None,
+    config: SceneConfig,
+    train: TrainConfig,
+    metadata: dict[str, Any],
+    steps: int | None = None,
+) -> Scene:
+    """Surfels at the capture's points, or at random in its box, and an empty texture field around them.
+
+    Args:
+        points: positions [N, 3] and colours [N, 3] (uint8, or empty when the cloud has none).
+        scene_box: where random points are placed.
+        config: the representation.
+        train: training options.
+        metadata: what the data manager says about the capture.
+        steps: length of the run that is going to be made.
+    """
+    centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
+    if train.first_surfels is None and steps is not None and len(centers):
+        train = replace(train, first_surfels=first_surfels_for(steps, pixels / len(centers)))
+    xyz, rgb = _points(points)
+    declared = _corners(scene_box) if metadata.get("declares_box") else None
+    box = None
+    if not bool(torch.isfinite(xyz).all(1).any()):
+        box = _box_for_random_points(scene_box, len(xyz))
+    try:
+        with reporting_time("Making surfels of", len(xyz)):
+            scene, report = build_scene(
+                xyz,
+                rgb,
+                centers,
+                config,
+                train,
+                bounded=metadata.get("has_alpha", False),
+                image_pixels=pixels,
+                box=box,
+                declared=declared,
+            )
+    except ValueError as error:
+        fail(str(error), error)
+    for sentence in limits.start(report, train, pixels, config):
+        say(sentence)
+    if report.random:
+        say(f"Surfels are made of {report.random:,} random points.")
+    usable = report.given - report.not_finite - report.duplicates
+    if 0 < usable < FEW_POINTS:
+        warn(
+            f"The capture's point cloud has only {usable} different points to start from. If little appears, remove it "
+            "(ply_file_path in transforms.json) to start from random points."
+        )
+    if report.not_finite:
+        row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
+        warn(
+            f"{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
+            f"first is point {row}); they are left out."
+        )
+    return scene
+
+
+def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+    if points is None:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    xyz, rgb = points
+    xyz = xyz.detach().float().reshape(-1, 3)
+    if rgb.shape[:1] != xyz.shape[:1]:
+        return xyz, torch.full_like(xyz, 0.5)  # a cloud without colours
+    return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
+
+
+def _box_for_random_points(scene_box: SceneBox | None, given: int) -> Tensor | None:
+    """[2, 3] corners."""
+    if given:
+        fail(
+            f"all {given} points of the capture's point cloud are NaN or infinite. Make the cloud again, or remove "
+            "ply_file_path from transforms.json to start from random points."
+        )
+    return None if scene_box is None else _corners(scene_box)
+
+
+def _corners(scene_box: SceneBox) -> Tensor:
+    """[2, 3]: low and high corner."""
+    corners = scene_box.aabb.float().cpu().reshape(2, 3)
+    low, high = corners
+    if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):
+        fail(
+            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it in the "
+            "capture's files; in nerfstudio's own format give a point cloud (ply_file_path in transforms.json) or a "
+            "positive --scene-scale after `nerfstudio-data`."
+        )
+    return corners

@@ -5,68 +5,42 @@ A default is declared once, in the dataclass of the option; a file states what d
 
 from __future__ import annotations
 
-import dataclasses
-import types
-import typing
+import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Any
 
 import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import AdamConfig, TrainConfig
+from bitymi_ns.train.config import TrainConfig
 
 
 class PresetError(ValueError):
     """A preset file that cannot be used; the message names the file and the key."""
 
 
-@dataclass
-class TrainerOptions:
-    """How long a run is and what it leaves behind."""
-
-    iterations: int = 30_000
-    """Steps of a run when --max-num-iterations is not given."""
-    iterations_cpu: int = 3_000
-    """The same on a machine without a supported GPU."""
-    saves: int = 5
-    """Checkpoints written over a run."""
-    curve_points: int = 20
-    """Evaluations over a run, for the curve of quality against time; 0 = none."""
-    curve_views: int = 8
-    """Held-out views rendered for each of them, all for the last one; 0 = all."""
-    vis: str = "viewer"
-    """Default of --vis."""
-    quit_on_train_completion: bool = True
-    """End the process when training is done, also with the viewer."""
+class _Loader(yaml.SafeLoader):
+    """Reads 1e-3 as a number, which YAML 1.1 takes for text without a point."""
 
 
-@dataclass
-class DataOptions:
-    """How a capture is split and read."""
-
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """Rule by which photographs are held out, of nerfstudio's parsers."""
-    eval_interval: int = 8
-    """Of so many photographs one is held out, as is usual for 3D Gaussian splatting."""
-    points: Literal["auto", "triangulate", "random"] = "auto"
-    """Points to start from: the capture's or, where it has none, triangulated ones; triangulated ones; random ones."""
-    cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """How photographs are kept in memory."""
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
 
 
 @dataclass
 class Preset:
     """One method: the defaults that the dataclasses declare, changed by what its YAML file says."""
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     name: str
     description: str = ""
-    trainer: TrainerOptions = field(default_factory=TrainerOptions)
-    data: DataOptions = field(default_factory=DataOptions)
-    optimizer: AdamConfig = field(default_factory=AdamConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
@@ -85,7 +59,14 @@ def load_preset(name: str, folder: Path | None = None, changes: Mapping[str, Any
     folder = preset_dir() if folder is None else folder
     path = folder / f"{name}.yaml"
     values = _merged(_read_with_base(path, folder, ()), changes or {})
-    return build(Preset, {**values, "name": name}, path.name, "")
+    try:
+        # as JSON: lists become tuples, while true is no number and 3 no text
+        return TypeAdapter(Preset).validate_json(json.dumps({**values, "name": name}, default=str), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        unknown = first["type"] == "unexpected_keyword_argument"
+        why = "unknown key" if unknown else f"{first['msg'].lower()}, found {first['input']!r}"
+        raise PresetError(f"{path.name}: {'.'.join(map(str, first['loc']))}: {why}") from error
 
 
 def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[str, Any]:
@@ -96,7 +77,7 @@ def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[s
         where = f" (named as base of {above[-1].name})" if above else ""
         raise PresetError(f"there is no preset file {path}{where}; reinstall bitymi-ns")
     try:
-        values = yaml.safe_load(path.read_text("utf8"))
+        values = yaml.load(path.read_text("utf8"), _Loader)
     except yaml.YAMLError as error:
         raise PresetError(f"{path.name}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
@@ -116,50 +97,3 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
             value = _merged(result[key], value)
         result[key] = value
     return result
-
-
-def build(cls: type, values: dict[str, Any], file: str, prefix: str) -> Any:
-    """An instance of the dataclass `cls` from a mapping; unknown keys and wrong types are errors."""
-    hints = typing.get_type_hints(cls)
-    known = [f.name for f in dataclasses.fields(cls)]
-    for key in values:
-        if key not in known:
-            raise PresetError(f"{file}: {prefix}{key}: unknown key; known here: {', '.join(known)}")
-    return cls(**{key: _converted(value, hints[key], file, prefix + key) for key, value in values.items()})
-
-
-def _converted(value: Any, hint: Any, file: str, key: str) -> Any:
-    """`value` as the type `hint` asks for."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (Union, types.UnionType):
-        if value is None and type(None) in args:
-            return None
-        return _converted(value, next(a for a in args if a is not type(None)), file, key)
-    if dataclasses.is_dataclass(hint):
-        if not isinstance(value, dict):
-            raise PresetError(f"{file}: {key}: expected a group of options, found {value!r}")
-        return build(typing.cast(type, hint), value, file, key + ".")
-    if origin is Literal:
-        if value not in args:
-            raise PresetError(f"{file}: {key}: expected one of {', '.join(map(str, args))}, found {value!r}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, list) or (args[-1] is not Ellipsis and len(value) != len(args)):
-            count = "" if args[-1] is Ellipsis else f" of {len(args)} values"
-            raise PresetError(f"{file}: {key}: expected a list{count}, found {value!r}")
-        items = [args[0]] * len(value) if args[-1] is Ellipsis else args
-        return tuple(_converted(v, a, file, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, items, strict=True)))
-    return _converted_plain(value, hint, file, key)
-
-
-def _converted_plain(value: Any, hint: Any, file: str, key: str) -> Any:
-    if hint is float and isinstance(value, (int, float, str)) and not isinstance(value, bool):
-        try:
-            return float(value)  # YAML 1.1 reads 1e-3, without a point, as text
-        except ValueError:
-            pass
-    elif hint is Path and isinstance(value, str):
-        return Path(value)
-    elif isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
-        return value
-    raise PresetError(f"{file}: {key}: expected {getattr(hint, '__name__', hint)}, found {value!r}")

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from bitymi_ns import files
 from bitymi_ns.capture.report import FILES
+from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.colmap_views import Source
 from bitymi_ns.plugin.data.sfm_poses import write_kept_poses
-from bitymi_ns.plugin.errors import fail, warn
 from bitymi_ns.trust import check_no_links
 
 LOCK = ".lock"

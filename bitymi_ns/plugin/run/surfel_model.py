@@ -1,4 +1,4 @@
-"""What a trained and a baked scene have in common as nerfstudio models: outputs, metrics and images."""
+"""Base of the nerfstudio models of trained and baked scenes: outputs, metrics and images."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.plugin.console import InputError, warn
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
-from bitymi_ns.plugin.errors import InputError, warn
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import as_float, over_background, reduce_image, reduce_mask
+from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background
 
 OVERDRAW_SCALE = 64.0
 """Blended surfels at a pixel at which colour maps of overdraw end: the same in every picture, so that runs compare."""
@@ -41,7 +41,7 @@ class SurfelModel(Model):
     """Renders whole images from surfels."""
 
     measure_time = True
-    """Whether image metrics include the time of rendering; off while training."""
+    """Include render_ms in the image metrics; off while training."""
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -111,9 +111,9 @@ class SurfelModel(Model):
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
 
     def _say_once(self, message: str) -> None:
-        said: set[str] = self.__dict__.setdefault("_said", set())
-        if message not in said:
-            said.add(message)
+        warned: set[str] = self.__dict__.setdefault("_warned", set())
+        if message not in warned:
+            warned.add(message)
             warn(message)
 
     def _empty(self, height: int, width: int) -> dict[str, Tensor]:
@@ -125,9 +125,9 @@ class SurfelModel(Model):
     def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
         """[H, W, 3] the batch's photograph over the background, and [H, W, 1] its mask, at the size of a render."""
         height, width = rgb.shape[:2]
-        target = reduce_image(as_float(batch["image"].to(rgb.device)), width, height)
+        target = downscale_image(as_float(batch["image"].to(rgb.device)), width, height)
         mask = batch.get("mask")
-        mask = None if mask is None else reduce_mask(mask.to(rgb.device), width, height)
+        mask = None if mask is None else downscale_mask(mask.to(rgb.device), width, height)
         return over_background(target, self.background), mask
 
     def get_image_metrics_and_images(

@@ -15,15 +15,18 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import files
-from bitymi_ns.plugin.console import quiet_host, quiet_warnings, step_bar
-from bitymi_ns.plugin.errors import fail, say, warn
+from bitymi_ns.plugin.console import fail, filter_console, ignore_torch_warnings, say, step_bar, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
-from bitymi_ns.plugin.run.launcher import Others
+from bitymi_ns.plugin.run.launcher import Workers
 from bitymi_ns.train import optimizers
 from bitymi_ns.train.processes import Processes, ProcessesApart, ProcessLost
 
 if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler
+import math
+from dataclasses import dataclass, field
+
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the convention of shells."""
@@ -62,15 +65,15 @@ class BitymiTrainer(Trainer):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        with quiet_host():
+        with filter_console():
             super().__init__(*args, **kwargs)
         self.processes = Processes(self.local_rank, self.world_size)
-        self._others: Others | None = None
+        self._workers: Workers | None = None
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         self._stop_requested = False
         try:
-            with quiet_host():
+            with filter_console():
                 super().setup(test_mode)
         except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
@@ -124,14 +127,14 @@ class BitymiTrainer(Trainer):
             self._train_to_the_end()
             orderly = True
         except ProcessLost:
-            if self._others is None:
+            if self._workers is None:
                 raise
-            self._others.explain()
+            self._workers.explain()
         except ProcessesApart as error:
             fail(f"training cannot go on at step {self.step}: {error}.", error)
         finally:
-            if self._others is not None:
-                self._others.end(orderly)
+            if self._workers is not None:
+                self._workers.end(orderly)
             run_folder.leave(self.base_dir)
 
     def _train_to_the_end(self) -> None:
@@ -150,10 +153,10 @@ class BitymiTrainer(Trainer):
         restore_handler = self._catch_interrupt()
         try:
             if self.processes.count > 1 and self.processes.first:
-                self._others = Others(self.config, self.processes.count)
-                self._others.start()
+                self._workers = Workers(self.config, self.processes.count)
+                self._workers.start()
             self.config.max_num_iterations = total - self._start_step
-            with quiet_warnings(), step_bar(self._start_step, total) as self._show_step:
+            with ignore_torch_warnings(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
         except _StopAfterStep:
             self.save_checkpoint(self.step)
@@ -213,3 +216,42 @@ class BitymiTrainer(Trainer):
             for other in self.checkpoint_dir.glob("step-*.ckpt"):
                 if other.name < path.name:  # later ones are of a run that this one branched off from
                     other.unlink(missing_ok=True)
+
+
+class BitymiPipeline(VanillaPipeline):
+    """Data manager and model, as nerfstudio pairs them."""
+
+    def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
+        # as if alone: nerfstudio would wrap the model, to add gradients of parameters that keep their size
+        super().__init__(*args, **kwargs)
+        self.world_size = self.datamanager.world_size = world_size
+        self.datamanager.local_rank = local_rank
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load the parameters of a checkpoint."""
+        try:
+            super().load_pipeline(loaded_state, step)
+        except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
+            fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
+
+    def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
+        """Averages over images, without NaN, which JSON does not know.
+
+        The deviation of a single image is 0. A metric that an image has none of, because no pixel of it counts, is
+        left out.
+        """
+        if len(data_loader) == 0:
+            fail("there is no held-out view to evaluate: none was held out, or their masks exclude every pixel")
+        metrics = super().get_average_image_metrics(data_loader, *args, **kwargs)
+        missing = [k for k, v in metrics.items() if math.isnan(v) and not k.endswith("_std")]
+        if missing:
+            warn(f"{', '.join(missing)} is left out: there is a held-out view of which no pixel counts.")
+        kept = {k: v for k, v in metrics.items() if k.removesuffix("_std") not in missing}
+        return {k: 0.0 if math.isnan(v) else v for k, v in kept.items()}
+
+
+@dataclass
+class BitymiPipelineConfig(VanillaPipelineConfig):
+    """Configuration of the pipeline."""
+
+    _target: type = field(default_factory=lambda: BitymiPipeline)

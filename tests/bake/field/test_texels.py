@@ -5,7 +5,7 @@ import torch
 from bitymi_ns.bake.field.texels import evaluate_tiles
 from bitymi_ns.codec.packing import pack
 from bitymi_ns.codec.pages import tile_means
-from bitymi_ns.train.rotations import tangents
+from bitymi_ns.train.init import tangents
 
 
 @pytest.fixture

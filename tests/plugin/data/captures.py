@@ -12,9 +12,9 @@ from nerfstudio.data.utils import colmap_parsing_utils as reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.errors import InputError
 
 
 def load(data: Path, **dataparser: Any) -> BitymiDataManager:

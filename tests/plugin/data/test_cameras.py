@@ -6,8 +6,8 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
-from bitymi_ns.plugin.errors import InputError
 
 
 def rotation(generator: torch.Generator) -> torch.Tensor:

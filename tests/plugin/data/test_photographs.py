@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data import datamanager as module
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
-from bitymi_ns.plugin.errors import InputError
 from bitymi_ns.sample import generate
 
 WIDTH, HEIGHT = 48, 36

@@ -10,7 +10,7 @@ import torch
 
 from bitymi_ns.plugin.data import point_files
 from bitymi_ns.plugin.data.point_files import ply_fault, read_points
-from bitymi_ns.plugin.run.scene_setup import new_scene
+from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
 from tests.plugin.data.captures import load, printed

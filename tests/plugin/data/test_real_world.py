@@ -17,7 +17,7 @@ from bitymi_ns.bundle import check_files, check_world
 from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.export.command import world_of
+from bitymi_ns.plugin.export.trained import world_of
 from bitymi_ns.plugin.run.run_folder import POSES, keep_poses_report
 from tests.bake.conftest import surfels
 from tests.bake.scenes import write

@@ -11,8 +11,8 @@ from PIL import Image
 import bitymi_ns.capture
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError, SfmSettings
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data import sfm_poses
-from bitymi_ns.plugin.errors import InputError
 
 
 @pytest.mark.parametrize(

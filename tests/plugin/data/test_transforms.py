@@ -13,8 +13,8 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from PIL import Image
 
 from bitymi_ns.capture.recognise import recognise
+from bitymi_ns.plugin.console import InputError, say, warn
 from bitymi_ns.plugin.data import point_files
-from bitymi_ns.plugin.errors import InputError, say, warn
 from tests.plugin.data.captures import expect, images_of, load, load_any, load_with, printed
 
 

@@ -18,7 +18,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.export.command import world_of
+from bitymi_ns.plugin.export.trained import world_of
 from tests.plugin.data.captures import colmap_model, expect, images_of, load_any, printed
 
 UTM = np.array([500123.0, 4649876.0, 312.0])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import checkpoints
 from bitymi_ns.scene.config import SceneConfig
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch.distributed as dist
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import launcher
 
 
@@ -16,28 +16,28 @@ def process(status: int | None) -> SimpleNamespace:
 
 
 @pytest.fixture
-def others(monkeypatch: pytest.MonkeyPatch) -> launcher.Others:
+def others(monkeypatch: pytest.MonkeyPatch) -> launcher.Workers:
     """Two that run."""
     monkeypatch.setattr(launcher, "PATIENCE", 0.0)
-    found = launcher.Others.__new__(launcher.Others)
+    found = launcher.Workers.__new__(launcher.Workers)
     found._store = dist.TCPStore("127.0.0.1", 0, 3, is_master=True, wait_for_workers=False)
     found._processes = [process(None), process(None)]
     return found
 
 
-def test_what_went_wrong_in_another_process_is_told(others: launcher.Others) -> None:
+def test_what_went_wrong_in_another_process_is_told(others: launcher.Workers) -> None:
     others._processes[0] = process(launcher.LOST)  # because the other one ended
     others._store.set("why 2", "bitymi: there is no capture")
     with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: bitymi: there is no capture"):
         others.explain()
 
 
-def test_a_process_that_said_nothing(others: launcher.Others) -> None:
+def test_a_process_that_said_nothing(others: launcher.Workers) -> None:
     others._processes[1] = process(-9)
     with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: exit status -9"):
         others.explain()
 
 
-def test_processes_that_are_there_but_do_not_answer(others: launcher.Others) -> None:
+def test_processes_that_are_there_but_do_not_answer(others: launcher.Workers) -> None:
     with pytest.raises(InputError, match="the 3 processes of this run do not hear each other .* within 30 min"):
         others.explain()

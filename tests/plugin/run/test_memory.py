@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
@@ -59,7 +60,7 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     memory.state_training(one, [camera], 0)
     assert gigabytes(said(capsys)) == pytest.approx(0.8 + 1e-3 * memory.MARGIN * count, abs=0.1)
     monkeypatch.setattr(texels, "FEW", 0)
-    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    options = TexelConfig(pixels_per_texel=2.0, rendered_pixels_per_texel=10.0)
     for to_come, views in ((1000, memory.VIEWS_OF_TEXELS / 2.0), (20, 2.0)):
         monkeypatch.setattr(memory, "PER_TEXEL", 0)
         memory.state_training(one, [camera], 0, options, to_come)
@@ -101,7 +102,7 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
     for views in (30_000, 40_000):  # whose photographs are more than are kept
         memory.state_export(scene[0], [scene[1]] * views, 0, compact=compact)
     assert stated[1] - stated[0] == 10_000 * bytes_each * len(scene[0])
-    options = TexelConfig(pixels_per_texel=2.0, looked_pixels_per_texel=10.0)
+    options = TexelConfig(pixels_per_texel=2.0, rendered_pixels_per_texel=10.0)
     for views in (30_000, 40_000):
         memory.state_training(scene[0], [scene[1]] * views, 0, options, 1000)
     assert stated[3] - stated[2] == 10_000 * len(scene[0])
@@ -134,3 +135,20 @@ def test_an_export_takes_copies_of_the_texels_that_were_learned(
 def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:
     output = scene[0].render(scene[1])
     assert trace_cpu.count(output.projection) == len(output.fragments)
+
+
+@pytest.mark.parametrize(
+    ("groups", "file", "limit"),
+    [
+        ("0::/a/b", "a/memory.max", 5e9),
+        ("4:cpu:/a\n3:memory:/a/b", "memory/a/b/memory.limit_in_bytes", 5e9),
+        ("0::/a/b", "a/b/other", float("inf")),
+    ],
+)
+def test_the_limit_of_a_control_group_counts(tmp_path: Path, groups: str, file: str, limit: float) -> None:
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text("5000000000\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "cgroups").write_text(groups + "\n")
+    assert memory.memory_limit(tmp_path, tmp_path / "cgroups") == limit
+    assert memory.memory_limit(tmp_path, tmp_path / "none") == float("inf")

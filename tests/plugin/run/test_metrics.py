@@ -11,11 +11,11 @@ import pytest
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
-from bitymi_ns.plugin.errors import InputError
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import metrics
-from bitymi_ns.plugin.run.curve import TrainingCurve, points
-from bitymi_ns.plugin.run.pipeline import BitymiPipeline
-from bitymi_ns.train.clock import Stopwatch
+from bitymi_ns.plugin.run.callbacks import TrainingCurve, points
+from bitymi_ns.plugin.run.trainer import BitymiPipeline
+from bitymi_ns.train.step import Stopwatch
 
 
 def pair() -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,21 +8,12 @@ import pytest
 import yaml
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.plugin.run.preset import DataOptions, Preset, PresetError, TrainerOptions, load_preset
-from bitymi_ns.presets import preset_names, preset_path
+from bitymi_ns.plugin.run.preset import Preset, PresetError, load_preset
+from bitymi_ns.presets import preset_dir, preset_names
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import AdamConfig
 
-METHODS = [
-    "bitymi",
-    "bitymi-quality",
-    "bitymi-fast",
-    "bitymi-sb",
-    "bitymi-sg",
-    "bitymi-sh",
-    "bitymi-field",
-    "bitymi-notexture",
-]
+METHODS = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
 
 
 def test_the_presets_are_those_that_are_registered() -> None:
@@ -48,7 +39,7 @@ def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_preset_states_no_default_again(name: str) -> None:
-    values = yaml.safe_load(preset_path(name).read_text("utf8"))
+    values = yaml.safe_load((preset_dir() / f"{name}.yaml").read_text("utf8"))
     base = values.pop("base", None)
     assert repeated(values, Preset(name) if base is None else load_preset(base)) == []
 
@@ -66,7 +57,7 @@ def documented(cls: type) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("cls", [TrainerOptions, DataOptions, SceneConfig, AdamConfig, BakeOptions])
+@pytest.mark.parametrize("cls", [SceneConfig, AdamConfig, BakeOptions])
 def test_every_option_is_documented_where_it_is_declared(cls: type) -> None:
     assert documented(cls) == []
 
@@ -100,13 +91,14 @@ def write(folder: Path, text: str, name: str = "mine") -> Path:
     ("text", "message"),
     [
         ("train:\n  loss:\n    falloff_wieght: 1.0", r"mine\.yaml: train\.loss\.falloff_wieght: unknown key"),
-        ("scene:\n  levels: four", r"mine\.yaml: scene\.levels: expected int, found 'four'"),
-        ("scene:\n  levels: true", r"scene\.levels: expected int"),
-        ("scene:\n  view_color: xy", r"scene\.view_color: expected one of sv, sh, sb, sg"),
-        ("bake:\n  tolerance: 1.0", r"mine\.yaml: bake: unknown key; known here: .*scene, train"),
-        ("scene: 3", r"mine\.yaml: scene: expected a group of options"),
-        ("train:\n  lr:\n    means: [1.0]", r"train\.lr\.means: expected a list of 2 values"),
-        ("train:\n  densify:\n    final_prune_steps: [1, x]", r"final_prune_steps\[1\]: expected int"),
+        ("scene:\n  levels: four", r"mine\.yaml: scene\.levels: .*valid integer, found 'four'"),
+        ("scene:\n  levels: true", r"scene\.levels: .*valid integer, found True"),
+        ("scene:\n  view_color: xy", r"scene\.view_color: .*'sv', 'sh', 'sb' or 'sg', found 'xy'"),
+        ("bake:\n  tolerance: 1.0", r"mine\.yaml: bake: unknown key"),
+        ("scene: 3", r"mine\.yaml: scene: .*found 3"),
+        ("train:\n  lr:\n    means: [1.0]", r"train\.lr\.means\.1: .*required"),
+        ("train:\n  densify:\n    final_prune_steps: [1, x]", r"final_prune_steps\.1: .*valid integer"),
+        ("train:\n  loss:\n    ssim_weight: 2.0", r"train\.loss\.ssim_weight: .*less than or equal to 1, found 2"),
         ("- a\n- b", r"mine\.yaml: expected a mapping"),
         ("a: [", r"mine\.yaml: not valid YAML"),
         ("base: nowhere", r"no preset file .*nowhere\.yaml .*named as base of mine\.yaml"),

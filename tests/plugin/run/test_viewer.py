@@ -14,8 +14,8 @@ pytest.importorskip("nerfstudio")
 import tyro
 from nerfstudio.scripts.viewer import run_viewer
 
+from bitymi_ns.plugin.run.commands import adopt_viewer
 from bitymi_ns.plugin.run.config import method_config
-from bitymi_ns.plugin.run.viewer import adopt_viewer
 
 
 @pytest.fixture

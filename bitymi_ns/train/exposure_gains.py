@@ -1,4 +1,4 @@
-"""How photographs agree on the colours of the sparse points: by what factors they differ, and whether that is all.
+"""Exposure gains of photographs, estimated from the colours of the sparse points.
 
 A point that a photograph shows has there the colour that it has elsewhere, times a gain of the photograph per channel.
 In logarithms, observation = point + photograph: two-way data, solved by medians in turn, which nothing that stands in
@@ -21,9 +21,9 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View, as_float
 
 POINTS = 6000
-"""Points that are looked at, at most."""
+"""Most points compared."""
 HIDING = 100_000
-"""Points that may hide them, at most."""
+"""Most points that may occlude them."""
 OBSERVATIONS = 1_200_000
 """Points times photographs, at most."""
 SWEEPS = 10
@@ -33,15 +33,15 @@ DARKEST, BRIGHTEST = 0.03, 0.97
 FEWEST_PHOTOGRAPHS = 3
 """Points that fewer photographs show are left out."""
 CELL = 2.0
-"""Side of the cells in which the nearest point is looked for, in mean distances of the points in the picture."""
+"""Side of the cells of the occlusion test, in mean distances of the points in the picture."""
 HIDDEN = 1.05
 """A point is hidden where one in its cell or a neighbouring one is nearer by this factor."""
 FEWEST_TESTED = 1000
-"""With fewer observations the two halves of the points prove nothing."""
+"""Fewest observations for a test on the other half of the points."""
 
 
-class Agreement(NamedTuple):
-    """What the photographs' colours of the points say.
+class ExposureGains(NamedTuple):
+    """Gains of the photographs, and how well they explain the differences of colours.
 
     Attributes:
         log_gains: [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0.
@@ -63,7 +63,7 @@ class Agreement(NamedTuple):
 
 
 @torch.no_grad()
-def measure_agreement(points: Tensor, views: Sequence[View], near: float) -> Agreement:
+def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
     """Compares the photographs at the points.
 
     Args:
@@ -84,7 +84,7 @@ def measure_agreement(points: Tensor, views: Sequence[View], near: float) -> Agr
     before = after = math.nan
     if int(other.isfinite().sum()) >= FEWEST_TESTED:
         before, after = _disagreement(other), _disagreement(other - _log_gains(half)[:, None])
-    return Agreement(_log_gains(logs), count, before, after)
+    return ExposureGains(_log_gains(logs), count, before, after)
 
 
 def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:

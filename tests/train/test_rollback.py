@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 
@@ -81,7 +81,7 @@ def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
     trainer = Trainer(scene, views, config_of(), 120)
     schedule = trainer.training.schedule
     prune = next(
-        step for step in range(50, 120) if schedule.is_densify_step(step) or schedule.is_final_prune_step(step)
+        step for step in range(50, 120) if step in schedule.densify_steps or step in schedule.final_prune_steps
     )
     run(trainer, prune)
     step = trainer.training.strategy.step
@@ -132,7 +132,7 @@ def test_nothing_is_compared_with_before_where_the_resolution_changes_in_a_faded
     config.resolution_schedule, config.num_downscales = 12_500, 1
     config.densify.min_reset_interval = 1  # resets after steps 12, 24, ...
     trainer = Trainer(scene, views, config, 120)
-    assert trainer.training.schedule.is_reset_step(48) and trainer.training.schedule.recovering(50)
+    assert 48 in trainer.training.schedule.reset_steps and trainer.training.schedule.recovering(50)
     trainer.training.guard.before(0, trainer.training.views)
     trainer.training.guard._best = 0.1
     trainer.training.guard._convert(49)

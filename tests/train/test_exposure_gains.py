@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.agreement import measure_agreement
+from bitymi_ns.train.exposure_gains import estimate_gains
 from bitymi_ns.train.views import View
 
 SIZE = 64
@@ -45,7 +45,7 @@ def plane_views(gains: torch.Tensor, noise: float = 0.0) -> tuple[torch.Tensor, 
 def test_gains_are_found(seed: int, spread: float) -> None:
     logs = spread * (2 * torch.rand(8, 3, generator=torch.Generator().manual_seed(seed)) - 1)
     points, views = plane_views(logs.exp(), noise=0.003)
-    found = measure_agreement(points, views, 0.02)
+    found = estimate_gains(points, views, 0.02)
     torch.testing.assert_close(found.log_gains, logs - logs.mean(0), rtol=0, atol=0.02)
     torch.testing.assert_close(found.log_gains.mean(0), torch.zeros(3), rtol=0, atol=1e-6)
     assert found.explained > 0.2
@@ -54,7 +54,7 @@ def test_gains_are_found(seed: int, spread: float) -> None:
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
 def test_photographs_that_agree_are_left_alone(noise: float) -> None:
     points, views = plane_views(torch.ones(8, 3), noise)
-    found = measure_agreement(points, views, 0.02)
+    found = estimate_gains(points, views, 0.02)
     assert found.explained < 0.02 and found.log_gains.abs().max() < 0.05
 
 
@@ -74,7 +74,7 @@ def test_masks_transparency_bytes_and_reduced_pictures(ball) -> None:
             made = [v._replace(image=(255 * v.image).round().to(torch.uint8)) for v in views]
         else:
             made = [v._replace(image=v.image[::2, ::2].contiguous()) for v in views]
-        found = measure_agreement(points, made, 0.02)
+        found = estimate_gains(points, made, 0.02)
         torch.testing.assert_close(found.log_gains, logs, rtol=0, atol=0.03, msg=kind)
 
 
@@ -82,18 +82,18 @@ def test_clipped_and_black_pixels_do_not_count() -> None:
     points, views = plane_views(torch.ones(6, 3))
     clipped = [v._replace(image=torch.ones_like(v.image) if i % 2 else torch.zeros_like(v.image))
                for i, v in enumerate(views)]  # fmt: skip
-    found = measure_agreement(points, clipped, 0.02)
+    found = estimate_gains(points, clipped, 0.02)
     assert found.points.tolist() == [0] * 6 and math.isnan(found.explained) and not found.log_gains.any()
 
 
 def test_points_on_the_far_side_are_not_taken_for_exposure(views, ball) -> None:
     """The ball's colours differ from side to side: a point that shines through would make each view its own gain."""
     many = torch.nn.functional.normalize(torch.randn(6000, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
-    found = measure_agreement(many, views, 0.02)
+    found = estimate_gains(many, views, 0.02)
     assert math.isnan(found.explained) or found.explained < 0.05
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.full((5, 3), math.nan), torch.tensor([[0.0, 0.0, -9.0]])])
 def test_points_that_no_photograph_shows(points) -> None:
-    found = measure_agreement(points, plane_views(torch.ones(4, 3))[1], 0.02)
+    found = estimate_gains(points, plane_views(torch.ones(4, 3))[1], 0.02)
     assert math.isnan(found.explained) and not found.log_gains.any()

@@ -33,11 +33,11 @@ from torch.optim import Optimizer
 
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
+from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.optimizers import replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.resize import replace_rows
-from bitymi_ns.train.views import ReducedViews, spread, step_background
+from bitymi_ns.train.views import DownscaledViews, spread, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -61,7 +61,7 @@ SHARE_OF_RUN = 5
 """A window is at most one part in so many of the run, also where that is less than an epoch."""
 
 
-class Guard:
+class RollbackGuard:
     """Watches one run.
 
     Attributes:
@@ -80,15 +80,6 @@ class Guard:
         exposure: Exposure | None = None,
         processes: Processes = ALONE,
     ) -> None:
-        """
-        Args:
-            scene, optimizers, strategy: what is restored; one optimiser per name.
-            schedule: of the run.
-            config: training options.
-            announce: told in a sentence whenever the run goes back, or surfels are dropped.
-            exposure: restored, too; None = there are no corrections.
-            processes: of the run.
-        """
         self.processes = processes
         self.exposure = exposure
         self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
@@ -97,13 +88,13 @@ class Guard:
         self.factor, self.rollbacks = 1.0, 0
         self._streak = 0  # times in a row, without a good window between
         self._limit, self._best = math.nan, math.inf  # mean losses: of what is blank, of the best window
-        self._views: ReducedViews | None = None
+        self._views: DownscaledViews | None = None
         # on the scene's device, so that no step has to wait for numbers: of the losses, and the most surfels that broke
         self._sum, self._broken, self._count = torch.zeros(()), torch.zeros(1, dtype=torch.int32), 0
         self._states: list[tuple[int, dict[str, Any]]] = []  # the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed run needs; it can go back no farther than to where it was resumed."""
+        """State for a resumed run; it can roll back no farther than to where it was resumed."""
         return {
             "factor": self.factor,
             "rollbacks": self.rollbacks,
@@ -124,11 +115,11 @@ class Guard:
 
     @property
     def on(self) -> bool:
-        """Whether the run may go back at all."""
+        """True where rollbacks are enabled."""
         return self.config.guard.rollbacks > 0
 
-    def before(self, step: int, views: ReducedViews) -> None:
-        """Call before each step: notes the state that the run starts from, and what its first scene is worth.
+    def before(self, step: int, views: DownscaledViews) -> None:
+        """Call before each step: keeps the state that the run starts from, and measures the loss of its first scene.
 
         Args:
             step: index of the step.
@@ -145,12 +136,12 @@ class Guard:
             self._limit = max(self._loss_of(views, 1.0), self._loss_of(views, 1.0, blank=True))
         self._states = [(step, self._capture())]
 
-    def start_from_here(self) -> None:
+    def forget_states(self) -> None:
         """Forget the states to go back to: the scene is made of other parts from the next step on."""
         self._states = []
 
     @torch.no_grad()
-    def _loss_of(self, views: ReducedViews, factor: float, blank: bool = False) -> float:
+    def _loss_of(self, views: DownscaledViews, factor: float, blank: bool = False) -> float:
         """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
         losses = []
         device = self.scene.surfels["means"].device
@@ -202,7 +193,7 @@ class Guard:
 
         Args:
             step: index of the step.
-            loss: scalar, photometric loss of the step, without graph. On a CUDA device it is looked at when a window
+            loss: scalar, photometric loss of the step, without graph. On a CUDA device it is read when a window
                 ends, and so is the next one; on the CPU at once.
             broken: [1] int32, surfels that could not be drawn because they are not finite.
 

@@ -1,4 +1,4 @@
-"""What a run's own rules keep it from, in sentences: no bound is met in silence."""
+"""Messages for every limit that a run hits."""
 
 from __future__ import annotations
 

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns.train.errors import TrainingDiverged, describe_broken
-
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
-
+from torch import nn
 
 TOGETHER = 4
 """Steps whose losses are sent to the host together."""
@@ -76,3 +74,19 @@ class LossWatch:
             if not math.isfinite(value):
                 cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
                 raise TrainingDiverged(f"the {name} loss is {value} at step {step}: {cause}")
+
+
+class TrainingDiverged(ValueError):
+    """The loss or every surfel is no longer finite."""
+
+
+def describe_broken(module: nn.Module) -> str:
+    """Name the first parameter that is not finite, and its row; empty when all are finite."""
+    for name, parameter in module.named_parameters():
+        if len(parameter) == 0:
+            continue
+        broken = ~torch.isfinite(parameter.detach().reshape(len(parameter), -1)).all(-1)
+        if bool(broken.any()):
+            rows = broken.nonzero().flatten()
+            return f"{name} is not finite in {len(rows)} of {len(parameter)} rows, the first is row {int(rows[0])}"
+    return ""

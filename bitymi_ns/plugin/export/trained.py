@@ -1,0 +1,156 @@
+"""A trained run as an export reads it: loading, previewing, and comparing with its bundle."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+
+from bitymi_ns.bake.verify import check_field, check_view_color
+from bitymi_ns.bundle import Bundle, Check, check_world
+from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.statistics import HeldOut
+from bitymi_ns.bundle.write import World
+from bitymi_ns.capture.frame import UP, read_frame
+from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.run.model import BitymiModel
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import HashField
+from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.views import as_bytes
+
+_PSNR_SLACK = 0.1  # dB
+
+
+def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
+    """Configuration and pipeline of a trained scene, at a step of which there is a checkpoint or at the last one."""
+
+    def choose(config: Any) -> Any:
+        config.load_step = step
+        return config
+
+    if (load_config.parent / MANIFEST).is_file():
+        fail(
+            f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
+            "it was made from."
+        )
+    if not load_config.is_file():
+        fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
+    try:
+        config, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=choose)
+    except (yaml.YAMLError, AttributeError, KeyError) as error:
+        fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
+    except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
+        detail = (str(error).strip().splitlines() or [""])[0]
+        if isinstance(error, AssertionError) and not detail:  # the host's word for another kind of file
+            fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
+        fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
+    if not isinstance(pipeline.model, BitymiModel):
+        fail(
+            f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
+            "give the config.yml of a bitymi training run"
+        )
+    return config, pipeline
+
+
+def world_of(datamanager: Any) -> World:
+    """Transform from the scene to the capture's frame, with up and metres where the poses come from our SfM."""
+    outputs = datamanager.train_dataparser_outputs
+    report = getattr(datamanager.dataparser, "poses_report", None)
+    frame = None if report is None else read_frame(report)
+    transform, scale = np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)
+    return World(transform, scale) if frame is None else World(transform, scale, UP, frame.up, frame.metres_per_unit)
+
+
+@torch.no_grad()
+def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
+    """The trained scene as a camera sees it."""
+    rgb = model.render(camera, model.background, maps=False).rgb
+    buffer = io.BytesIO()
+    Image.fromarray(as_bytes(rgb).numpy()).save(buffer, format=format)
+    return buffer.getvalue()
+
+
+@torch.no_grad()
+def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
+    """PSNR in dB over the held-out views: means of bundle, trained scene and photographs against each other, also after
+    the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
+    rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
+    names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
+    names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")
+    means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
+    worst = round(min(row[0] for row in rows), 4)
+    return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
+
+
+@torch.no_grad()
+def held_out_psnr(
+    model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
+) -> list[list[float]]:
+    """Rows of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
+    bundle against photograph, and the last two after the affine fit of the colours."""
+    rows = []
+    background = model.background
+    for index in range(min(views, len(datamanager.eval_views))):
+        view = datamanager.eval_views[index]
+        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
+        baked = render_baked(view.camera.to("cpu")).clamp(0.0, 1.0)
+        photo = view.target(background.cpu(), "cpu")
+        mask = None if view.mask is None else view.mask.cpu()
+        of_photo = [measure(rgb, photo, mask) for measure in (psnr, cc_psnr) for rgb in (neural, baked)]
+        rows.append([psnr(baked, neural, mask), *of_photo])
+    return rows
+
+
+def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
+    """Checks a bundle against the run it was baked from.
+
+    Args:
+        bundle: what was read.
+        run: config.yml of the run, its folder, or one of its checkpoints.
+        views: held-out views to render.
+    """
+    if views < 1:
+        fail(f"--views must be at least 1, not {views}")
+    config, step = find_run(run)
+    with CONSOLE.capture():  # nerfstudio reports at length what it loads
+        _, pipeline = load_trained(config, step)
+    model, datamanager = pipeline.model, pipeline.datamanager
+    cameras = datamanager.train_dataset.cameras
+    train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
+    checks = [check_view_color(bundle, model.scene.surfels, train)]
+    if isinstance(model.scene.field, HashField):
+        checks.append(check_field(bundle, copy.deepcopy(model.scene.field).cpu(), train))
+    if len(datamanager.eval_dataset):
+        scene, background = bundle.scene, model.background.cpu()
+        rows = held_out_psnr(model, datamanager, lambda c: scene.render(c, background=background).rgb, views)
+        worst, photos = min(row[0] for row in rows), sum(row[2] - row[1] for row in rows) / len(rows)
+        stated = bundle.info.statistics.held_out and bundle.info.statistics.held_out.psnr_baked_against_neural_worst
+        detail = f"at least {worst:.2f} dB in {len(rows)} views"
+        detail += "" if stated is None else f" (stated {stated:.2f})"
+        detail += f"; against the photographs {photos:+.3f} dB"
+        checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
+    return [*checks, check_world(bundle.info.world, world_of(datamanager))]
+
+
+def find_run(run: Path) -> tuple[Path, int | None]:
+    """The config.yml of a run named by it, by its folder or by a checkpoint, and the checkpoint's step."""
+    if run.suffix == ".ckpt":
+        step = run.stem.removeprefix("step-")
+        if not run.is_file() or not step.isdecimal():
+            fail(f"there is no checkpoint {run}")
+        return run.parent.parent / "config.yml", int(step)
+    if run.is_dir() and not (run / "config.yml").is_file() and (run.parent / "config.yml").is_file():
+        run = run.parent  # the folder of its checkpoints
+    return (run / "config.yml" if run.is_dir() else run), None

@@ -62,3 +62,11 @@ def cpu():
             backend._emulated = before
 
     return context
+
+
+@pytest.fixture
+def exactly() -> Iterator[None]:
+    """Ask torch for deterministic algorithms."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)

@@ -68,28 +68,9 @@ def test_lean_view_colors_against_the_cpu(kind: str, dtype: torch.dtype, device:
     assert not got[~active].any()
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_view_colors_by_finite_differences(kind: str, device: torch.device) -> None:
-    params = parameters(kind, TERMS[kind][0], 3)
-    leaves = [v.to(device).requires_grad_() for v in (torch.randn(3, 3, dtype=torch.float64), *params.values())]
-    center = torch.zeros(3, dtype=torch.float64, device=device)
-
-    def function(x: Tensor, *values: Tensor) -> Tensor:
-        return ops.view_color(kind, dict(zip(params, values, strict=True)), x, center)
-
-    assert torch.autograd.gradcheck(function, leaves, eps=1e-6, atol=1e-6, rtol=1e-4, fast_mode=True)
-
-
-def test_view_colors_of_no_surfels_and_at_extreme_temperatures(device: torch.device) -> None:
+def test_view_colors_of_no_surfels(device: torch.device) -> None:
     none = {k: v[:0].to(device).requires_grad_() for k, v in parameters("sv", 7, 1).items()}
     ops.view_color("sv", none, torch.zeros(0, 3, device=device).double(), torch.zeros(3)).sum().backward()
-    n = 6
-    sites = torch.randn(n, 7, 3) * torch.tensor([0.0, 1e-20, 1e-10, 1.0, 1e10, 1e18]).view(-1, 1, 1)
-    leaves = {"sv_sites": sites, "sv_log_tau": torch.full((n, 7), 80.0), "sv_rgb": torch.rand(n, 7, 3)}
-    leaves = {name: value.to(device).requires_grad_() for name, value in leaves.items()}
-    color = ops.view_color("sv", leaves, torch.zeros(n, 3, device=device), torch.zeros(3, device=device))
-    color.sum().backward()
-    assert color.isfinite().all() and all(leaf.grad.isfinite().all() for leaf in leaves.values())
 
 
 @DTYPES

@@ -19,14 +19,6 @@ Context = Callable[[], AbstractContextManager[None]]
 HERE = torch.device("cpu")
 
 
-@pytest.fixture
-def exactly():
-    """Torch asked for deterministic algorithms."""
-    torch.use_deterministic_algorithms(True)
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 def run(
     case: SceneCase, device: torch.device, dtype: torch.dtype, textured: bool, maps: bool = True, moves: bool = True
 ) -> list[Tensor]:

@@ -13,16 +13,8 @@ from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene import Camera, HashField, SceneConfig
-from tests.ops.golden import SURFEL_KEYS, changed, extreme_scenes, random_scene
-from tests.ops.test_kernels import field_reference, make_field, relative
-
-
-@pytest.fixture
-def exactly():
-    """Torch asked for deterministic algorithms."""
-    torch.use_deterministic_algorithms(True)
-    yield
-    torch.use_deterministic_algorithms(False)
+from tests.ops.golden import SURFEL_KEYS, changed, random_scene
+from tests.ops.test_kernels import make_field, relative
 
 
 def points(count: int, device: torch.device, dtype: torch.dtype, close: bool = False) -> Tensor:
@@ -43,23 +35,15 @@ def value_and_gradients(field: HashField, x: Tensor) -> list[Tensor]:
     return [t.detach().cpu().double() for t in (rho, x.grad, *(p.grad for p in field.parameters()))]
 
 
-@pytest.mark.parametrize("contract", [True, False])
-@pytest.mark.parametrize("count", [1, 31, 33, 700])
-def test_values_against_the_reference(contract: bool, count: int, device: torch.device) -> None:
-    x = points(count, device, torch.float64)
-    field = make_field(contract, torch.float64).to(device)
-    want = field_reference(field.cpu(), x.cpu())
-    torch.testing.assert_close(field.to(device)(x).cpu(), want, rtol=1e-10, atol=1e-11)
-    single = make_field(contract, torch.float32).to(device)
-    got = single(x.float()).cpu().double()
-    torch.testing.assert_close(got, field_reference(single.cpu(), x.float().cpu()), rtol=1e-3, atol=1e-3)
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-@pytest.mark.parametrize(("count", "close"), [(1, False), (32, False), (300, False), (300, True)])
-def test_gradients_against_the_cpu(count: int, close: bool, dtype: torch.dtype, device: torch.device, cpu) -> None:
+@pytest.mark.parametrize("contract", [True, False])
+@pytest.mark.parametrize(("count", "close"), [(1, False), (31, False), (33, False), (300, False), (300, True)])
+def test_values_and_gradients_against_the_cpu(
+    count: int, close: bool, contract: bool, dtype: torch.dtype, device: torch.device, cpu
+) -> None:
+    """The CPU's are held against the reference and finite differences in tests/ops."""
     x = points(count, device, dtype, close)
-    field = make_field(True, dtype).to(device)
+    field = make_field(contract, dtype).to(device)
     got = value_and_gradients(field, x)
     with cpu():
         want = value_and_gradients(field.cpu(), x.cpu())
@@ -79,19 +63,6 @@ def test_fewer_levels(device: torch.device, cpu) -> None:
             want = value_and_gradients(field.cpu(), x.cpu())
         for a, b in zip(got, want, strict=True):
             assert relative(a, b) < 1e-11
-
-
-def test_gradients_by_finite_differences(device: torch.device) -> None:
-    field = make_field(True, torch.float64, log2=4).to(device)
-    x = points(5, device, torch.float64).requires_grad_()
-    weights = [w.detach().clone().requires_grad_() for w in field.weights]
-
-    def function(x: Tensor, *values: Tensor) -> Tensor:
-        return ops.field(x, field.geometry, *values)
-
-    # the table's sums come in any order on a card: their last bits may differ from call to call
-    nondet = 1e-10 if device.type == "cuda" else 0.0
-    assert torch.autograd.gradcheck(function, (x, *weights), eps=1e-7, atol=1e-5, rtol=1e-3, nondet_tol=nondet)
 
 
 def test_no_points_and_points_far_away(device: torch.device) -> None:
@@ -173,15 +144,6 @@ def test_without_fragments(device: torch.device, cpu) -> None:
     assert len(shading.fragments) == 0
     colors, *grads = shading.run(device, "move")
     assert colors.shape == (0, 3) and not any(g.any() for g in grads)
-
-
-EXTREMES = ("edge_on", "huge_scales", "coordinates_1e6", "screen_filling", "beta_0")
-
-
-@pytest.mark.parametrize("case", [c for c in extreme_scenes() if c.name in EXTREMES], ids=lambda case: case.name)
-def test_extreme_scenes_stay_finite(case, device: torch.device, cpu) -> None:
-    for values in Shading(torch.float32, cpu, case).run(device, "move"):
-        assert values.isfinite().all()
 
 
 def test_deterministic_sums_do_not_depend_on_the_order_of_threads(device: torch.device, cpu, exactly) -> None:

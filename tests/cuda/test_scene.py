@@ -37,13 +37,3 @@ def test_a_training_step_equals_that_of_the_cpu(name: str, texture: bool, mode: 
     assert any("field" in key for key in got) == (mode == "train")
     for key, value in want.items():
         assert (got[key] - value).abs().max() <= 1e-9 * value.abs().max(), key
-
-
-def test_an_empty_scene_is_its_background(device: torch.device) -> None:
-    case = random_scene(5, 0, 20, 18)
-    case.params = {key: value[:0] for key, value in case.params.items()}
-    scene, camera = scene_of(case, device, False)
-    output = scene.render(camera, case.background.to(device), maps=True)
-    assert len(output.fragments) == 0 and not output.overdraw.any()
-    assert torch.equal(output.rgb.detach(), case.background.to(device).expand_as(output.rgb))
-    output.rgb.sum().backward()

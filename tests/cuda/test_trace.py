@@ -1,11 +1,12 @@
-"""Visibility and compositing by the CUDA kernels: against the golden renders and against the CPU kernels."""
+"""Visibility and compositing by the CUDA kernels against the CPU kernels."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -51,25 +52,21 @@ def render(
     device: torch.device,
     rim: float = EXACT_RIM,
     maps: bool = True,
-    loss: Callable[[Tensor], Tensor] | None = None,
+    prefilter: bool = False,
 ) -> Rendered:
-    """A view and the gradients of a loss of its image; without a loss, of fixed random directions for the image and for
-    uv and depth of the fragments."""
+    """Render a view, and its gradients along fixed directions for the image and for uv and depth of fragments."""
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera)
+    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, prefilter=prefilter)
     fragments = ops.trace(projection, rim)
     directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
     base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions) + 0.5
     rows = fragments.surfel.long()
     image = ops.composite_image(fragments, projection, base.clamp(min=0)[rows], maps)
-    if loss is None:
-        # directions by pixel and surfel: they do not depend on the order in which the list has them
-        by_fragment = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
-        by_pixel = torch.cos(torch.arange(image.numel(), device=device).double() * 1.7).to(dtype).view_as(image)
-        total = (image * by_pixel).sum() + (fragments.uv * by_fragment).sum() + (fragments.depth * by_fragment).sum()
-    else:
-        total = loss(image)
+    # directions by pixel and surfel: they do not depend on the order in which the list has them
+    by_fragment = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
+    by_pixel = torch.cos(torch.arange(image.numel(), device=device).double() * 1.7).to(dtype).view_as(image)
+    total = (image * by_pixel).sum() + (fragments.uv * by_fragment).sum() + (fragments.depth * by_fragment).sum()
     total.backward()
     grads = {key: leaf.grad.cpu().double() for key, leaf in leaves.items()}
     found = (projection.mean2d_grad, projection.mean2d_absgrad)
@@ -117,39 +114,37 @@ def check_order(fragments: ops.Fragments) -> None:
     assert torch.unique_consecutive(run, dim=1).shape[1] == torch.unique(run, dim=1).shape[1]
 
 
-@pytest.mark.parametrize("name", [name for name in GOLDEN_NAMES if name != "textured"])
-def test_golden_images_and_gradients(name: str, device: torch.device) -> None:
-    golden = load_golden(name)
-    shape = (golden.height, golden.width, -1)
-    weights = {key: value.to(device) for key, value in golden.loss_weights.items()}
-
-    def images(flat: Tensor) -> dict[str, Tensor]:
-        image = flat.view(shape)
-        rgb = image[..., :3] + (1 - image[..., 3:4]) * golden.background.to(flat)
-        return {"rgb": rgb, "alpha": image[..., 3], "beta_map": image[..., 4], "depth": image[..., 5]}
-
-    def loss(flat: Tensor) -> Tensor:
-        return sum((value * weights[key]).sum() for key, value in images(flat).items())
-
-    got = render(golden, torch.float64, device, loss=loss)
-    for key, image in images(got.image).items():
-        assert relative(image, golden.outputs[key]) < 1e-12, key
-    assert torch.equal(got.fragments.overdraw().cpu()[..., 0].double(), golden.outputs["overdraw"].double())
-    for key, want in golden.grads.items():
-        assert relative(got.leaves[key], want) < 1e-10, key
-    check_order(got.fragments)
+def scenes() -> Iterator[Any]:
+    """Scenes, options of `render`, and bounds of `compare`."""
+    for name in GOLDEN_NAMES:
+        if name != "textured":
+            yield pytest.param(load_golden(name), {}, {}, id=name)
+    for seed, width, height in ((0, 70, 50), (1, 16, 16), (2, 33, 17), (3, 8, 40)):
+        yield pytest.param(random_scene(60, seed, width, height), {"maps": seed != 1}, {}, id=f"{width}x{height}")
+    # a surfel on 95 tiles, which its warp lists and its block sums
+    yield pytest.param(random_scene(3, 0, 300, 80, scale=30.0), {}, {}, id="whole screen")
+    for scale in (0.5, 0.01):
+        case = random_scene(30, 4, 40, 24, scale=scale)
+        yield pytest.param(case, {"prefilter": True}, {"image": 1e-9, "gradient": 1e-9}, id=f"prefilter {scale}")
+    for case in extreme_scenes():
+        case = replace(
+            case, params={key: value[:400] for key, value in case.params.items()}
+        )  # for the emulation's sake
+        # of discs seen edge-on, rounding decides which side faces the camera
+        options = {"rim": 1e-3, "maps": case.name != "edge_on"}
+        yield pytest.param(case, options, {"image": 1e-9, "gradient": 1e-7}, id=case.name)
 
 
-@pytest.mark.parametrize("maps", [True, False])
-@pytest.mark.parametrize(("seed", "width", "height"), [(0, 70, 50), (1, 16, 16), (2, 33, 17), (3, 8, 40)])
-def test_random_scenes_equal_those_of_the_cpu(
-    seed: int, width: int, height: int, maps: bool, device: torch.device, cpu: CpuContext
+@pytest.mark.parametrize("case, options, bounds", scenes())
+def test_fragments_images_and_gradients_equal_those_of_the_cpu(
+    case: SceneCase, options: dict[str, Any], bounds: dict[str, float], device: torch.device, cpu: CpuContext
 ) -> None:
-    case = random_scene(60, seed, width, height)
-    got = render(case, torch.float64, device, maps=maps)
+    """The CPU's are held against the golden renders and the references in tests/ops."""
+    got = render(case, torch.float64, device, **options)
     with cpu():
-        want = render(case, torch.float64, torch.device("cpu"), maps=maps)
-    compare(got, want)
+        want = render(case, torch.float64, torch.device("cpu"), **options)
+    assert got.image.isfinite().all() and all(value.isfinite().all() for value in got.leaves.values())
+    compare(got, want, **bounds)
     check_order(got.fragments)
 
 
@@ -182,30 +177,6 @@ def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
         assert alpha.min() > 0.99 if closes else alpha.max() < 0.9
 
 
-def extreme() -> list[SceneCase]:
-    """Extreme scenes; the crowd on one pixel is thinned out, for the emulation's sake."""
-    cases = []
-    for case in extreme_scenes():
-        if len(case.params["means"]) > 400:
-            case = replace(case, params={key: value[:400] for key, value in case.params.items()})
-        cases.append(case)
-    return cases
-
-
-EXTREME = extreme()
-
-
-@pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
-def test_extreme_scenes_equal_those_of_the_cpu(case: SceneCase, device: torch.device, cpu: CpuContext) -> None:
-    maps = case.name != "edge_on"  # which side of a disc faces the camera is there decided by rounding
-    got = render(case, torch.float64, device, rim=1e-3, maps=maps)
-    with cpu():
-        want = render(case, torch.float64, torch.device("cpu"), rim=1e-3, maps=maps)
-    assert got.image.isfinite().all()
-    assert all(value.isfinite().all() for value in got.leaves.values())
-    compare(got, want, image=1e-9, gradient=1e-7)
-
-
 def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> None:
     case = random_scene(70, 3, 20, 20, scale=2.0)
     same = {key: value[:1].expand_as(value).clone() for key, value in case.params.items()}
@@ -215,17 +186,6 @@ def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> Non
     assert len(runs) > 70
     step = runs.diff()
     assert ((step == 1) | (runs[1:] == 0)).all()  # 0, 1, 2, ... again in every tile
-
-
-def test_a_surfel_over_the_whole_screen_is_listed_by_its_warp_and_summed_by_its_block(
-    device: torch.device, cpu: CpuContext
-) -> None:
-    case = random_scene(3, 0, 300, 80, scale=30.0)  # 95 tiles
-    got = render(case, torch.float64, device)
-    with cpu():
-        want = render(case, torch.float64, torch.device("cpu"))
-    assert got.fragments.layout.pairs > 64
-    compare(got, want)
 
 
 @pytest.mark.parametrize("name", GOLDEN_NAMES)

@@ -100,8 +100,9 @@ def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainer
     config = start(method="bitymi-notexture")
     config.max_num_iterations = 3
     ns_train.main(config)
-    run_export(config, tmp_path / "plain")
-    assert not (tmp_path / "plain" / "atlas.ktx2").exists()
+    for name, options in (("plain", {}), ("polished", {"polish_steps": None})):
+        run_export(config, tmp_path / name, **options)
+        assert not (tmp_path / name / "atlas.ktx2").exists()
     assert evaluate(tmp_path / "plain" / "config.yml", tmp_path / "plain.json")["atlas_bytes"] == 0
 
 
@@ -165,14 +166,6 @@ def test_verify_compares_a_bundle_with_its_run(trained: BitymiTrainerConfig, cop
     earlier = check_run(bundle, min((run / "nerfstudio_models").glob("*.ckpt")), views=1)
     # what the bundle holds was not there yet, its place was
     assert [check.ok for check in earlier] == [False, False, True]
-
-
-def test_a_run_without_texture_is_not_given_one(start: Callable[..., BitymiTrainerConfig], tmp_path: Path) -> None:
-    config = start(method="bitymi-notexture")
-    config.max_num_iterations = 3
-    ns_train.main(config)
-    run_export(config, tmp_path / "b", polish_steps=None)
-    assert not (tmp_path / "b" / "atlas.ktx2").exists()
 
 
 def test_a_run_is_found_beside_its_configuration(

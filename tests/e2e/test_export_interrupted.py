@@ -15,42 +15,41 @@ from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, run_export
 
 
-def test_ctrl_c_in_the_fine_tuning_leaves_nothing(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*args: Any, **kwargs: Any) -> None:
-        raise KeyboardInterrupt
+def interrupted(*args: Any, **kwargs: Any) -> None:
+    raise KeyboardInterrupt
 
-    monkeypatch.setattr(tune, "photometric", interrupted)
+
+@pytest.mark.parametrize(
+    "module, function, options, replaces, message",
+    [
+        (tune, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
+        (bake_learn, "learned", {}, False, "was not written"),
+        (bake_learn, "learned", {"overwrite": True}, True, "is the earlier one"),
+        (command, "read_bundle", {"finetune_steps": 0}, False, "is complete"),
+    ],
+    ids=["fine-tuning", "bake", "bake of a replacement", "comparison"],
+)
+def test_ctrl_c_leaves_nothing_half_written_and_the_message_names_what_is_there(
+    module: Any,
+    function: str,
+    options: dict[str, Any],
+    replaces: bool,
+    message: str,
+    request: pytest.FixtureRequest,
+    trained: BitymiTrainerConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = request.getfixturevalue("copied") if replaces else tmp_path / "b"
+    monkeypatch.setattr(module, function, interrupted)
     with pytest.raises(SystemExit) as stop:
-        run_export(trained, tmp_path / "b", tolerance=TOLERANCE)
-    assert stop.value.code == 130 and list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_in_the_export_leaves_nothing(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(*args: Any, **kwargs: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(bake_learn, "learned", interrupted)
-    with pytest.raises(SystemExit) as stop:
-        run_export(trained, tmp_path / "b")
-    assert stop.value.code == 130
-    assert "was not written" in " ".join(capsys.readouterr().out.split())
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_before_a_bundle_is_replaced_says_which_one_is_there(
-    trained: BitymiTrainerConfig, copied: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(*args: Any, **kwargs: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(bake_learn, "learned", interrupted)
-    with pytest.raises(SystemExit):
-        run_export(trained, copied, overwrite=True)
-    assert "is the earlier one" in " ".join(capsys.readouterr().out.split())
+        run_export(trained, folder, **options)
+    assert stop.value.code == 130 and message in " ".join(capsys.readouterr().out.split())
+    if message == "was not written":
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert check_files(folder)[0] is not None
 
 
 @pytest.mark.parametrize(
@@ -86,16 +85,3 @@ def test_ctrl_c_while_a_bundle_is_replaced_says_which_one_is_there(
     assert state in " ".join(capsys.readouterr().out.split())
     assert ((copied / "bundle.json").read_bytes() == before) == (state == "is the earlier one")
     assert check_files(copied)[0] is not None and [p.name for p in copied.parent.iterdir()] == [copied.name]
-
-
-def test_ctrl_c_in_the_comparison_says_that_the_bundle_is_complete(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(*args: Any, **kwargs: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command, "read_bundle", interrupted)
-    with pytest.raises(SystemExit):
-        run_export(trained, tmp_path / "b", finetune_steps=0)
-    assert "is complete" in " ".join(capsys.readouterr().out.split())
-    assert check_files(tmp_path / "b")[0] is not None

@@ -16,7 +16,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export import command, target
 from bitymi_ns.plugin.export.command import ExportAtlas
-from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import run_export
 
@@ -55,6 +54,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
         ({"r_max": 48}, "r_max must be a power of two"),
         ({"r_max": 8192}, "do not fit pages"),
         ({"seed": -1}, "seed must not be negative"),
+        ({"r_min": 5}, "cannot be baked: .*power of two"),
     ],
 )
 def test_options_out_of_range_are_found_before_the_work(
@@ -64,18 +64,6 @@ def test_options_out_of_range_are_found_before_the_work(
     with pytest.raises(InputError, match=message):
         run_export(trained, tmp_path / "b", **options)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_options_that_make_no_sense(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be baked: .*power of two"):
-        run_export(trained, tmp_path / "b", r_min=5)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_config_of_another_kind(tmp_path: Path) -> None:
-    (tmp_path / "config.yml").write_text("just text")
-    with pytest.raises(InputError, match="is not the configuration of a trained scene"):
-        load_trained(tmp_path / "config.yml")
 
 
 def test_a_place_that_will_not_do_is_found_before_the_work(
@@ -110,9 +98,10 @@ def test_a_missing_encoder_is_named(
 def test_a_configuration_that_is_not_there_or_not_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no .*config.yml"):
         ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
-    (tmp_path / "config.yml").write_text("a: [")
-    with pytest.raises(InputError, match="is not the configuration"):
-        ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
+    for text in ("a: [", "just text"):
+        (tmp_path / "config.yml").write_text(text)
+        with pytest.raises(InputError, match="is not the configuration of a trained scene"):
+            ExportAtlas(load_config=tmp_path / "config.yml", output_dir=tmp_path / "b").main()
 
 
 def test_a_damaged_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import atexit
+import http.server
 import json
+import re
 import select
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -85,10 +87,9 @@ def drive(
 
 
 @contextmanager
-def served(site: Site) -> Iterator[str]:
-    """Serve a site from a thread of this process; yields its address."""
-    server = serve(site)
-    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+def running(server: Any) -> Iterator[str]:
+    """Run a server of the viewer in a thread of this process; yields its address."""
+    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     try:
         yield address_of(server)
@@ -96,3 +97,45 @@ def served(site: Site) -> Iterator[str]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+def served(site: Site, **options: Any) -> AbstractContextManager[str]:
+    """Serve a site from a thread of this process; yields its address."""
+    return running(serve(site, **options))
+
+
+@contextmanager
+def plain_server(folder: Path, ranges: bool) -> Iterator[tuple[str, list[tuple[str, int]]]]:
+    """Serve a folder as any file server would.
+
+    Yields its address, and of requests for bundles in one file the range and the bytes of the answer.
+    """
+    asked: list[tuple[str, int]] = []
+
+    class Plain(http.server.SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            span = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range") or "")
+            path = Path(self.translate_path(self.path))
+            if path.suffix != ".bitymi" or not path.is_file():
+                super().do_GET()
+                return
+            data = path.read_bytes()
+            first, last = 0, len(data) - 1
+            if ranges and span:
+                first = int(span[1]) if span[1] else max(0, len(data) - int(span[2]))
+                last = min(int(span[2]), last) if span[1] and span[2] else last
+            asked.append((self.headers.get("Range") or "", last - first + 1))
+            self.send_response(206 if ranges and span else 200)
+            if ranges and span:
+                self.send_header("Content-Range", f"bytes {first}-{last}/{len(data)}")
+            self.send_header("Content-Length", str(last - first + 1))
+            self.end_headers()
+            self.wfile.write(data[first : last + 1])
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Log nothing."""
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Plain, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/", asked
+        server.shutdown()

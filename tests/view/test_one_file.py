@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import http.server
 import json
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from threading import Thread
 
 import pytest
 
@@ -17,46 +11,12 @@ from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from bitymi_ns.view import single_site, write_static
-from tests.view.browser import drive
+from tests.view.browser import drive, plain_server
 from tests.view.conftest import HEIGHT, WIDTH, write
 from tests.view.test_browser import MEAN, STATE, difference
 
 SCREEN = (WIDTH, HEIGHT)
 NAME = "scene.bitymi"
-
-
-@contextmanager
-def plain_server(folder: Path, ranges: bool) -> Iterator[tuple[str, list[tuple[str, int]]]]:
-    """Address of a file server, and what it was asked of bundles in one file: the range and the bytes of the answer."""
-    asked: list[tuple[str, int]] = []
-
-    class Plain(http.server.SimpleHTTPRequestHandler):
-        def do_GET(self) -> None:
-            given = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range") or "")
-            path = Path(self.translate_path(self.path))
-            if path.suffix != ".bitymi" or not path.is_file():
-                super().do_GET()
-                return
-            data = path.read_bytes()
-            first, last = 0, len(data) - 1
-            if ranges and given:
-                first = int(given[1]) if given[1] else max(0, len(data) - int(given[2]))
-                last = min(int(given[2]), last) if given[1] and given[2] else last
-            asked.append((self.headers.get("Range") or "", last - first + 1))
-            self.send_response(206 if ranges and given else 200)
-            if ranges and given:
-                self.send_header("Content-Range", f"bytes {first}-{last}/{len(data)}")
-            self.send_header("Content-Length", str(last - first + 1))
-            self.end_headers()
-            self.wfile.write(data[first : last + 1])
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Says nothing."""
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Plain, directory=str(folder))) as server:
-        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}/", asked
-        server.shutdown()
 
 
 def test_the_command_writes_the_page_and_one_file(bundle: Path, tmp_path: Path, capsys) -> None:

@@ -19,10 +19,9 @@ from bitymi_ns.bundle.manifest import POSTER
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.view import Site, single_site, site_of, write_static
 from tests.bundle.damage import signed
-from tests.view.browser import Outcome, drive, served
+from tests.view.browser import Outcome, drive, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 from tests.view.test_browser import MEAN, difference
-from tests.view.test_one_file import plain_server
 
 SCREEN = (WIDTH, HEIGHT)
 SHOWN = "!document.getElementById('poster').hidden"

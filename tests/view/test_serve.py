@@ -15,7 +15,6 @@ import zipfile
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from threading import Thread
 from urllib.parse import urlsplit
 
 import pytest
@@ -23,9 +22,9 @@ import pytest
 from bitymi_ns.bundle import BundleError, check_files
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
-from bitymi_ns.view import PageError, address_of, is_loopback, serve, site_of, write_static
+from bitymi_ns.view import PageError, is_loopback, serve, site_of, write_static
 from tests.bundle.damage import amend
-from tests.view.browser import served
+from tests.view.browser import running, served
 
 
 def ask(address: str, path: str, method: str = "GET", host: str | None = None) -> tuple[int, dict[str, str], bytes]:
@@ -276,13 +275,10 @@ def test_a_body_is_no_second_request(bundle: Path, method: str, header: str) -> 
 
 @pytest.mark.parametrize("data", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"drip"])
 def test_half_a_request_is_not_waited_for(bundle: Path, data: bytes) -> None:
-    server = serve(site_of(bundle), request_seconds=0.4)
-    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
     begin = time.monotonic()
-    try:
-        host, port = server.server_address[:2]
-        with socket.create_connection((host, port), timeout=10) as connection:
+    with served(site_of(bundle), request_seconds=0.4) as address:
+        parts = urlsplit(address)
+        with socket.create_connection((parts.hostname, parts.port), timeout=10) as connection:
             connection.sendall(data if data != b"drip" else b"GET / HTTP/1.1\r\n")
             with suppress(ConnectionError):
                 while data == b"drip" and time.monotonic() - begin < 3:
@@ -290,10 +286,6 @@ def test_half_a_request_is_not_waited_for(bundle: Path, data: bytes) -> None:
                     time.sleep(0.05)
                 assert connection.recv(100) == b""
         assert time.monotonic() - begin < 2.5
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 @pytest.mark.parametrize("host", ["127.0.0.2", "localhost", "127.1", "::1", "0.0.0.0"])
@@ -302,17 +294,10 @@ def test_every_address_of_this_machine_answers_to_its_name(bundle: Path, host: s
         server = serve(site_of(bundle), host)
     except PageError as error:
         pytest.skip(str(error))  # no IPv6
-    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    try:
-        address = address_of(server)
+    with running(server) as address:
         assert ask(address, "/")[0] == 200
         assert ask(address, "/", host="evil.example")[0] == (200 if host == "0.0.0.0" else 403)
         assert is_loopback(server) == (host != "0.0.0.0")
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 @pytest.mark.parametrize(

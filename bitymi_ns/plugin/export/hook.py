@@ -1,8 +1,8 @@
-"""Adds `bitymi-atlas` to nerfstudio's `ns-export`.
+"""Add `bitymi-atlas` and `bitymi-mesh` to nerfstudio's `ns-export`.
 
 nerfstudio has no registry of exporters. Its script binds `tyro` at the top, then imports modules that load this plugin,
 and only at the end builds the union of commands and hands it to `tyro.cli`. So the module's own reference to tyro is
-replaced by a proxy that adds one member to that union; tyro itself and every other module are left alone.
+replaced by a proxy that adds members to that union; tyro itself and every other module are left alone.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from types import ModuleType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 EXPORTER = "nerfstudio.scripts.exporter"
-COMMAND = "bitymi-atlas"
+COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 DESCRIPTION = "Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest."
+MESH_DESCRIPTION = "Extract the surface of a trained bitymi scene or of a bundle as a triangle mesh with vertex colors."
 
 
 def install() -> None:
@@ -42,18 +43,19 @@ def patch(module: ModuleType) -> None:
 
 
 def extended(commands: Any) -> Any:
-    """The union of ns-export's commands with ours as a further member; markers around it are kept."""
+    """The union of ns-export's commands with ours as further members; markers around it are kept."""
     if get_origin(commands) is Annotated:
         inner, *markers = get_args(commands)
         return Annotated[(extended(inner), *markers)]  # type: ignore[return-value]
     import tyro
 
-    from bitymi_ns.plugin.export.command import ExportAtlas, default_export
+    from bitymi_ns.plugin.export import command, mesh
 
-    subcommand = tyro.conf.subcommand(name=COMMAND, description=DESCRIPTION, default=default_export())
-    ours = Annotated[ExportAtlas, subcommand]
+    atlas = tyro.conf.subcommand(name=COMMAND, description=DESCRIPTION, default=command.default_export())
+    surface = tyro.conf.subcommand(name=MESH_COMMAND, description=MESH_DESCRIPTION, default=mesh.default_export())
+    ours = (Annotated[command.ExportAtlas, atlas], Annotated[mesh.ExportMesh, surface])
     members = get_args(commands) if get_origin(commands) in (Union, UnionType) else (commands,)
-    return Union[(*members, ours)]  # noqa: UP007 - built at run time
+    return Union[(*members, *ours)]  # noqa: UP007 - built at run time
 
 
 class _Forwarding:

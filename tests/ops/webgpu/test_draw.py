@@ -140,14 +140,18 @@ def as_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(on_device, "in_software", lambda: False)
 
 
+def encoded(scene: BakedScene) -> BakedScene:
+    """Replace a scene's texels by BC7 blocks and what these decode to."""
+    blocks = [bytes(bc7_encoder("ultrafast")(page.numpy())) for page in scene.atlas]
+    height, width = scene.atlas.shape[1:3]
+    stored = np.stack([np.frombuffer(page, np.uint8).reshape(height // 4, width // 4, 16) for page in blocks])
+    atlas = np.stack([decode_bc7(page, width, height) for page in blocks])
+    return replace(scene, atlas=torch.from_numpy(atlas), blocks=torch.from_numpy(stored))
+
+
 def test_the_processor_gets_decoded_texels(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would decode a block for each texel that it fetches."""
-    scene = replace(textured(20, 0), weight_bound=0.0)
-    blocks = [np.frombuffer(bytes(bc7_encoder("ultrafast")(page.numpy())), np.uint8) for page in scene.atlas]
-    height, width = scene.atlas.shape[1:3]
-    alone = replace(
-        scene, atlas=None, blocks=torch.from_numpy(np.stack(blocks).reshape(len(blocks), height // 4, width // 4, 16))
-    )
+    scene = replace(encoded(textured(20, 0)), atlas=None, weight_bound=0.0)
     formats: list[str] = []
     monkeypatch.setattr(on_device, "in_software", lambda: True)
     made = on_device.SceneOnDevice._pages
@@ -156,21 +160,12 @@ def test_the_processor_gets_decoded_texels(monkeypatch: pytest.MonkeyPatch) -> N
         "_pages",
         lambda self, format, *rest: formats.append(format) or made(self, format, *rest),
     )
-    webgpu.draw(alone, [front()], None, ["rgb"])
+    webgpu.draw(scene, [front()], None, ["rgb"])
     assert formats == ["rgba8unorm"]
 
 
 def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded(as_a_card: None) -> None:
-    scene = replace(textured(60, 0), weight_bound=0.0)
-    blocks = [bc7_encoder("ultrafast")(page.numpy()) for page in scene.atlas]
-    height, width = scene.atlas.shape[1:3]
-    decoded = np.stack([decode_bc7(bytes(page), width, height) for page in blocks])
-    scene.atlas = torch.from_numpy(decoded)
-    scene.blocks = torch.from_numpy(
-        np.stack([np.frombuffer(bytes(page), np.uint8) for page in blocks]).reshape(
-            len(blocks), height // 4, width // 4, 16
-        )
-    )
+    scene = replace(encoded(textured(60, 0)), weight_bound=0.0)
     assert check(scene, front()).max() < 2 * STEP
     # nothing but the blocks is needed
     alone = replace(scene, atlas=None, through_webgpu=True).render(front())
@@ -236,14 +231,9 @@ def test_views_of_other_sizes(share: float, prefilter: str) -> None:
 
 def test_levels_of_blocks_and_of_tiles_without_a_mean(as_a_card: None) -> None:
     camera = front(240, 176)
-    scene = photographed(textured(60, 0), camera)
-    blocks = [bc7_encoder("ultrafast")(page.numpy()) for page in scene.atlas]
-    height, width = scene.atlas.shape[1:3]
-    scene.atlas = torch.from_numpy(np.stack([decode_bc7(bytes(page), width, height) for page in blocks]))
-    stored = np.stack([np.frombuffer(bytes(page), np.uint8) for page in blocks])
-    scene.blocks = torch.from_numpy(stored.reshape(len(blocks), height // 4, width // 4, 16))
-    for given in (scene, replace(scene, mean_residual=None)):
-        assert check(given, camera.scaled(0.3)).max() < 2 * STEP
+    scene = encoded(photographed(textured(60, 0), camera))
+    for each in (scene, replace(scene, mean_residual=None)):
+        assert check(each, camera.scaled(0.3)).max() < 2 * STEP
 
 
 def test_what_was_changed_is_drawn_anew() -> None:

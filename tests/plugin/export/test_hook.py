@@ -28,7 +28,7 @@ def test_the_union_grows_by_one_member_and_keeps_its_markers() -> None:
     result = hook.extended(commands)
     assert get_args(result)[1:] == get_args(commands)[1:]
     members = get_args(get_args(result)[0])
-    assert len(members) == 3 and members[:2] == get_args(get_args(commands)[0])
+    assert len(members) == 4 and members[:2] == get_args(get_args(commands)[0])
     assert get_args(members[2])[0] is ExportAtlas
 
 
@@ -44,7 +44,7 @@ def test_only_the_exporters_own_union_is_extended() -> None:
     module.tyro.cli(First)
     module.tyro.cli(module.Commands)
     assert seen[0] is First
-    assert len(get_args(seen[1])) == 3
+    assert len(get_args(seen[1])) == 4
     assert module.tyro.conf is fake_tyro.conf
     assert fake_tyro.cli is not module.tyro.cli
 

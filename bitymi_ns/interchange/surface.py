@@ -1,0 +1,232 @@
+"""The surface of a scene as a triangle mesh: TSDF fusion of median depths (as in 2DGS, Huang et al. 2024).
+
+open3d, which nerfstudio depends on, does the fusion, the extraction and the simplification.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bitymi_ns.ops import fitting_lists, project
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import GEOMETRY
+
+if TYPE_CHECKING:
+    import open3d
+
+HALF = 0.5
+"""Accumulated weight at which the median depth is reached."""
+TRUNCATION = 8.0
+"""Truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes."""
+SMOOTHING = 10
+"""Iterations of Taubin smoothing, which takes the noise of depths and keeps volumes."""
+QUANTILE = 0.01
+"""Share of the observed points that the box leaves out at each of its sides."""
+REACH = 3.0
+"""Half the side of the largest box, in units of the greatest distance of a camera from their mean or, where that is
+more, of the median depth of all views."""
+SMALLEST = 0.005
+"""Connected parts with less than this share of the triangles of the largest part are dropped."""
+BOX_SIDE = 160
+"""Longer side in pixels of the depth maps that the box is found from."""
+POISSON_DEPTH = 9
+"""Depth of the octree of the watertight reconstruction."""
+
+
+class NoSurface(ValueError):
+    """The cameras see no surface that could be fused; the message says why."""
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How a surface is extracted.
+
+    Attributes:
+        resolution: voxels along the longest side of the box, at least 16.
+        triangles: budget; a mesh with more is simplified by quadric error metrics; 0 = no limit.
+        watertight: close the mesh by a Poisson reconstruction from its vertices and normals.
+    """
+
+    resolution: int = 256
+    triangles: int = 500_000
+    watertight: bool = False
+
+    def check(self) -> None:
+        """Refuse values out of range.
+
+        Raises:
+            ValueError: naming the option and its range.
+        """
+        for name, value, low, high in (
+            ("resolution", self.resolution, 16, 4096),
+            ("triangles", self.triangles, 0, 10**8),
+        ):
+            if not low <= value <= high:
+                raise ValueError(f"{name} must be from {low} to {high:,}, not {value}")
+
+
+@torch.no_grad()
+def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, through_pixel: bool = False) -> Tensor:
+    """Depth at which half of the light of each pixel is blocked.
+
+    Args:
+        surfels: geometry by name (`GEOMETRY`), of N surfels.
+        camera: the view.
+        near: nearest depth that is drawn, camera z.
+        through_pixel: as in `ops.project`.
+
+    Returns:
+        [H, W] camera z of the first fragment with which the blending weights of its pixel reach 0.5; 0 where they do
+        not.
+
+    Raises:
+        TooManyFragments: a single row of screen tiles has more fragments than memory holds.
+    """
+    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, through_pixel)
+    rows = []
+    for fragments in fitting_lists(projection):
+        pixel = fragments.pixel.long()
+        order = pixel.argsort(stable=True)  # front to back within each pixel, as the fragments of a tile are
+        pixel, weight = pixel[order], fragments.weight[order].double()
+        total = weight.cumsum(0)
+        first = torch.searchsorted(pixel, pixel)  # of the same pixel
+        reached = total - (total[first] - weight[first])
+        crossing = (reached >= HALF) & (reached - weight < HALF)
+        part = fragments.weight.new_zeros(fragments.height * fragments.width)
+        part[pixel[crossing]] = fragments.depth[order][crossing]
+        rows.append(part.view(fragments.height, fragments.width))
+    return torch.cat(rows)
+
+
+def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
+    """[2, 3] corners of the box that holds what the cameras see, without the outermost `QUANTILE` of it, cut to `REACH`
+    times the extent of the cameras or their median depth.
+
+    Raises:
+        NoSurface: no depth is known.
+    """
+    points = torch.cat([_points(depth, camera) for depth, camera in zip(depths, cameras, strict=True)])
+    if not len(points):
+        raise NoSurface("no pixel of the cameras' views is covered to one half: there is no surface to fuse")
+    centers = torch.stack([camera.center.cpu() for camera in cameras])
+    middle = centers.mean(0)
+    typical = torch.cat([depth[depth > 0] for depth in depths]).median()
+    reach = REACH * max(float((centers - middle).norm(dim=1).max()), float(typical))
+    inside = points[((points - middle).abs() <= reach).all(1)]
+    low, high = (torch.from_numpy(np.quantile(inside.numpy(), q, axis=0)) for q in (QUANTILE, 1 - QUANTILE))
+    margin = 0.02 * (high - low).max()
+    return torch.stack([low - margin, high + margin])
+
+
+def _points(depth: Tensor, camera: Camera) -> Tensor:
+    """[M, 3] world points of the pixels [H, W] whose depth is known."""
+    y, x = (depth > 0).nonzero(as_tuple=True)
+    z, K = depth[y, x].cpu().double(), camera.K.cpu().double()
+    x, y = x.cpu(), y.cpu()
+    local = torch.stack([(x + 0.5 - K[0, 2]) / K[0, 0] * z, (y + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
+    viewmat = camera.viewmat.cpu().double()
+    return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def extract_surface(
+    surfels: Mapping[str, Tensor],
+    render: Callable[[Camera], Tensor],
+    cameras: Sequence[Camera],
+    near: float,
+    options: SurfaceOptions = SurfaceOptions(),  # noqa: B008 - frozen
+    through_pixel: bool = False,
+    progress: Progress = no_progress,
+) -> open3d.geometry.TriangleMesh:
+    """Fuse the median depths of views into a triangle mesh with vertex colors, in the scene's frame.
+
+    Args:
+        surfels: geometry by name (`GEOMETRY`).
+        render: [H, W, 3] colors of a view, for the vertices.
+        cameras: of the training views.
+        near: nearest depth that is drawn, camera z.
+        options: resolution and budget.
+        through_pixel: as in `ops.project`.
+        progress: called after every view and step.
+
+    Raises:
+        NoSurface: there is nothing to fuse.
+        ValueError: an option is out of range.
+    """
+    import open3d
+
+    options.check()
+    small = [camera.scaled(min(1.0, BOX_SIDE / max(camera.width, camera.height))) for camera in cameras]
+    depths = []
+    for i, camera in enumerate(small):
+        depths.append(median_depth(surfels, camera, near, through_pixel).cpu())
+        progress("finding the box", i + 1, len(small))
+    box = observed_box(depths, small)
+    voxel = float((box[1] - box[0]).max()) / options.resolution
+    volume = open3d.pipelines.integration.ScalableTSDFVolume(
+        voxel, TRUNCATION * voxel, open3d.pipelines.integration.TSDFVolumeColorType.RGB8
+    )
+    for i, camera in enumerate(cameras):
+        depth = median_depth(surfels, camera, near, through_pixel).cpu()
+        depth = _cut(depth, camera, box)
+        rgb = (render(camera).clamp(0, 1) * 255).round().byte().cpu().numpy()
+        picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
+            open3d.geometry.Image(np.ascontiguousarray(rgb)),
+            open3d.geometry.Image(np.ascontiguousarray(depth.float().numpy())),
+            depth_scale=1.0,
+            depth_trunc=math.inf,
+            convert_rgb_to_intensity=False,
+        )
+        K = camera.K.cpu().double()
+        # open3d samples a pixel at its integer coordinates, this package half a pixel further
+        pinhole = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item() - 0.5, K[1, 2].item() - 0.5)
+        intrinsic = open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *pinhole)
+        volume.integrate(picture, intrinsic, camera.viewmat.cpu().double().numpy())
+        progress("fusing depth maps", i + 1, len(cameras))
+    mesh = volume.extract_triangle_mesh()
+    if not len(mesh.triangles):
+        raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
+    return _finished(mesh, options, progress)
+
+
+def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
+    """The depths [H, W] of points within the box [2, 3], 0 elsewhere."""
+    known = depth > 0
+    points = _points(depth, camera)
+    inside = ((points >= box[0]) & (points <= box[1])).all(1)
+    cut = torch.zeros_like(depth)
+    cut[known] = torch.where(inside, depth[known], 0.0)
+    return cut
+
+
+def _finished(
+    mesh: open3d.geometry.TriangleMesh, options: SurfaceOptions, progress: Progress
+) -> open3d.geometry.TriangleMesh:
+    """The mesh without specks, closed where asked for, within the budget of triangles."""
+    import open3d
+
+    labels, counts, _ = (np.asarray(part) for part in mesh.cluster_connected_triangles())
+    mesh.remove_triangles_by_mask(counts[labels] < SMALLEST * counts.max())
+    mesh.remove_unreferenced_vertices()
+    progress("removing specks", 1, 1)
+    if options.watertight:
+        mesh.compute_vertex_normals()
+        cloud = open3d.geometry.PointCloud(mesh.vertices)
+        cloud.normals, cloud.colors = mesh.vertex_normals, mesh.vertex_colors
+        mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=POISSON_DEPTH)
+        progress("closing the mesh", 1, 1)
+    if options.triangles and len(mesh.triangles) > options.triangles:
+        mesh = mesh.simplify_quadric_decimation(options.triangles)
+        progress("simplifying", 1, 1)
+    mesh = mesh.filter_smooth_taubin(SMOOTHING)
+    mesh.remove_degenerate_triangles()
+    mesh.remove_unreferenced_vertices()
+    mesh.compute_vertex_normals()
+    return mesh

@@ -1,0 +1,82 @@
+"""Median depth against the float64 reference, and the surface fused from it against known geometry."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface, median_depth
+from bitymi_ns.scene.camera import Camera
+from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, camera_of, load_golden, reference
+
+
+def plane(side: int, opacity: float = 0.95) -> dict[str, torch.Tensor]:
+    """A dense grid of discs in the plane z = 0, from -1 to 1."""
+    at = torch.linspace(-1, 1, side)
+    means = torch.stack([*torch.meshgrid(at, at, indexing="xy"), torch.zeros(side, side)], -1).reshape(-1, 3)
+    count = len(means)
+    return {
+        "means": means,
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        "log_scales": torch.full((count, 2), math.log(1.2 / side)),
+        "opacity_logits": torch.full((count,), math.log(opacity / (1 - opacity))),
+        "beta_raw": torch.zeros(count),
+    }
+
+
+def looking_down(x: float, y: float, distance: float = 2.0) -> Camera:
+    """A camera above the plane z = 0 that looks along -z."""
+    viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([x, y, distance])
+    return Camera(viewmat, torch.tensor([[60.0, 0, 31.3], [0, 62.0, 25.1], [0, 0, 1]]), 64, 48)
+
+
+@pytest.mark.parametrize("name", GOLDEN_NAMES)
+def test_median_depth_is_that_of_the_reference(name: str) -> None:
+    case = load_golden(name)
+    values = [case.params[key].double() for key in SURFEL_KEYS]
+    depth = median_depth(dict(zip(SURFEL_KEYS, values, strict=True)), camera_of(case), 0.2)
+    t = reference(case, values)
+    reached = t.weight[:, t.order].cumsum(1) >= 0.5
+    z = t.depth[:, t.order].gather(1, reached.double().argmax(1, keepdim=True))[:, 0]
+    expected = torch.where(reached.any(1), z, 0.0).view(case.height, case.width)
+    close = (depth - expected).abs() <= 1e-6
+    assert close.double().mean() > 0.999  # the sum may reach one half a surfel earlier by rounding
+
+
+CAMERAS = [looking_down(x, y) for x in (-0.3, 0.0, 0.3) for y in (-0.2, 0.2)]
+
+
+def gray(camera: Camera) -> torch.Tensor:
+    return torch.full((camera.height, camera.width, 3), 0.5)
+
+
+def test_a_plane_is_fused_where_it_lies() -> None:
+    mesh = extract_surface(plane(60), gray, CAMERAS, 0.02, SurfaceOptions(resolution=64))
+    vertices, colors = np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors)
+    assert len(mesh.triangles) > 500 and np.abs(vertices[:, 2]).max() < 2e-3
+    assert np.abs(colors - 0.5).max() < 0.01
+    x, y = vertices[:, 0], vertices[:, 1]  # what the outermost cameras see, and no more
+    assert 0.6 < x.max() < 1.06 and abs(x.max() + x.min()) < 0.1 and 0.4 < y.max() < 1.06
+    assert np.asarray(mesh.vertex_normals)[:, 2].min() > 0.9  # towards the cameras
+
+
+def test_the_budget_and_the_closed_surface_are_kept() -> None:
+    few = extract_surface(plane(40), gray, CAMERAS, 0.02, SurfaceOptions(resolution=64, triangles=200))
+    assert 50 < len(few.triangles) <= 200
+    closed = extract_surface(plane(40), gray, CAMERAS, 0.02, SurfaceOptions(resolution=32, watertight=True))
+    assert closed.is_edge_manifold(allow_boundary_edges=True) and len(closed.triangles) > 100
+
+
+def test_a_scene_without_a_surface_says_so() -> None:
+    with pytest.raises(NoSurface, match="no pixel of the cameras' views is covered"):
+        extract_surface(plane(4, 0.05), gray, CAMERAS, 0.02)
+
+
+@pytest.mark.parametrize("option", [{"resolution": 8}, {"triangles": -1}])
+def test_options_out_of_range_are_named(option: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(option))} must be from"):
+        SurfaceOptions(**option).check()

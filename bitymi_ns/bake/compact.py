@@ -12,7 +12,7 @@ from torch import Tensor
 from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, set_aside
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.texel_scene import TexelScene
+from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
@@ -116,10 +116,10 @@ class Coder:
             background: [3] colour behind the scene.
             options: see `Compact`.
             progress: called on the way.
-            device: where view colours are weighed.
+            device: where views are drawn and weighed.
         """
         options.check()
-        self._baked, self._pictures = baked, Pictures(views, background, options.views)
+        self._baked, self._pictures = baked, Pictures(views, background, options.views, device)
         scene = baked.unquantised()
         self._sizes = torch.from_numpy(baked.packing.tiles[:, 3:]).long()
         drawn = self._pictures.of(scene)
@@ -132,9 +132,9 @@ class Coder:
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._weights = None
         if baked.texels is not None:
-            texels = TexelScene(baked, background)
-            self._tiles, self._texels = texels.tiles, texels.texels
-            self._weights = texels.coverage(learned, progress, squared=True)[:, 0]
+            texels = TexelList(baked, device)
+            self._tiles, self._texels = texels.tiles, texels.values.cpu()
+            self._weights = texels.coverage(learned, progress, squared=True).cpu()
 
     @property
     def measured(self) -> bool:
@@ -159,7 +159,7 @@ class Coder:
         residual = baked.mean_residual[order]
         texels = pages = None
         if self._texels is not None:
-            moved = self._tiles.rows_of(order)
+            moved = self._tiles.rows_of(order.to(self._tiles.size.device)).cpu()
             texels, weights = self._texels[moved], self._weights[moved]
             pages = paged_texels(texels, packing)
         kept = SceneCodes(
@@ -195,7 +195,7 @@ def compacted(
         background: [3] colour behind the scene.
         options: see `Compact`.
         progress: called on the way.
-        device: where view colours are weighed; all else is done on the CPU.
+        device: where views are drawn and weighed.
 
     Raises:
         ValueError: an option is out of range, or what is asked for cannot be had.

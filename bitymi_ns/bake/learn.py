@@ -60,7 +60,9 @@ def baked_and_reduced(
     else:
         baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
     if polish is not None and baked.texels is not None:
-        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out)
+        baked = polish_scene(
+            baked, photographs, background, polish, learning.train, progress, held_out, device_of(cameras)
+        )
     if polish is not None or has_learned:
         baked = reduced(baked, cameras, progress)
     return baked
@@ -120,7 +122,7 @@ def stored(
         coding: from there, how texels are coded.
     """
     if tune is not None and baked.texels is not None:
-        baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding)
+        baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device_of(cameras))
     if baked.codes is not None and baked.codes.texels is None:
         baked = with_coded_texels(baked, coding)
     return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras])

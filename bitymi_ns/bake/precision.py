@@ -30,29 +30,30 @@ class Pictures:
         numbers: of all their pixels that count, three each.
     """
 
-    def __init__(self, views: Sequence[View], background: Tensor, most: int) -> None:
+    def __init__(
+        self, views: Sequence[View], background: Tensor, most: int, device: torch.device | str = "cpu"
+    ) -> None:
         """
         Args:
             views: training views, of which `most` are taken, spread over all.
             background: [3] colour behind the scene.
             most: how many.
+            device: where they are drawn.
         """
         chosen = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
-        self._background = background.cpu()
-        self._targets = [view.target(self._background, "cpu") for view in chosen]
-        self._masks = [None if view.mask is None else view.mask.cpu() for view in chosen]
-        self._cameras = [view.camera.to("cpu") for view in chosen]
-        self._shown = [view.shown for view in chosen]
+        self._device, self._background = device, background.to(device)
+        self._targets = [view.target(self._background, device) for view in chosen]
+        self._views = [v._replace(image=t).to(device) for v, t in zip(chosen, self._targets, strict=True)]
+        self._masks = [view.mask for view in self._views]
         self.views = len(chosen)
         counts = (t.numel() if m is None else 3 * int(m.sum()) for t, m in zip(self._targets, self._masks, strict=True))
         self.numbers = sum(counts)
 
     def of(self, scene: BakedScene) -> list[Tensor]:
         """[H, W, 3] each, as the photographs show them."""
-        drawn = (scene.render(camera, self._background) for camera in self._cameras)
-        return [
-            shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for shown, d in zip(self._shown, drawn, strict=True)
-        ]
+        scene = scene.to(self._device)
+        drawn = [(view, scene.render(view.camera, self._background)) for view in self._views]
+        return [view.shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for view, d in drawn]
 
     def square(self, pictures: Sequence[Tensor], than: Sequence[Tensor] | None = None) -> float:
         """Mean square difference from other pictures; None = from the photographs."""

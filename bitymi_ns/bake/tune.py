@@ -12,12 +12,12 @@ from torch import Tensor
 from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.codings import C, Coding, Cosines, CosineTexels, Pages, PageTexels
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, Looks, gain, set_aside
-from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews
+from bitymi_ns.bake.texel_list import TexelList
+from bitymi_ns.bake.tuning_views import TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.config import TexelSteps
-from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
 
@@ -75,6 +75,7 @@ def tune_atlas(
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
     coding: TexelCodeOptions | None = None,
+    device: torch.device | str = "cpu",
 ) -> Baked:
     """Fine-tunes the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
@@ -83,9 +84,6 @@ def tune_atlas(
     the texel. This is the step of simultaneous algebraic reconstruction (SART), with the loss's gradient for the
     residual. It needs no second moments, and a texel that is hardly seen hardly moves. The texels that show the
     set-aside views best are kept, or the baked ones if none are better.
-
-    It runs on the CPU, because `ops.texel_image` and its gradient have no other kernels. A bake is on the CPU, whatever
-    device made it. Photographs and cameras may be on another device: each view is copied when it is traced.
 
     Args:
         baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
@@ -96,6 +94,8 @@ def tune_atlas(
         eval_views: views of which the gain is stated, of what is stored; they decide nothing.
         coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
             the coding makes of the texels, and the codes that show the set-aside views best are kept.
+        device: where the texels learn. Photographs and cameras may be on another one: each view is copied when it is
+            traced.
 
     Returns:
         a new bake, encoded, with `statistics.finetune`; `baked` itself without change where there are fewer than 4
@@ -106,24 +106,24 @@ def tune_atlas(
     if len(views) < (FEWEST_VIEWS if options.held_in_every else 1):
         return replace(baked, statistics=baked.statistics.but(finetune=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
-    scene = TexelScene(baked, background)
+    texels = TexelList(baked, device)
     budget = MemoryBudget(options.cache_bytes)
     aside, learned = (
         OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
         for rows in set_aside(len(views), options.held_in_every)
     )
-    held_in, tuned = (TexelViews(scene, part, budget) for part in (aside, learned))
-    before = held_in.psnr(scene.texels, progress)  # first: these views are kept first
-    looks = Looks(options, before, scene.texels)
-    squares = None if baked.codes is None else torch.zeros_like(scene.texels)
-    covered = torch.zeros_like(scene.texels)
-    scene.add_coverage(learned, covered, squares, progress)
-    share = 1.0 / (covered[:, :1] + options.prior)  # [T, 1]
-    _descend(scene, tuned, held_in, share, looks, options, progress)
-    held_out = TexelViews(scene, eval_views, MemoryBudget(0))
-    coder = _coding(baked, scene, squares, coding or TexelCodeOptions())
-    untuned = held_out.psnr(coder.first(scene.texels).texels()) if eval_views else None
-    coded = _coded(scene, tuned, held_in, share, looks.best, coder, options, progress)
+    held_in, tuned = (TuningViews(texels, part, background, budget) for part in (aside, learned))
+    before = held_in.psnr(texels.values, progress)  # first: these views are kept first
+    looks = Looks(options, before, texels.values)
+    squares = None if baked.codes is None else torch.zeros_like(texels.values)
+    covered = torch.zeros_like(texels.values)
+    texels.add_coverage(learned, covered, squares, progress)
+    share = 1.0 / (covered[:, 0] + options.prior)  # [T]
+    _descend(texels.values.clone(), tuned, held_in, share, looks, options, progress)
+    held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
+    coder = _coding(baked, texels, squares, coding or TexelCodeOptions())
+    untuned = held_out.psnr(coder.first(texels.values.cpu()).texels()) if eval_views else None
+    coded = _coded(tuned, held_in, share, looks.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = looks.statistics(len(tuned), len(held_in), *spent).but(
         steps=looks.done + options.coded_steps,
@@ -134,53 +134,41 @@ def tune_atlas(
     if isinstance(coded, CosineTexels):
         result = baked.with_texel_codes(coded.codes, coded.listed)
     else:
-        result = scene.baked(coded.listed).with_atlas(coded.atlas)
+        result = texels.baked(coded.listed).with_atlas(coded.atlas)
     return replace(result, statistics=result.statistics.but(finetune=statistics))
 
 
 def _coding(
-    baked: Baked, scene: TexelScene, squares: Tensor | None, options: TexelCodeOptions
+    baked: Baked, texels: TexelList, squares: Tensor | None, options: TexelCodeOptions
 ) -> Coding[CosineTexels] | Coding[PageTexels]:
     """How the texels are stored: by their squared coverage [T, 3], or as blocks where there is none."""
     if squares is not None:
-        return Cosines(TexelCoder(scene.sizes, squares[:, 0], options), options)
-    return Pages(baked, scene.tiles)
+        return Cosines(TexelCoder(texels.sizes, squares[:, 0].cpu(), options), options)
+    return Pages(baked, texels.tiles.first.cpu())
 
 
 def _descend(
-    scene: TexelScene,
-    views: TexelViews,
-    held_in: TexelViews,
+    texels: Tensor,
+    views: TuningViews,
+    held_in: TuningViews,
     share: Tensor,
     looks: Looks[Tensor],
     options: TuneOptions,
     progress: Progress,
 ) -> None:
-    """Moves texels by their shares [T, 1], and looks at what that brings."""
-    texels, gradient = scene.texels.clone(), torch.zeros_like(scene.texels)
+    """Moves texels [T, 3] by their shares [T], and looks at what that brings."""
     for step in range(options.steps):
-        view = views[training_order(len(views), options.seed, step)]
-        _gradient(scene, view, texels, options.ssim_weight, gradient)
-        texels.addcmul_(gradient, share, value=-falling(options.rate, step, options.steps))
+        rate = falling(options.rate, step, options.steps)
+        views.step(training_order(len(views), options.seed, step), texels, share, rate, options.ssim_weight)
         progress("tuning texels", step + 1, options.steps)
         if looks.due(step + 1) and not looks.note(step + 1, held_in.psnr(texels), texels.clone):
             progress("tuning texels", step + 1, step + 1)  # no more is to come
             break
 
 
-def _gradient(scene: TexelScene, view: TexelView, texels: Tensor, ssim_weight: float, out: Tensor) -> None:
-    """Writes the gradient [T, 3] of a view's loss, as a sum over its numbers."""
-    rgb = scene.render(view, texels).requires_grad_()
-    photometric(scene.shown(view, rgb), view.target, ssim_weight, view.mask).backward()
-    out.zero_()
-    # the loss is a mean, the step wants a sum
-    scene.add_gradient(view, texels, rgb.grad * numbers(rgb, view.mask), out)
-
-
 def _coded(
-    scene: TexelScene,
-    views: TexelViews,
-    held_in: TexelViews,
+    views: TuningViews,
+    held_in: TuningViews,
     share: Tensor,
     texels: Tensor,
     coding: Coding[C],
@@ -189,19 +177,21 @@ def _coded(
 ) -> C:
     """What is stored of texels [T, 3] after steps that see it: the picture is that of the stored texels, and its
     gradient moves the texels behind them. What shows the set-aside views best."""
-    coded = coding.first(texels)
-    texels = coded.texels().clone()
+    coded = coding.first(texels.cpu())
+    texels = coded.texels().to(texels.device, copy=True)
     looks = Looks(replace(options, steps=max(1, options.coded_steps)), held_in.psnr(texels, progress), coded)
-    shift, gradient = torch.zeros_like(texels), torch.zeros_like(texels)
+    shift = torch.zeros_like(texels)
     for step in range(options.coded_steps):
-        view = views[training_order(len(views), options.seed, step)]
-        _gradient(scene, view, texels + shift, options.ssim_weight, gradient)
-        texels.addcmul_(gradient, share, value=-falling(options.coded_rate, step, options.coded_steps))
+        rate, view = (
+            falling(options.coded_rate, step, options.coded_steps),
+            training_order(len(views), options.seed, step),
+        )
+        views.step(view, texels, share, rate, options.ssim_weight, texels + shift)
         progress("tuning texels as they are stored", step + 1, options.coded_steps)
         last = step + 1 == options.coded_steps
         if (step + 1) % options.coded_every == 0 or last:
-            coded = coding.again(texels)
-            shown = coded.texels()
+            coded = coding.again(texels.cpu())
+            shown = coded.texels().to(texels.device)
             shift = shown - texels
             if looks.due(step + 1) or last:
                 looks.note(step + 1, held_in.psnr(shown), lambda coded=coded: coded)

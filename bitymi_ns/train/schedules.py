@@ -139,9 +139,19 @@ class Schedule:
         """True where every surfel has its own texels in this step, and they learn."""
         return step >= self.texels_start
 
-    def texel_rate(self, step: int) -> float:
-        """Rate of the texels in a step in which they learn."""
-        return self.config.texels.rate * self._falling(step)
+    def texel_rate(self, step: int, views: int = 1) -> float:
+        """Rate of the texels in a step in which they learn.
+
+        It falls to 0 as a cosine, so texels can move half as far as they would at its start. Few passes over the views
+        at `rate` would end before the texels are where the photographs want them.
+
+        Args:
+            step: index of the step.
+            views: training views.
+        """
+        texels = self.config.texels
+        needed = 2.0 * texels.travel * views / self.texel_steps
+        return max(texels.rate, min(needed, texels.travel)) * self._falling(step)
 
     def _falling(self, step: int) -> float:
         return falling(1.0, step - self.texels_start, self.texel_steps)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import cuda_backend
@@ -38,8 +39,12 @@ if TYPE_CHECKING:
 DrawViews = Callable[[int, torch.Generator], list[View]]
 """(k, CPU generator) -> k different training views, or all when there are fewer."""
 
-SPLIT_SHRINK = 1.6
-"""Factor by which the two halves of a split surfel are smaller."""
+SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
+"""Scales of the halves of a split surfel, along its long axis and across it, as a share of the surfel's."""
+SPLIT_APART = 0.7
+"""Distance of the halves' centres from the surfel's, in scales of its long axis."""
+SPLIT_OPACITY = 0.9
+"""Opacity of the halves as a share of the surfel's: they overlap where it is most opaque."""
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
@@ -230,13 +235,16 @@ class Strategy:
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
 
     def _halves(self, surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-        """Two smaller surfels for each of `rows`, their centres drawn from the parent's disc as a Gaussian."""
+        """The two halves of each of `rows`, side by side along its long axis: together about the surfel that they were,
+        so that the picture stays."""
         halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
-        scales = halves["log_scales"].exp()  # [2S, 2]
-        offset = torch.randn(scales.shape, generator=self.generator).to(scales) * scales
-        u, v = tangents(halves["quats"]).unbind(-1)
-        halves["means"] = halves["means"] + offset[:, :1] * u + offset[:, 1:] * v
-        halves["log_scales"] = halves["log_scales"] - math.log(SPLIT_SHRINK)
+        long = one_hot(halves["log_scales"].argmax(-1), 2).to(halves["log_scales"])  # [2S, 2]
+        side = long.new_tensor([1.0, -1.0]).repeat(len(rows))[:, None]
+        axis = (tangents(halves["quats"]) * long[:, None]).sum(-1)  # [2S, 3]
+        reach = halves["log_scales"].amax(-1, keepdim=True).exp()
+        halves["means"] = halves["means"] + SPLIT_APART * side * reach * axis
+        halves["log_scales"] = halves["log_scales"] + long * math.log(SPLIT_LONG) + (1.0 - long) * math.log(SPLIT_WIDE)
+        halves["opacity_logits"] = (SPLIT_OPACITY * halves["opacity_logits"].sigmoid()).logit()
         return halves
 
     # ---- pruning

@@ -52,9 +52,11 @@ class LearningTexels:
     def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
         self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
         self._rate: RemovableHandle | None = None
+        self._views = 1
 
     def begin(self, step: int, views: DownscaledViews) -> bool:
         """Create the tiles on the first step that needs them; True where this step is it."""
+        self._views = len(views)
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
         sample = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
@@ -83,7 +85,7 @@ class LearningTexels:
         field = self.scene.field
         if isinstance(field, TexelField):
             # the loss is a mean, the step wants a sum
-            rate = factor * self.schedule.texel_rate(step) * numbers(view.image, view.mask)
+            rate = factor * self.schedule.texel_rate(step, self._views) * numbers(view.image, view.mask)
             if self.processes.views == 1:
                 field.descent = TexelDescent(field.share, rate)
                 return

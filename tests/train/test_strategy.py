@@ -137,25 +137,26 @@ def test_clone_and_split_need_score_gradient_and_size(bench):
     check(b)
 
 
-def test_children_lie_in_the_disc_of_their_parent(bench):
-    b = bench(1, max_surfels=0)
-    b.importance[:] = 9
-    b.set("log_scales", 0, torch.tensor([math.log(0.2), math.log(0.05)]))
-    b.set("quats", 0, torch.tensor([0.5, -1.0, 2.0, 0.3]))
-    parent = {name: p.detach().clone() for name, p in b.scene.surfels.items()}
-    offsets = []
-    for seed in range(300):
-        b.strategy.generator.manual_seed(seed)
-        halves = b.strategy._halves(b.scene.surfels, torch.tensor([0]))
-        offsets.append(halves["means"] - parent["means"])
-    offsets = torch.cat(offsets)
-    u, v = module.tangents(parent["quats"]).unbind(-1)
-    assert (offsets @ torch.linalg.cross(u, v).T).abs().max() < 1e-5
-    assert (offsets @ u.T).std().item() == pytest.approx(0.2, rel=0.1)
-    assert (offsets @ v.T).std().item() == pytest.approx(0.05, rel=0.1)
-    torch.testing.assert_close(halves["log_scales"].exp(), parent["log_scales"].exp().expand(2, 2) / 1.6)
-    for name in set(parent) - {"means", "log_scales"}:
-        torch.testing.assert_close(halves[name], parent[name].repeat_interleave(2, 0))
+def test_halves_lie_side_by_side_along_the_long_axis(bench):
+    b = bench(2, max_surfels=0)
+    b.set("log_scales", slice(0, 2), torch.tensor([[math.log(0.2), math.log(0.05)], [math.log(0.05), math.log(0.2)]]))
+    b.set("quats", slice(0, 2), torch.tensor([0.5, -1.0, 2.0, 0.3]))
+    b.set("opacity_logits", slice(0, 2), torch.tensor([0.4, 30.0]))
+    parents = {name: p.detach().clone() for name, p in b.scene.surfels.items()}
+    halves = b.strategy._halves(b.scene.surfels, torch.tensor([0, 1]))
+    axes = module.tangents(parents["quats"])
+    offset = (halves["means"] - parents["means"].repeat_interleave(2, 0)).view(2, 2, 3)
+    for row, (long, wide) in enumerate(((0, 1), (1, 0))):
+        expected = 0.7 * 0.2 * axes[row, :, long]
+        torch.testing.assert_close(offset[row], torch.stack([expected, -expected]))
+        scales = halves["log_scales"].exp()[2 * row : 2 * row + 2]
+        assert scales[:, long].tolist() == pytest.approx([0.12] * 2) and scales[:, wide].tolist() == pytest.approx(
+            [0.035] * 2
+        )
+    opacity = 0.9 * parents["opacity_logits"].sigmoid().repeat_interleave(2)
+    torch.testing.assert_close(halves["opacity_logits"].sigmoid(), opacity)
+    for name in set(parents) - {"means", "log_scales", "opacity_logits"}:
+        torch.testing.assert_close(halves[name], parents[name].repeat_interleave(2, 0))
 
 
 def test_clones_equal_their_parents_and_start_without_momentum(bench):

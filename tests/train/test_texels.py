@@ -57,6 +57,8 @@ def test_the_last_part_of_a_run() -> None:
         assert rates == sorted(rates, reverse=True) and rates[-1] < 1e-3 * rates[0] > 0
     assert with_texels.lr("exposure", 400) == without.lr("exposure", 400)
     assert with_texels.texel_rate(360) == OPTIONS.rate > with_texels.texel_rate(500) > 0
+    few_passes = [with_texels.texel_rate(360, count) for count in (1, 24, 100, 10_000)]
+    assert few_passes == pytest.approx([OPTIONS.rate, 0.2 * OPTIONS.travel, OPTIONS.travel / 1.2, OPTIONS.travel])
     early = TrainConfig(texels=TexelConfig(start=6_000))
     assert max(Schedule(early, 3000, texels=True).densify_steps) < 600 < max(Schedule(early, 3000).densify_steps)
     never = Schedule(TrainConfig(texels=TexelConfig(start=30_000)), 600, texels=True)

@@ -1,5 +1,4 @@
-"""What is stored of texels, as their last steps see it: pages of BC7 blocks, say, or the integers of a compact
-bundle."""
+"""Codings of texels that their last optimisation steps draw: BC7 pages, or the codes of a compact bundle."""
 
 from __future__ import annotations
 
@@ -33,15 +32,15 @@ class Coding(Protocol[C]):
     """A way to store texels."""
 
     def first(self, texels: Tensor) -> C:
-        """Of texels [T, 3], before the steps."""
+        """Code texels [T, 3] before the steps."""
         ...
 
     def again(self, texels: Tensor) -> C:
-        """The same on the way, quickly."""
+        """Code texels between steps, quickly."""
         ...
 
     def last(self, coded: C) -> C:
-        """What is stored of the best that was found."""
+        """Final coding of the best texels."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""How precisely the numbers of surfels are kept: what an error of each costs in the pictures, measured by drawing."""
+"""Quantisation steps of the surfels' columns from the image error of rounding each, measured by drawing."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from bitymi_ns.train.views import View
 WIDEST, NARROWEST = 4.0, 1.0 / 64
 """Steps are chosen between these, in reference steps; beyond, errors are not proportional to them."""
 PER_BIT = 2.0 * math.log(2.0)
-"""An error that is proportional to the square of a step falls by this share of it for each bit that is spent."""
+"""Relative fall, per bit, of an error proportional to the square of a step."""
 
 
 class Pictures:
-    """Some of the training views, as what they look like is compared with the photographs.
+    """Training views sampled for the comparison of renderings with photographs.
 
     Attributes:
         views: how many there are.
@@ -70,7 +70,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """What rounding does to the pictures, by column of `REFERENCE`.
+    """Image error of rounding by column of `REFERENCE`.
 
     Attributes:
         noise: mean square error of the pictures by the square of the step; 0 = it is not seen.
@@ -80,24 +80,24 @@ class ColumnNoise:
     noise: Mapping[str, float]
     counts: Mapping[str, int]
 
-    def steps(self, price: float) -> dict[str, float]:
-        """Steps at which a further bit for each number of a column saves as much error as it is worth.
+    def steps(self, lmbda: float) -> dict[str, float]:
+        """Steps at which a further bit for each number of a column saves lambda.
 
         A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number.
 
         Args:
-            price: mean square error of the pictures that a bit is worth; 0 = not known: the reference steps.
+            lmbda: mean square error of the images per bit; 0 = not known: the reference steps.
         """
-        if price == 0:
+        if lmbda == 0:
             return dict(REFERENCE)
-        return {name: _step(name, price * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
+        return {name: _step(name, lmbda * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
 
 
 @torch.no_grad()
 def column_noise(
     scene: BakedScene, sizes: npt.ArrayLike, pictures: Pictures, progress: Progress = no_progress
 ) -> ColumnNoise:
-    """Draws the views with each column rounded alone, at its reference step.
+    """Measure the image error of each column rounded alone, at its reference step.
 
     Args:
         scene: with lean view colours, on the CPU, of N surfels.

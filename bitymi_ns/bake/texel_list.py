@@ -57,7 +57,7 @@ class TexelList:
         return project(*geometry, camera.to(self.device), self.scene.near, self.scene.through_pixel)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
-        """How much of the pictures every texel makes up, in pixels.
+        """Coverage of every texel, in pixels.
 
         Args:
             views: training views.

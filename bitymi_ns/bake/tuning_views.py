@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.early_stopping import look
+from bitymi_ns.bake.early_stopping import evaluate
 from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.ops import Fragments, Projection, TexelDescent, blended_image, fitting_lists, select, view_color
 from bitymi_ns.progress import Progress, no_progress
@@ -151,4 +151,4 @@ class TuningViews(Sequence[TuningView]):
         """Mean dB over the views of which any pixel counts."""
         texels = texels.to(self._texels.device)
         pictures = ((self.picture(view, texels), view.target, view.mask) for view in self)
-        return look(pictures, len(self), progress)
+        return evaluate(pictures, len(self), progress)

@@ -19,7 +19,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import MemoryBudget, View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
-OPTIONS = TuneOptions(steps=60, rate=0.3, held_in_every=4, coded_steps=0)
+OPTIONS = TuneOptions(steps=60, rate=0.3, val_every=4, coded_steps=0)
 
 
 def cameras() -> list[Camera]:
@@ -284,9 +284,7 @@ def test_an_interruption_leaves_the_bake_as_it_was(wrong: Baked, views: list[Vie
     assert torch.equal(wrong.texels, before)
 
 
-@pytest.mark.parametrize(
-    "bad", [{"steps": -1}, {"held_in_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}]
-)
+@pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])
 def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
     tune = partial(tune_atlas, wrong, views, BACKGROUND)
     with pytest.raises(ValueError, match=f"{next(iter(bad))}.*fine-tuning|fine-tuning.*{next(iter(bad))[:4]}|SSIM"):
@@ -307,8 +305,8 @@ def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], form
     noise = 0.2 * torch.randn(truth.texels.shape, generator=generator)
     noisy = replace(truth, options=options).with_texels(truth.texels + noise)
     plain = noisy.encoded()
-    for held_in_every in (0, 4):
-        steps = TuneOptions(steps=0, coded_steps=40, coded_rate=0.3, held_in_every=held_in_every)
+    for val_every in (0, 4):
+        steps = TuneOptions(steps=0, coded_steps=40, coded_rate=0.3, val_every=val_every)
         tuned = tune_atlas(noisy, views, BACKGROUND, steps)
         assert error(tuned, views) < 0.8 * error(plain, views)
         assert tuned.statistics.finetune.steps == 40

@@ -86,7 +86,7 @@ def test_texels_and_surfels_are_polished_as_on_the_cpu(
     with cpu():
         scene, views = trained()
     learning = Learning(
-        polish=PolishOptions(steps=6, held_in_every=2), tune=TuneOptions(steps=6, coded_steps=4), train=TrainConfig()
+        polish=PolishOptions(steps=6, val_every=2), tune=TuneOptions(steps=6, coded_steps=4), train=TrainConfig()
     )
     learned_on.clear()
     got = exported(scene, views, device, learning)

@@ -224,11 +224,9 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
         assert torch.equal(bins.tile_pairs, want.tile_pairs)
         pairs = int(want.tile_pairs[-1])
         assert pairs < len(slots) and torch.equal(bins.surfel[:pairs], want.surfel)
-        layout, tile_start = trace_cuda.blended(geom, listed, bins)
-        want_layout, want_start = trace_cuda.blended(geom, listed, want)
-        assert torch.equal(tile_start, want_start) and layout.fragments == want_layout.fragments > 0
-        filled = (trace_cuda.fill(geom, listed, each) for each in (layout, want_layout))
-        got, fragments = (numbers | places.arrays() for numbers, places in filled)
+        layouts = [trace_cuda.blended(geom, listed, each) for each in (bins, want)]
+        assert layouts[0].handle.fragments == layouts[1].handle.fragments > 0
+        got, fragments = (trace_cuda.fill(geom, listed, layout) | layout.ids() for layout in layouts)
         assert all(torch.equal(got[name], value) for name, value in fragments.items())
 
 

@@ -105,11 +105,27 @@ def number(value: object) -> float | None:
     return found if math.isfinite(found) and found > 0 else None
 
 
+EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
+"""Tags of shutter time, f-number and ISO."""
+
+
+def exposure_exif(image: Image.Image) -> Image.Exif:
+    """Make EXIF data that hold the exposure of an opened image and nothing else: no orientation, no position."""
+    kept = Image.Exif()
+    try:
+        detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        kept.get_ifd(ExifTags.IFD.Exif).update({tag: detail[tag] for tag in EXPOSURE if tag in detail})
+        kept.tobytes()
+    except Exception:  # Pillow raises many kinds on broken EXIF
+        return Image.Exif()
+    return kept
+
+
 def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
     """Read shutter time (seconds), f-number and ISO of an opened image; None where the time is not stated."""
     detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
     values = []
-    for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings):
+    for tag in EXPOSURE:
         value = detail.get(tag)
         if isinstance(value, (tuple, list)):  # several ISO values
             value = value[0] if value else None

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
-from bitymi_ns.capture.exif import Exif, read_exif
+from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
 from bitymi_ns.capture.panorama import has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
@@ -244,9 +244,12 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def upright(photo: Photo) -> Image.Image:
-    """Read the photograph as an upright 8-bit RGB image."""
+    """Read the photograph as an upright 8-bit RGB image, with the EXIF data of its exposure in `info`."""
     with open_picture(photo.path) as image:
-        return in_srgb(ImageOps.exif_transpose(eight_bits(image))).convert("RGB")
+        exposure = exposure_exif(image)
+        picture = in_srgb(ImageOps.exif_transpose(eight_bits(image))).convert("RGB")
+    picture.info["exif"] = exposure.tobytes()
+    return picture
 
 
 def blurred(photos: Sequence[Photo]) -> list[str]:

@@ -47,7 +47,8 @@ def upright_photos(
                     there = os.path.realpath(target / names[photo.name])
                     path.symlink_to(os.path.relpath(photo.path.resolve(), os.path.dirname(there)))  # may move together
                 else:
-                    upright(photo).save(path, quality=JPEG_QUALITY, subsampling=0)
+                    picture = upright(photo)
+                    picture.save(path, quality=JPEG_QUALITY, subsampling=0, exif=picture.info["exif"])
             progress("turning photographs upright", len(photos), len(photos))
     return target, names
 

@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
-from bitymi_ns.capture.exif import Exif, focal_length, read_exif
+from bitymi_ns.capture.exif import Exif, exposure_settings, focal_length, read_exif
+from bitymi_ns.capture.photos import read_photo
+from bitymi_ns.capture.prepare import upright_photos
+from bitymi_ns.progress import no_progress
 
 B = ExifTags.Base
 
@@ -128,3 +132,19 @@ def test_a_broken_maker_note_is_none(length: int, more: bytes) -> None:
     found = up_of(whole[:length] + more, 6)
     assert found is None or len(found) == 3
     assert up_of(b"Nikon" + whole) is None and up_of(b"") is None
+
+
+def test_the_upright_copy_of_a_portrait_photograph_keeps_its_exposure_alone(tmp_path: Path) -> None:
+    image = Image.new("RGB", (64, 48), (90, 120, 60))
+    exif = image.getexif()
+    exif[B.Orientation] = 6
+    exif.get_ifd(ExifTags.IFD.Exif).update(detail(ExposureTime=0.008, FNumber=1.8, ISOSpeedRatings=125, FocalLength=50))
+    exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitudeRef] = "N"
+    image.save(tmp_path / "portrait.jpg", exif=exif)
+    photo = read_photo(tmp_path, "portrait.jpg")
+    folder, names = upright_photos([photo], tmp_path, tmp_path / "work", no_progress)
+    with Image.open(folder / names["portrait.jpg"]) as copy:
+        assert copy.size == (48, 64)
+        assert exposure_settings(copy) == pytest.approx((0.008, 1.8, 125))
+        tags = copy.getexif()
+        assert B.Orientation not in tags and not tags.get_ifd(ExifTags.IFD.GPSInfo)
